@@ -19,10 +19,10 @@ import torch
 from helpers import synthetic
 from helpers.reports import table, write_results
 
-from ssilk_core.config import ModelConfig
 from ssilk_core.devices import select_device
-from ssilk_core.model.batch import BatchPlayer, MotionInputs, motion_inputs
-from ssilk_core.model.network import GarmentModel
+from ssilk_core.network.model.batch import BatchPlayer, MotionInputs, motion_inputs
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.settings import ModelConfig
 
 SHOTS = (1, 8, 64, 512, 2048)
 FRAMES = 128

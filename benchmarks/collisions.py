@@ -19,9 +19,9 @@ from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
-from ssilk_core.assets import CLASS_NAMES, Floats, Ints, Motion
-from ssilk_core.collision import signed_distance
-from ssilk_core.motion_bank import roll_states
+from ssilk_core.physics.collision import signed_distance
+from ssilk_core.scene.assets import CLASS_NAMES, Floats, Ints, Motion
+from ssilk_core.training.motion_bank import roll_states
 
 ABOVE = 2e-3  # [m] over the surface, where a free surface is outside the body
 HEADER = ("garment", "", *(f"inside: {name}" for name in CLASS_NAMES), "inside: all", "by winding number",

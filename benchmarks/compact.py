@@ -25,12 +25,12 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
-from ssilk_core.assets import Floats
-from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder
-from ssilk_core.bake.opened import open_shot
 from ssilk_core.cli import main
-from ssilk_core.kinematics import deform
-from ssilk_core.targets import TARGETS, cap_influences
+from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder
+from ssilk_core.delivery.bake.opened import open_shot
+from ssilk_core.delivery.targets import TARGETS, cap_influences
+from ssilk_core.scene.assets import Floats
+from ssilk_core.scene.kinematics import deform
 
 SAMPLED = ("blendShapeWeights", "rotations")
 BITS = (16, 12, 10)

@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 from helpers.reports import RESULTS, table, write_results
 
-from ssilk_core.charts import COLOURS, ChartPanel, write_chart
-from ssilk_core.energy import TERMS
 from ssilk_core.errors import fail
 from ssilk_core.events import format_seconds
+from ssilk_core.physics.energy import TERMS
+from ssilk_core.quality.charts import COLOURS, ChartPanel, write_chart
 from ssilk_core.training.curve import curve_path
 from ssilk_core.training.verdict import curve_lbs
 

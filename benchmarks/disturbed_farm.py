@@ -37,15 +37,15 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.stages import demo_body_path
 from ssilk_usd.write import write_motion
 
-from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder, plan_layers, verify
-from ssilk_core.bake.inputs import InputHashes
-from ssilk_core.bake.record import current_record, read_record, task_key
-from ssilk_core.checkpoint import load_model, save_model
+from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder, plan_layers, verify
+from ssilk_core.delivery.bake.inputs import InputHashes
+from ssilk_core.delivery.bake.record import current_record, read_record, task_key
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.errors import EXIT_OK, EXIT_TASKS, SsilkError
 from ssilk_core.events import Event, Message
 from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model, save_model
 
 SHAPE_SCALES = (1.0, 0.9, 1.1)  # of the blendshapes, one for each version of the model
 MOTIONS = 20  # versions of a motion, of which each shot begins with another

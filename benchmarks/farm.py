@@ -33,10 +33,10 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.write import write_motion
 
-from ssilk_core.assets import Motion
-from ssilk_core.bake import BakeRequest, BakeTask, LayerFolder, plan_layers
-from ssilk_core.farm.cluster import bake_here, run_on_cluster
+from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder, plan_layers
+from ssilk_core.delivery.farm.cluster import bake_here, run_on_cluster
 from ssilk_core.files import sha256
+from ssilk_core.scene.assets import Motion
 
 PERIOD = 10.0  # seconds from one kill to the next; a worker takes a few to start
 PARTS = ("cluster", "cores", "start", "soak")
@@ -180,7 +180,7 @@ def _cores(tasks: Sequence[BakeTask], folder: Path, cores: Sequence[int]) -> dic
 
 def _start(task: BakeTask, folder: Path) -> dict[str, Any]:
     """Return what a process takes before its first shot, and for a shot then [s]."""
-    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.bake"
+    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.delivery.bake"
     layers, taken = LayerFolder(folder / "first"), [time.perf_counter()]
     for work in (
         lambda: subprocess.run([sys.executable, "-c", words], check=True),

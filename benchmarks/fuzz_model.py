@@ -20,8 +20,8 @@ from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
 with atheris.instrument_imports(include=["ssilk_core"]):
-    from ssilk_core.checkpoint import load_model
     from ssilk_core.errors import SsilkError
+    from ssilk_core.network.checkpoint import load_model
 
 SCRATCH = Path(tempfile.mkdtemp()) / "model.safetensors"
 

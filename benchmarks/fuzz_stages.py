@@ -25,8 +25,8 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_scene
 from ssilk_usd.trial import stop
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model
 
 KINDS = ("flip", "huge", "zero", "insert", "cut", "double", "swap")
 MOST_EDITS = 6

@@ -18,8 +18,8 @@ from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
 from shown_skin import refined_points, seen
 
-from ssilk_core.assets import Floats
-from ssilk_core.collision import CoveredSkin
+from ssilk_core.physics.skin.covered_skin import CoveredSkin
+from ssilk_core.scene.assets import Floats
 
 ITERATIONS = (4, 16)
 HEADER = ("garment", "clip", "first frame", "network", *(f"{count} iterations" for count in ITERATIONS),

@@ -19,11 +19,11 @@ from helpers.reports import RESULTS, table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
-from ssilk_core.charts import ChartPanel, write_chart
-from ssilk_core.energy import TERMS
-from ssilk_core.evaluation.methods import Network, build_take_set
-from ssilk_core.evaluation.record import recorded
-from ssilk_core.evaluation.takes import Take, back_and_forth
+from ssilk_core.physics.energy import TERMS
+from ssilk_core.quality.charts import ChartPanel, write_chart
+from ssilk_core.quality.evaluation.methods import Network, build_take_set
+from ssilk_core.quality.evaluation.record import recorded
+from ssilk_core.quality.evaluation.takes import Take, back_and_forth
 
 CLIPS = ("02_04", "02_02", "49_08a")
 HEADER = ("garment", "clip", "loops x frames", "term", "first [J]", "second [J]", "last [J]", "first to last",

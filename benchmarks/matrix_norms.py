@@ -14,7 +14,7 @@ from pathlib import Path
 import torch
 from helpers.reports import table, write_results
 
-from ssilk_core.checkpoint import load_model, network
+from ssilk_core.network.checkpoint import load_model, network
 
 PARTS = {"initialiser": "P", "stepper": "S", "output": "D"}  # D's parameters are those of its outputs
 

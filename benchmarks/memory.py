@@ -17,7 +17,12 @@ import torch
 from helpers.peak import Peak
 from helpers.reports import table, write_results
 
-from ssilk_core.assets import (
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.physics.collision import CollisionBody
+from ssilk_core.physics.collision.samples import contact_samples
+from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
     Body,
@@ -31,16 +36,12 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.collision import CollisionBody
-from ssilk_core.collision.samples import contact_samples
-from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.energy import GarmentEnergy
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import local_transforms, rigid
-from ssilk_core.memory import StepMemory, decoded_frames
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import build_bank
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import local_transforms, rigid
+from ssilk_core.training.memory import StepMemory, decoded_frames
+from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.shape_smoothing import ShapeSmoothing
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler

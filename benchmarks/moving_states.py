@@ -22,13 +22,13 @@ from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
-from ssilk_core.evaluation.methods import Network, TakeSet, build_take_set
-from ssilk_core.evaluation.metrics import mean_square
-from ssilk_core.evaluation.solver_errors import windows_of
-from ssilk_core.evaluation.takes import takes_of
-from ssilk_core.simulate.characters import PosedCharacters
-from ssilk_core.simulate.incremental_potential import StepInputs
-from ssilk_core.simulate.simulator import StepHistory
+from ssilk_core.physics.simulate.characters import PosedCharacters
+from ssilk_core.physics.simulate.incremental_potential import StepInputs
+from ssilk_core.physics.simulate.simulator import StepHistory
+from ssilk_core.quality.evaluation.methods import Network, TakeSet, build_take_set
+from ssilk_core.quality.evaluation.metrics import mean_square
+from ssilk_core.quality.evaluation.solver_errors import windows_of
+from ssilk_core.quality.evaluation.takes import takes_of
 
 STEP_EVERY, SHOT = 5, 30  # frames between single steps; frames of a shot
 AFTER = (5, 10, 30)  # frames of a shot after which distances are told

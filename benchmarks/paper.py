@@ -27,7 +27,7 @@ from helpers.reports import table
 
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE, SsilkError
 from ssilk_core.training.signals import stop_on_signals
-from ssilk_core.wardrobe.queue import CommandTask, End, Queue
+from ssilk_core.training.wardrobe.queue import CommandTask, End, Queue
 
 ROOT = Path(__file__).parent.parent
 PATHS = (ROOT, ROOT / "usd", ROOT / "benchmarks")

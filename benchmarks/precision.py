@@ -24,15 +24,15 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from safetensors import safe_open
 from torch import Tensor
 
-from ssilk_core.assets import Motion
-from ssilk_core.checkpoint import ModelFile, network, save_model
-from ssilk_core.energy import TERMS
-from ssilk_core.energy.frames import FRAMES_PER_CHUNK
 from ssilk_core.errors import fail
-from ssilk_core.evaluation.splits import chosen, read_index
-from ssilk_core.evaluation.takes import back_and_forth
-from ssilk_core.motion_bank import roll_states
-from ssilk_core.packing import dequantize, quantize
+from ssilk_core.network.checkpoint import ModelFile, network, save_model
+from ssilk_core.network.packing import dequantize, quantize
+from ssilk_core.physics.energy import TERMS
+from ssilk_core.physics.energy.frames import FRAMES_PER_CHUNK
+from ssilk_core.quality.evaluation.splits import chosen, read_index
+from ssilk_core.quality.evaluation.takes import back_and_forth
+from ssilk_core.scene.assets import Motion
+from ssilk_core.training.motion_bank import roll_states
 
 MOST_RMS = 1e-4  # [m] over all vertices, frames and clips
 # [m] any vertex in any frame: amid a cartwheel a rollout makes millimetres of any rounding, for a few frames.

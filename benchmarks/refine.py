@@ -22,14 +22,14 @@ from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
-from ssilk_core.assets import Floats, GarmentPose, Motion
-from ssilk_core.collision import ShownCounts
-from ssilk_core.decomposition import decompose
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import deform, motion_transforms, resample, skinning_matrices
-from ssilk_core.refine import RefineOptions, Refiner
-from ssilk_core.rollout import decode, garment_poses
-from ssilk_core.simulate import SimulationOptions, simulate
+from ssilk_core.network.rollout import decode, garment_poses
+from ssilk_core.physics.refine import RefineOptions, Refiner
+from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.physics.skin.covered_skin import ShownCounts
+from ssilk_core.scene.assets import Floats, GarmentPose, Motion
+from ssilk_core.scene.decomposition import decompose
+from ssilk_core.scene.kinematics import deform, motion_transforms, resample, skinning_matrices
 
 HEADER = ("garment, clip", "iterations", "looks back on", "s a frame", "energy [J]", "inside the body",
           "shows, worst frame", "limbs through", "moved [mm]", "from the simulator [mm]", "jitter [mm]", "own shapes",

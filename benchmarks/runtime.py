@@ -31,16 +31,16 @@ from helpers.reports import table, write_results
 from helpers.subjects import arguments, open_subject, parsed
 from ssilk_usd.read_motion import read_motion
 
-from ssilk_core.assets import PINNED, Motion, Scene
-from ssilk_core.checkpoint import ModelFile, model_file
-from ssilk_core.config import ModelConfig
 from ssilk_core.errors import fail
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import motion_transforms, resample, skin_points, skinning_matrices
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.quality import QUALITIES
-from ssilk_core.reduction import Reducer
-from ssilk_core.runtime import Player
+from ssilk_core.network.checkpoint import ModelFile, model_file
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.runtime import Player
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.quality.levels import QUALITIES
+from ssilk_core.quality.reduction import Reducer
+from ssilk_core.scene.assets import PINNED, Motion, Scene
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 
 VERTICES = (500, 2_500, 10_000, 30_000, 100_000)
 NETWORKS = ((32, (128, 128)), (64, (256, 256)), (128, (256, 256, 256)), (128, (256, 512, 512)))

@@ -28,14 +28,15 @@ from helpers.reports import table, write_results
 from ssilk_usd.shot import write_shot
 from ssilk_usd.units import StageUnits
 
-from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, Motion, ProxyRig, Scene
-from ssilk_core.checkpoint import ModelFile, save_model
-from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.fabrics import Fabric
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.rollout import garment_poses
+from ssilk_core.network.checkpoint import ModelFile, save_model
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.rollout import garment_poses
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Character, Motion, ProxyRig, Scene
+from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
+from ssilk_core.training.settings import TrainConfig
 
 SIZE = synthetic.Size(vertices=2500, body=4000, proxies=20, shapes=64, batch=8, window=6, static_batch=8)
 STEPS, CLIPS, TIMES = 6, 4, 6

@@ -30,12 +30,12 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.stages import demo_body_path
 from ssilk_usd.write import write_motion
 
-from ssilk_core.bake import BakeRequest, BakeTask, plan_layers
-from ssilk_core.bake.inputs import InputContents
+from ssilk_core.delivery.bake import BakeRequest, BakeTask, plan_layers
+from ssilk_core.delivery.bake.inputs import InputContents
+from ssilk_core.delivery.farm.job import FarmJob, read_job, submitted, write_job
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.events import silent
-from ssilk_core.farm.job import FarmJob, read_job, submitted, write_job
 
 CALLS = "openat,newfstatat,statx,access,faccessat2,readlink,rename,unlink,mkdir,chmod,getdents64,fsync"
 READY = "import os, signal, sys, torch, ssilk_usd.layers, ssilk_usd.check, ssilk_usd.read_motion, ssilk_core.cli; "

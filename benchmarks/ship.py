@@ -33,13 +33,13 @@ from precision import (
 )
 from ssilk_usd.read_stage import split_location
 
-from ssilk_core.assets import Motion, Scene
-from ssilk_core.checkpoint import ModelFile, save_model
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import need_trained_on, shipped_path
-from ssilk_core.energy import TERMS
 from ssilk_core.errors import SsilkError, fail
+from ssilk_core.network.checkpoint import ModelFile, save_model
+from ssilk_core.physics.energy import TERMS
+from ssilk_core.scene.assets import Motion, Scene
 
 
 def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:

@@ -21,11 +21,11 @@ from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import CHUNK, Blocks, NetworkTake
 from torch import Tensor
 
-from ssilk_core.assets import Floats
-from ssilk_core.collision import CoveredSkin, ShownCounts
-from ssilk_core.evaluation.splits import read_index
-from ssilk_core.motion_bank import roll_states
-from ssilk_core.simulate import SimulationOptions, simulate
+from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.physics.skin.covered_skin import CoveredSkin, ShownCounts
+from ssilk_core.quality.evaluation.splits import read_index
+from ssilk_core.scene.assets import Floats
+from ssilk_core.training.motion_bank import roll_states
 
 SPLITS = ("valid", "test", "flips")
 HEADER = (

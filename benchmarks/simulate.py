@@ -24,14 +24,14 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_scene
 from torch import Tensor
 
-from ssilk_core.assets import Motion, Scene
+from ssilk_core.authoring.setup.prepare import prepare_scene
 from ssilk_core.devices import select_device
 from ssilk_core.events import TextReporter
-from ssilk_core.fabrics import Fabric
-from ssilk_core.setup.prepare import prepare_scene
-from ssilk_core.simulate import SimulationOptions, Simulator
-from ssilk_core.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.simulate.newton import Solution, SolverOptions
+from ssilk_core.physics.simulate import SimulationOptions, Simulator
+from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.physics.simulate.newton import Solution, SolverOptions
+from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.scene.fabrics import Fabric
 
 HEADER = ("method", "shots at once", "ms per frame and shot", "iterations", "of conjugate gradients",
           "out of balance, median [g]", "within the tolerance", "energy [J]")  # fmt: skip

@@ -19,9 +19,9 @@ from helpers.playing import SKINNING, measured, with_numpy
 from helpers.reports import table, write_results
 from ssilk_usd.read_motion import read_motion
 
-from ssilk_core.checkpoint import load_model
-from ssilk_core.kinematics import resample
-from ssilk_core.runtime import Player
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.network.runtime import Player
+from ssilk_core.scene.kinematics import resample
 
 HEADER = ("model", "proxies", "shapes", "latent", "MB", "network [µs]", "frame [µs]", "best [J]", "last [J]",
           "stretch [J]", "step [mJ]", "step [mm]")  # fmt: skip

@@ -20,9 +20,9 @@ import torch
 from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from torch import Tensor
 
-from ssilk_core.evaluation.splits import read_index
-from ssilk_core.kinematics import resample
-from ssilk_core.simulate import SimulationOptions, Simulator
+from ssilk_core.physics.simulate import SimulationOptions, Simulator
+from ssilk_core.quality.evaluation.splits import read_index
+from ssilk_core.scene.kinematics import resample
 from ssilk_core.training.objective import Objective, Terms
 from ssilk_core.training.validation import Validator
 

@@ -17,8 +17,8 @@ import torch
 from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 
-from ssilk_core.evaluation.splits import chosen, read_index
-from ssilk_core.motion_bank import roll_states
+from ssilk_core.quality.evaluation.splits import chosen, read_index
+from ssilk_core.training.motion_bank import roll_states
 
 HEADER = ("garment", "split", "steps", "mean [mJ]", "median [mJ]", "95 % below [mJ]", "RMS [mm]")
 

@@ -40,13 +40,13 @@ from helpers.subjects import dressed_in
 from helpers.sweeps import ablations
 from ssilk_usd.read_motion import read_motion
 
-from ssilk_core.assets import Motion
-from ssilk_core.checkpoint import ModelFile
 from ssilk_core.errors import SsilkError, fail
-from ssilk_core.evaluation.methods import build_take_set
-from ssilk_core.evaluation.run import SIMULATOR
-from ssilk_core.evaluation.splits import SPLITS
-from ssilk_core.evaluation.takes import takes_of
+from ssilk_core.network.checkpoint import ModelFile
+from ssilk_core.quality.evaluation.methods import build_take_set
+from ssilk_core.quality.evaluation.run import SIMULATOR
+from ssilk_core.quality.evaluation.splits import SPLITS
+from ssilk_core.quality.evaluation.takes import takes_of
+from ssilk_core.scene.assets import Motion
 
 Columns = Mapping[str, tuple[tuple[str, ...], str]]
 """The path to a figure, and the form that it is shown in, by the heading."""

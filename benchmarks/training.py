@@ -35,9 +35,9 @@ from helpers.reports import save_results, write_results
 from helpers.synthetic import Size, stepper
 from helpers.training_tables import tables
 
-from ssilk_core import kernels
-from ssilk_core.config import TrainConfig
 from ssilk_core.devices import select_device
+from ssilk_core.physics import kernels
+from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
 
 SIZES = {

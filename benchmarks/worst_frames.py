@@ -20,11 +20,11 @@ from helpers.subjects import Subject, arguments, clip_of, measure_each, parsed
 from refine import NetworkTake
 from shown_skin import refined_points, seen
 
-from ssilk_core.assets import Floats
-from ssilk_core.collision import CoveredSkin
-from ssilk_core.kinematics import motion_transforms, skin_points, skinning_matrices
-from ssilk_core.mesh.topology import vertex_normals
-from ssilk_core.setup.surface import is_enclosed
+from ssilk_core.authoring.setup.surface import is_enclosed
+from ssilk_core.physics.skin.covered_skin import CoveredSkin
+from ssilk_core.scene.assets import Floats
+from ssilk_core.scene.kinematics import motion_transforms, skin_points, skinning_matrices
+from ssilk_core.scene.mesh.topology import vertex_normals
 
 ITERATIONS = (4, 200)
 BEFORE = 1  # frames before the worst one, for its drag

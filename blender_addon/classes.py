@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from ssilk_usd.names import CLASS, LEVEL
 
-from ssilk_core.assets import LOOSE, PINNED
+from ssilk_core.scene.assets import LOOSE, PINNED
 
 COLORS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # sRGB, by class
 ATTRIBUTE = CLASS.removeprefix("primvars:")  # Blender's USD importer keeps the name

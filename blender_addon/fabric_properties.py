@@ -9,7 +9,7 @@ from dataclasses import fields
 import bpy
 from bpy.props import EnumProperty, FloatProperty
 
-from ssilk_core.fabrics import FABRICS, Fabric
+from ssilk_core.scene.fabrics import FABRICS, Fabric
 
 WORDS = ("stretch_model", "contact_model")
 LENGTHS = ("margin", "thickness")  # shown in the scene's units

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ssilk_core.assets import Mesh
-from ssilk_core.mesh.topology import edge_use
-from ssilk_core.preflight.finding import Finding, format_count
+from ssilk_core.authoring.preflight.finding import Finding
+from ssilk_core.events import format_count
+from ssilk_core.scene.assets import Mesh
+from ssilk_core.scene.mesh.topology import edge_use
 
 HOLES = "body-not-watertight"
 PUSHED = "penetration"  # the finding that Push Out mends; all others are mended by Fix

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.assets import Skeleton
-from ssilk_core.kinematics import local_transforms
+from ssilk_core.scene.assets import Skeleton
+from ssilk_core.scene.kinematics import local_transforms
 
 from .errors import SetupError
 from .names import joint_paths

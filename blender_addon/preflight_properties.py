@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, IntProperty, PointerProperty, StringProperty
 
-from ssilk_core.preflight.finding import Finding
+from ssilk_core.authoring.preflight.finding import Finding
 
 from .scene.mended import mark_of
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, FloatProperty, IntProperty, StringProperty
 
-from ssilk_core.config import PRESETS
+from ssilk_core.training.settings import PRESETS
 
 from .scene.motions import FILE, KINDS
 

@@ -10,6 +10,8 @@ import time
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, TextIO
 
+_ONE = {"vertices": "vertex", "isolated vertices": "isolated vertex"}
+
 
 @dataclass(frozen=True)
 class Started:
@@ -194,6 +196,11 @@ def describe(event: Event) -> str:
         case GarmentEvent():
             return f"{event.name}: {describe(event.said)}"
     return ""
+
+
+def format_count(count: int, elements: str) -> str:
+    """Format a number of elements: "1 vertex", "1,200 faces"."""
+    return f"{count:,} {elements}" if count != 1 else f"1 {_ONE.get(elements, elements.removesuffix('s'))}"
 
 
 def format_seconds(seconds: float) -> str:

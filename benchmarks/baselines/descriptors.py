@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose descriptors of the baselines: features of each joint by itself, made from those of a motion bank.
 
-They have the symmetries of `ssilk_core.descriptors`, so that turning gravity replaces turning the character here too.
-The root's orientation enters as gravity's direction in its frame. Its heading and its place do not enter.
+They have the symmetries of `ssilk_core.network.descriptors`, so that turning gravity replaces turning the character
+here too. The root's orientation enters as gravity's direction in its frame. Its heading and its place do not enter.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ssilk_core.descriptors import RATE_TIME
-from ssilk_core.motion_bank import MotionBank
+from ssilk_core.network.descriptors import RATE_TIME
+from ssilk_core.training.motion_bank import MotionBank
 
 STILL, MOVING, ROOT = 9, 12, 3
 """Features of a joint at rest and in motion, and of the root's motion."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Baselines as methods of `ssilk_core.evaluation`, beside models of 'ssilk train'."""
+"""Baselines as methods of `ssilk_core.quality.evaluation`, beside models of 'ssilk train'."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 import torch
 
 from ssilk_core.cli.evaluate import OpenedModel
-from ssilk_core.evaluation.methods import Network, TakeSet
-from ssilk_core.model.network import GarmentModel
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.quality.evaluation.methods import Network, TakeSet
 
 from .descriptors import joint_bank
 from .files import KEY, load_network

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 
-from ssilk_core.checkpoint import ModelFile, load_model, network, save_model
-from ssilk_core.config import ModelConfig
-from ssilk_core.fabrics import Fabric
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.parameters import Shapes, parameter_shapes
+from ssilk_core.network.checkpoint import ModelFile, load_model, network, save_model
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.parameters import Shapes, parameter_shapes
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.scene.fabrics import Fabric
 
 from .networks import Baseline, BaselineConfig, baseline
 

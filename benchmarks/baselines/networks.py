@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ssilk_core.assets import PINNED, Ints, Scene
 from ssilk_core.errors import fail
-from ssilk_core.skinning import Skinning
+from ssilk_core.physics.skinning import Skinning
+from ssilk_core.scene.assets import PINNED, Ints, Scene
 
 from .descriptors import MOVING, ROOT, STILL, split_features
 
@@ -178,7 +178,7 @@ def baseline(scene: Scene, config: BaselineConfig, joints: Ints, seed: int = 0) 
     Args:
         scene: character, garment and rig.
         config: says which network.
-        joints: character joints in the descriptors, as `ssilk_core.descriptors.descriptor_joints` gives them.
+        joints: character joints in the descriptors, as `ssilk_core.network.descriptors.descriptor_joints` gives them.
         seed: of the initial parameters.
     """
     with torch.random.fork_rng(devices=[]):

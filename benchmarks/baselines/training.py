@@ -6,11 +6,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssilk_core.collision import CollisionBody
-from ssilk_core.config import TrainConfig
-from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail
+from ssilk_core.physics.collision import CollisionBody
+from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.training.objective import Objective, Terms, total
+from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler
 

@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "usd"))
 from mathutils import Matrix
 from ssilk_usd.units import StageUnits
 
-from ssilk_core.assets import Scene
-from ssilk_core.checkpoint import load_model
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.scene.assets import Scene
 
 FRAMES = 300
 UNITS = StageUnits(1.0, "Z")  # of Blender's empty scene

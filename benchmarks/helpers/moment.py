@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from ssilk_core.collision import PosedBody
+from ssilk_core.physics.collision import PosedBody
 from ssilk_core.training.step import Stepper
 
 Tensors = tuple[Tensor, ...]

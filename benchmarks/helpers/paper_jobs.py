@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from ssilk_core.evaluation.splits import read_index, splits_of
+from ssilk_core.quality.evaluation.splits import read_index, splits_of
 
 GARMENTS = ("cape", "hooded_dress", "fringe_skirt", "tshirt", "long_sleeve", "pants")
 BASELINES = ("ncs", "ncs*", "snug")

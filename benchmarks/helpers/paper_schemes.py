@@ -9,9 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssilk_core.config import ModelConfig
-from ssilk_core.model.integrators import Integrator, soft_clamp
-from ssilk_core.schemes import SCHEMES, Scheme
+from ssilk_core.network.model.integrators import Integrator, soft_clamp
+from ssilk_core.network.schemes import SCHEMES, Scheme
+from ssilk_core.network.settings import ModelConfig
 
 
 class Verlet(Integrator):

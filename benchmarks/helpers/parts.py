@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 from torch import Tensor, nn
 
-from ssilk_core import kernels
-from ssilk_core.constants import GRAVITY
+from ssilk_core.physics import kernels
+from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.training.muon import ITERATIONS
 
 from .floors import WARM, WINDOWS, Part, Tensors

@@ -13,16 +13,16 @@ from baselines.descriptors import joint_bank
 from baselines.networks import Baseline, BaselineConfig, baseline
 from torch import Tensor
 
-from ssilk_core.assets import Motion
-from ssilk_core.checkpoint import ModelFile, network
-from ssilk_core.model.batch import DOWN, motion_inputs
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import build_bank
-from ssilk_core.runtime import Player
-from ssilk_core.runtime.character import character_frames
-from ssilk_core.runtime.playback import BLOCK, VERTEX_BLOCK
-from ssilk_core.runtime.skinning import skin_garment
-from ssilk_core.skinning import Skinning, blend_matrices, transform_points
+from ssilk_core.network.checkpoint import ModelFile, network
+from ssilk_core.network.model.batch import DOWN, motion_inputs
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime.character import character_frames
+from ssilk_core.network.runtime.playback import BLOCK, VERTEX_BLOCK
+from ssilk_core.network.runtime.skinning import skin_garment
+from ssilk_core.physics.skinning import Skinning, blend_matrices, transform_points
+from ssilk_core.scene.assets import Motion
+from ssilk_core.training.motion_bank import build_bank
 
 DESCRIPTORS, REST, LATENTS, DECODER, KINEMATICS, SKINNING = PARTS = (
     "descriptors and character", "networks of the poses alone", "latents", "decoder", "proxy kinematics",

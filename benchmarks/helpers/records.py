@@ -11,10 +11,10 @@ from typing import Any
 
 from baselines.files import KEY, load_network
 
-from ssilk_core.checkpoint import ModelFile
 from ssilk_core.devices import device_name, select_device
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
+from ssilk_core.network.checkpoint import ModelFile
 from ssilk_core.training.curve import curve_path
 
 Row = dict[str, Any]

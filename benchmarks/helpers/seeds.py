@@ -13,9 +13,9 @@ from baselines.evaluation import open_network
 from ssilk_core.cli import evaluate as verb
 from ssilk_core.cli import parser
 from ssilk_core.errors import fail
-from ssilk_core.evaluation.run import EvaluationOptions
-from ssilk_core.evaluation.tables import tables
 from ssilk_core.events import silent
+from ssilk_core.quality.evaluation.run import EvaluationOptions
+from ssilk_core.quality.evaluation.tables import tables
 
 from .records import Row, Settings, read_records, settings_of
 

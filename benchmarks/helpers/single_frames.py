@@ -12,9 +12,9 @@ from baselines.evaluation import method_over
 from baselines.networks import Baseline
 from torch import Tensor
 
-from ssilk_core.evaluation.methods import Network, TakeSet
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import LatentModel
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.quality.evaluation.methods import Network, TakeSet
+from ssilk_core.training.motion_bank import LatentModel
 
 from .clock import now
 

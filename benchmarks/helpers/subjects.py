@@ -17,15 +17,15 @@ from ssilk_usd.read_stage import open_stage
 from torch import Tensor
 
 from helpers.reports import table, write_results
-from ssilk_core.assets import Motion, Scene
-from ssilk_core.checkpoint import ModelFile, load_model, network
-from ssilk_core.collision import CollisionBody
 from ssilk_core.devices import select_device
-from ssilk_core.energy import GarmentEnergy
 from ssilk_core.errors import fail
-from ssilk_core.evaluation.methods import EvaluationScene
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import build_bank
+from ssilk_core.network.checkpoint import ModelFile, load_model, network
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.physics.collision import CollisionBody
+from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.quality.evaluation.methods import EvaluationScene
+from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 
 

@@ -11,7 +11,7 @@ from statistics import mean, mode
 from typing import Any
 
 from ssilk_core.errors import fail
-from ssilk_core.evaluation.splits import SPLITS
+from ssilk_core.quality.evaluation.splits import SPLITS
 
 from .records import SETTINGS, Settings
 from .reports import table

@@ -13,7 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ssilk_core.assets import (
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.physics.collision import CollisionBody
+from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
     TIGHT,
@@ -29,14 +33,11 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.collision import CollisionBody
-from ssilk_core.config import ModelConfig, TrainConfig
-from ssilk_core.energy import GarmentEnergy
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import local_transforms, rigid
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import build_bank
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import local_transforms, rigid
+from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.shape_smoothing import ShapeSmoothing
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.windows import WindowSampler

@@ -14,9 +14,9 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from ssilk_usd.names import LAYER_SUFFIXES
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.errors import SsilkError
-from ssilk_core.quality import QUALITIES
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.quality.levels import QUALITIES
 
 from ..errors import SetupError
 from ..joints import Joints, joint_order

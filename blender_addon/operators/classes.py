@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 from bpy.props import EnumProperty, FloatProperty
 
-from ssilk_core.assets import CLASS_NAMES
+from ssilk_core.scene.assets import CLASS_NAMES
 
 from .. import classes as palette
 from ..errors import SetupError

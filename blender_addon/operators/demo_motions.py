@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ssilk_core.assets import Motion
+from ssilk_core.scene.assets import Motion
 
 from ..errors import SetupError
 from ..outside.work import Work

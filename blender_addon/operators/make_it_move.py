@@ -9,8 +9,8 @@ from pathlib import Path
 
 import bpy
 
-from ssilk_core.assets import LOOSE
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene.assets import LOOSE
 
 from ..errors import SetupError
 from ..outside.jobs import read_state

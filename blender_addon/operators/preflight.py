@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ssilk_core.preflight.finding import format_count
+from ssilk_core.events import format_count
 
 from ..errors import SetupError
 from ..findings import PUSHED, Clip, read_findings

@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
-from ssilk_core.assets import LOOSE
+from ssilk_core.scene.assets import LOOSE
 
 from ..errors import SetupError
 from ..fabric_properties import fabric_options

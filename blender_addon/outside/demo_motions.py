@@ -9,10 +9,10 @@ import sys
 
 import numpy as np
 
-from ssilk_core.assets import Skeleton
 from ssilk_core.demo.motions import training_motions
 from ssilk_core.errors import SsilkError
-from ssilk_core.kinematics import local_transforms
+from ssilk_core.scene.assets import Skeleton
+from ssilk_core.scene.kinematics import local_transforms
 
 
 def make(given, made):

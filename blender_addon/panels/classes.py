@@ -6,8 +6,8 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ssilk_core.mesh.topology import components
-from ssilk_core.preflight.finding import format_count
+from ssilk_core.events import format_count
+from ssilk_core.scene.mesh.topology import components
 
 from ..classes import COLORS, LEVELS, adrift, counts
 from ..errors import SetupError

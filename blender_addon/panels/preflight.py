@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ssilk_core.preflight.finding import format_count
+from ssilk_core.events import format_count
 
 from ..operators.preflight import fixer
 from ..preflight_properties import shown_finding

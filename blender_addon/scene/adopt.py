@@ -11,7 +11,7 @@ import re
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Garment, ProxyRig, Skeleton
+from ssilk_core.scene.assets import Garment, ProxyRig, Skeleton
 
 from ..errors import SetupError
 from .armature import MADE, made_collection, proxy_names

@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ssilk_core.assets import ProxyRig
+from ssilk_core.scene.assets import ProxyRig
 
 from ..edits import Edits
 from ..errors import SetupError

@@ -10,7 +10,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from ssilk_core.assets import TIGHT, classes_at
+from ssilk_core.scene.assets import TIGHT, classes_at
 
 from .. import classes as palette
 from ..errors import SetupError

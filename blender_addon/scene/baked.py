@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from ssilk_usd.skinned import BakedGarment, SkinnedGarment
 
-from ssilk_core.kinematics import (
+from ssilk_core.scene.kinematics import (
     local_transforms,
     matrix_from_quaternion,
     multiply_quaternions,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ssilk_core.preflight.finding import Finding
+from ssilk_core.authoring.preflight.finding import Finding
 
 from .armature import is_evenly_scaled
 from .garment import armature_of

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Mesh
-from ssilk_core.mesh.hidden_faces import HiddenFaces, hidden_polygons
+from ssilk_core.physics.skin.hidden_faces import HiddenFaces, hidden_polygons
+from ssilk_core.scene.assets import Mesh
 
 from ..errors import SetupError
 from .cage import cage_points

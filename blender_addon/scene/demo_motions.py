@@ -9,8 +9,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Motion
-from ssilk_core.kinematics import motion_transforms, quaternion_from_matrix
+from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.kinematics import motion_transforms, quaternion_from_matrix
 
 from ..joints import Joints
 from .keys import Channel, new_action

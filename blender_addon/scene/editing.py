@@ -7,7 +7,7 @@ import bmesh
 import bpy
 import numpy as np
 
-from ssilk_core.assets import TIGHT
+from ssilk_core.scene.assets import TIGHT
 
 from .. import classes as palette
 

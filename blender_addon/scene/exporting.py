@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 from mathutils.kdtree import KDTree
 
-from ssilk_core.gltf.skinned import SkinnedGlb
+from ssilk_core.delivery.gltf.skinned import SkinnedGlb
 
 from ..errors import SetupError
 from .shapes import rest_points

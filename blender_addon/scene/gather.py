@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from ssilk_usd.units import StageUnits
 
-from ssilk_core.assets import Body, Character, Garment, Mesh, ProxyRig, SkinWeights
+from ssilk_core.scene.assets import Body, Character, Garment, Mesh, ProxyRig, SkinWeights
 
 from ..errors import SetupError
 from ..joints import Joints

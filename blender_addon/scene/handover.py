@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Garment, ProxyRig
+from ssilk_core.scene.assets import Garment, ProxyRig
 
 from ..errors import SetupError
 from ..outside.wording import reworded

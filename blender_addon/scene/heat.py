@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
-from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
+from ssilk_core.physics.skin.figures import COVER_REACH, SHOW_DEPTH
 
 from .. import heat
 from ..errors import SetupError

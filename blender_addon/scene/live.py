@@ -15,8 +15,8 @@ import bpy
 import numpy as np
 from ssilk_usd.skinned import SkinnedGarment
 
-from ssilk_core.assets import Motion
-from ssilk_core.runtime import Playback
+from ssilk_core.network.runtime import Playback
+from ssilk_core.scene.assets import Motion
 
 from ..errors import SetupError
 from .armature import read_joints

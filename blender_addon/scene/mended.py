@@ -13,11 +13,11 @@ from dataclasses import replace
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Mesh
+from ssilk_core.authoring.preflight import mesh as checks
+from ssilk_core.authoring.preflight.finding import Finding, index_tuple
 from ssilk_core.errors import SsilkError
-from ssilk_core.mesh.topology import edge_use
-from ssilk_core.preflight import mesh as checks
-from ssilk_core.preflight.finding import Finding, index_tuple
+from ssilk_core.scene.assets import Mesh
+from ssilk_core.scene.mesh.topology import edge_use
 
 from ..findings import HOLES, on_polygons, open_edges
 from .checks import MODIFIER, SCALE, scene_findings

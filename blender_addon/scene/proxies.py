@@ -7,7 +7,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ssilk_core.assets import ProxyRig
+from ssilk_core.scene.assets import ProxyRig
 
 from ..edits import Edits, match_proxies
 from ..joints import Joints

@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from ssilk_core.assets import Motion
-from ssilk_core.kinematics import local_transforms, quaternion_from_matrix
+from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.kinematics import local_transforms, quaternion_from_matrix
 
 from ..errors import SetupError
 from ..joints import Joints

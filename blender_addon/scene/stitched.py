@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Which pieces of a garment stitches hold, as `ssilk_core.mesh.stitches` has it, without the scipy that it needs."""
+"""Which pieces of a garment stitches hold, as `ssilk_core.scene.mesh.stitches` has it, but without scipy."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from mathutils.bvhtree import BVHTree
 
-from ssilk_core.mesh.stitches import ABOVE, LEAST_COSINE, SAGITTA, SAME_PLACE, TOUCH
-from ssilk_core.mesh.topology import face_areas, vertex_normals
+from ssilk_core.scene.mesh.stitches import ABOVE, LEAST_COSINE, SAGITTA, SAME_PLACE, TOUCH
+from ssilk_core.scene.mesh.topology import face_areas, vertex_normals
 
 
 class _Feet(NamedTuple):

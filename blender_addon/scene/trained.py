@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.runtime import Player
+from ssilk_core.network.runtime import Player
 
 from ..errors import SetupError
 from ..joints import Joints, joint_order

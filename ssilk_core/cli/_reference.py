@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..assets import Floats
 from ..errors import fail
+from ..scene.assets import Floats
 
 if TYPE_CHECKING:
     from ssilk_usd.play import Shot

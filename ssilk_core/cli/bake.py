@@ -23,7 +23,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .. import bake as library
+from ..delivery import bake as library
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
 from .options import add_bake, add_level, is_folder, layer_options, requests_of

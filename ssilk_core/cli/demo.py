@@ -15,7 +15,7 @@ from ..errors import EXIT_OK, EXIT_WORSE
 from ..events import Message, Reporter, Result
 
 if TYPE_CHECKING:
-    from ..assets import Mesh
+    from ..scene.assets import Mesh
 
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
 

@@ -29,9 +29,9 @@ from . import options as shared
 if TYPE_CHECKING:
     import torch
 
-    from ..checkpoint import ModelFile
-    from ..evaluation.methods import EvaluatedMethod, EvaluationScene, Method, TakeSet
-    from ..evaluation.run import EvaluationClips, EvaluationOptions, ResultRow
+    from ..network.checkpoint import ModelFile
+    from ..quality.evaluation.methods import EvaluatedMethod, EvaluationScene, Method, TakeSet
+    from ..quality.evaluation.run import EvaluationClips, EvaluationOptions, ResultRow
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -55,8 +55,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
-    from ..evaluation.run import EvaluationOptions
-    from ..evaluation.tables import tables
+    from ..quality.evaluation.run import EvaluationOptions
+    from ..quality.evaluation.tables import tables
 
     if options.output:
         if options.output.suffix != ".json":
@@ -95,8 +95,8 @@ Opener = Callable[[Path, "torch.device"], OpenedModel]
 
 def open_model(path: Path, device: torch.device) -> OpenedModel:
     """Open a model of 'ssilk train'; raise `SsilkError` as `checkpoint.load_model` does."""
-    from ..checkpoint import load_model, network
-    from ..evaluation.methods import Network
+    from ..network.checkpoint import load_model, network
+    from ..quality.evaluation.methods import Network
 
     file = load_model(path)
     return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)))
@@ -111,7 +111,7 @@ def evaluated(
         exact: see `evaluation.methods.EvaluationScene`.
     """
     from ..devices import select_device
-    from ..evaluation.run import evaluate
+    from ..quality.evaluation.run import evaluate
 
     device = select_device(options.device)
     opened = [opener(path, device) for path in options.models]
@@ -138,7 +138,7 @@ def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
 
 def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     """Return the methods of one garment, named after their files where several have one name."""
-    from ..evaluation.methods import EvaluatedMethod
+    from ..quality.evaluation.methods import EvaluatedMethod
 
     count = Counter(one.name for one in models)
     names = [one.name if count[one.name] == 1 else f"{one.name} ({one.path.stem})" for one in models]
@@ -149,8 +149,8 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device,
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.read_stage import open_stage
 
-    from ..bake import on_character
-    from ..evaluation.methods import EvaluationScene
+    from ..delivery.bake import on_character
+    from ..quality.evaluation.methods import EvaluationScene
 
     scene = on_character(file, open_stage(options.stage), options.root)
     return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact)
@@ -160,7 +160,7 @@ def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> Evaluati
     """Read the clips that options name, and find the simulator's shots of them."""
     from ssilk_usd.read_motion import read_motion, read_motions
 
-    from ..evaluation.run import EvaluationClips
+    from ..quality.evaluation.run import EvaluationClips
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
@@ -183,7 +183,7 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     """Return the names of clips by split, their files, and the motions of the training."""
     from ssilk_usd.read_motion import motion_files
 
-    from ..evaluation.splits import SPLITS, chosen, read_index, splits_of
+    from ..quality.evaluation.splits import SPLITS, chosen, read_index, splits_of
 
     folder: Path = options.motions
     if not folder.is_dir():

@@ -2,9 +2,9 @@
 """Write a trained model's network as ONNX, for engines that play it themselves.
 
 One call computes one frame of any number of characters. Inputs are the latents of the two previous frames, the
-descriptors of the pose (static ones and rates, see ssilk_core/descriptors.py) and a flag for the first frame. Outputs
-are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot. Where
-proxies move, their local translations follow. Blendshapes and skinning weights are those of any baked shot.
+descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py) and a flag for the first frame.
+Outputs are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot.
+Where proxies move, their local translations follow. Blendshapes and skinning weights are those of any baked shot.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the network; report its inputs and outputs."""
-    from ..checkpoint import load_model, network
-    from ..model.export import export_onnx
-    from ..parameters import descriptor_sizes
+    from ..network.checkpoint import load_model, network
+    from ..network.model.export import export_onnx
+    from ..network.parameters import descriptor_sizes
 
     output: Path = options.output
     if output.suffix != ".onnx":

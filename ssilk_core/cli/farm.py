@@ -14,15 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bake import BakeTask, LayerFolder, plan_layers
+from ..delivery.bake import BakeTask, LayerFolder, plan_layers
+from ..delivery.farm.job import FarmJob, submitted
+from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Countdown, Failed, GarmentEvent, Reporter, Result, Started
-from ..farm.job import FarmJob, submitted
-from ..farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from .options import NumberRange, add_bake, layer_options, requests_of
 
 if TYPE_CHECKING:
-    from ..farm.cluster import TaskOutcome
+    from ..delivery.farm.cluster import TaskOutcome
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -79,7 +79,7 @@ def _write(job: FarmJob, options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporter) -> int:
-    from ..farm.cluster import bake_here, run_on_cluster
+    from ..delivery.farm.cluster import bake_here, run_on_cluster
 
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[TaskOutcome] = []

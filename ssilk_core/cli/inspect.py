@@ -14,18 +14,18 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..config import PRESETS, preset_named
 from ..errors import EXIT_BAD_INPUT, EXIT_OK, SsilkError, fail
 from ..events import Reporter, Result, silent
 from ..files import replacing
+from ..training.settings import PRESETS, preset_named
 from . import options as shared
 
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
-    from ..assets import Motion, Skeleton
-    from ..preflight.inspection import PreflightInput
-    from ..preflight.units import FileUnits
+    from ..authoring.preflight.inspection import PreflightInput
+    from ..authoring.preflight.units import FileUnits
+    from ..scene.assets import Motion, Skeleton
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -46,8 +46,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Inspect; return 0, or 2 when there are errors."""
-    from ..preflight.inspection import inspect
-    from ..preflight.table import format_findings
+    from ..authoring.preflight.inspection import inspect
+    from ..authoring.preflight.table import format_findings
 
     inputs, repaired = _read_inputs(options, report), None
     if options.fix:
@@ -69,8 +69,8 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     from ssilk_usd.facts import animated
     from ssilk_usd.repair import repair_lock
 
-    from ..preflight.inspection import PreflightInput
-    from ..preflight.motion import MotionFile
+    from ..authoring.preflight.inspection import PreflightInput
+    from ..authoring.preflight.motion import MotionFile
 
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
@@ -110,7 +110,7 @@ def _default_preset() -> str:
 def _units(path: Path) -> FileUnits:
     from ssilk_usd.facts import stage_facts
 
-    from ..preflight.units import FileUnits
+    from ..authoring.preflight.units import FileUnits
 
     facts = stage_facts(path)
     return FileUnits(
@@ -122,7 +122,7 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
     """Write the repaired copy; return what was repaired."""
     from ssilk_usd.repair import write_repaired, write_with_units
 
-    from ..preflight.repair import plan_repair
+    from ..authoring.preflight.repair import plan_repair
 
     file, prim = shared.wardrobe(options)
     units, stated = _corrected_units(inputs)
@@ -142,8 +142,8 @@ def _corrected_units(inputs: PreflightInput) -> tuple[StageUnits, list[str]]:
     """Return the units that the garment's file should state, and in words those that it did not."""
     from ssilk_usd.units import StageUnits
 
-    from ..preflight.fit import find_unit_correction
-    from ..preflight.units import find_upright_units
+    from ..authoring.preflight.fit import find_unit_correction
+    from ..authoring.preflight.units import find_upright_units
 
     body, old = inputs.character.merged_body().mesh, inputs.garment_units
     shared_file = inputs.character_units == old

@@ -9,20 +9,20 @@ from math import nan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..bake import BakeRequest, naming
-from ..bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME, REFINED_OUTPUTS
-from ..config import apply_overrides
+from ..delivery.bake import BakeRequest, naming
+from ..delivery.bake.request import MAX_HANDLES, MAX_PRE_ROLL, MAX_REFINE, MAX_SAMPLES_PER_FRAME, REFINED_OUTPUTS
+from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
 from ..files import need_not_input, need_writable
-from ..kinematics import MAX_FPS, MIN_FPS
-from ..quality import QUALITIES
-from ..targets import TARGETS
+from ..network.settings import apply_overrides
+from ..quality.levels import QUALITIES
+from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
+from ..scene.kinematics import MAX_FPS, MIN_FPS
 
 if TYPE_CHECKING:
-    from ..assets import Character, Garment, ProxyRig, Scene, SurfaceMaterial
-    from ..setup.rig import RigOptions
+    from ..authoring.setup.rig import RigOptions
+    from ..scene.assets import Character, Garment, ProxyRig, Scene, SurfaceMaterial
 
 
 STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
@@ -79,7 +79,7 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
     Raises:
         SsilkError: an unknown property, a bad value, or a fabric without stitches for islands that these alone hold.
     """
-    from ..setup.hosts import need_stitch
+    from ..authoring.setup.hosts import need_stitch
 
     if options.fabric or garment.surface is None:
         found = asked_fabric(options)
@@ -314,7 +314,7 @@ def load_scene(
     rigging: RigOptions | None = None,
 ) -> Scene:
     """Read a scene and make the weights, classes and rig that it lacks, as `rigging` says."""
-    from ..setup.prepare import prepare_scene
+    from ..authoring.setup.prepare import prepare_scene
 
     character, garment, rig = read(options, report)
     return prepare_scene(character, garment, rig, rig_options=rigging, report=report)

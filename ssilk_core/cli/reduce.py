@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
-from ..quality import SizeReduction, size_at, spend
+from ..quality.levels import SizeReduction, size_at, spend
 from . import options as shared
 
 NUMBERS = ("shapes", "joints", "influences")
 
 if TYPE_CHECKING:
-    from ..assets import Motion
-    from ..checkpoint import ModelFile
-    from ..reduction import ReducedModel, Reducer
+    from ..network.checkpoint import ModelFile
+    from ..quality.reduction import ReducedModel, Reducer
+    from ..scene.assets import Motion
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -45,8 +45,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Reduce and write."""
     from ssilk_usd.read_motion import motion_files
 
-    from ..checkpoint import load_model, save_model
-    from ..reduction import Reducer
+    from ..network.checkpoint import load_model, save_model
+    from ..quality.reduction import Reducer
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
@@ -83,7 +83,7 @@ def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
 
 def _chosen(options: argparse.Namespace, reducer: Reducer, motions: list[Motion], report: Reporter) -> ReducedModel:
     """Return the model that the options ask for."""
-    from ..cost import model_bytes
+    from ..quality.cost import model_bytes
 
     named = {name: value for name in NUMBERS if (value := getattr(options, name)) is not None}
     size = replace(size_at(options.quality, reducer.whole), **named)

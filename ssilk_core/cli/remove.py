@@ -23,7 +23,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Remove."""
-    from ..bake.shots import remove_layers
+    from ..delivery.bake.shots import remove_layers
 
     removed = remove_layers(options.folder, options.names, report)
     report(Result("remove", {"removed": removed, "output": str(options.folder)}))

@@ -16,15 +16,15 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
-from ..fabrics import Fabric, fabric_of_file
 from ..files import replacing
-from ..shown_skin import ShownSkin
+from ..physics.skin.figures import ShownSkin
+from ..scene.fabrics import Fabric, fabric_of_file
 from .options import check_output
 
 if TYPE_CHECKING:
     from ssilk_usd.garment_api import GarmentRecord
 
-    from ..report.page import Section
+    from ..delivery.report.page import Section
 
 MODEL = ".safetensors"
 
@@ -43,8 +43,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Measure, draw and write."""
-    from ..report.figures import section_of
-    from ..report.page import page
+    from ..delivery.report.figures import section_of
+    from ..delivery.report.page import page
 
     _check(options)
     given = [section_of(path) for path in options.figures]
@@ -89,8 +89,8 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ssilk_usd.provenance import read_provenance
     from ssilk_usd.read_shot import read_parts
 
-    from ..report.page import Section, facts
-    from ..report.shots import ShotGarment, shot_sections
+    from ..delivery.report.page import Section, facts
+    from ..delivery.report.shots import ShotGarment, shot_sections
 
     shot = Shot(open_with_full_bodies(path))  # cloth is measured against all of the body
     parts = read_parts(shot)
@@ -121,9 +121,9 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Return the sections of a model, its provenance last."""
-    from ..checkpoint import load_model
-    from ..report.figures import learning_of
-    from ..report.page import Section, facts
+    from ..delivery.report.figures import learning_of
+    from ..delivery.report.page import Section, facts
+    from ..network.checkpoint import load_model
 
     path: Path = options.subject
     file = load_model(path)
@@ -144,7 +144,7 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Bake a model and return the sections of the shot without its provenance."""
     from ssilk_usd.shot import write_shot
 
-    from ..bake import BakeRequest, load_rollout
+    from ..delivery.bake import BakeRequest, load_rollout
 
     model, stage, motion = (str(path) for path in (options.subject, options.stage, options.motion))
     rollout = load_rollout(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))

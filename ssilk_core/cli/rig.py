@@ -13,14 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..authoring.setup.classes import USUAL
+from ..authoring.setup.rig import RigOptions
 from ..errors import EXIT_OK
 from ..events import Message, Reporter, Result, Started
-from ..setup.classes import USUAL
-from ..setup.rig import RigOptions
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..assets import Character, Garment
+    from ..scene.assets import Character, Garment
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -52,8 +52,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     import numpy as np
     from ssilk_usd.rig_io import write_rigged_stage
 
-    from ..assets import CLASS_NAMES
-    from ..setup.prepare import prepare_scene
+    from ..authoring.setup.prepare import prepare_scene
+    from ..scene.assets import CLASS_NAMES
 
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
     report(Started("rig", options.proxies))
@@ -88,8 +88,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def settled_garment(character: Character, garment: Garment, report: Reporter) -> Garment | None:
     """Return the garment settled out of the body, and say what moves; None if nothing of it lies in the body."""
-    from ..preflight.fit import describe_left, describe_move
-    from ..preflight.settle import settle
+    from ..authoring.preflight.fit import describe_left, describe_move
+    from ..authoring.preflight.settle import settle
 
     mesh = garment.mesh
     settled = settle(mesh, character.merged_body().mesh)

@@ -22,22 +22,22 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from ..bake import naming
-from ..bake.request import parse_range
+from ..delivery.bake import naming
+from ..delivery.bake.request import parse_range
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from ..fabrics import Fabric
 from ..files import replacing
+from ..scene.fabrics import Fabric
 from . import options as shared
 
 if TYPE_CHECKING:
     import torch
     from ssilk_usd.points import PointCache
 
-    from ..assets import Floats, Motion, Scene
-    from ..bake.result import ShotShapes
-    from ..simulate import SimulationOptions
-    from ..simulate.simulator import SimulatedFrame
+    from ..delivery.bake.result import ShotShapes
+    from ..physics.simulate import SimulationOptions
+    from ..physics.simulate.simulator import SimulatedFrame
+    from ..scene.assets import Floats, Motion, Scene
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -83,8 +83,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.read_motion import motion_files
 
     from ..devices import select_device
-    from ..simulate import SimulationOptions
-    from ..simulate.newton import SolverOptions
+    from ..physics.simulate import SimulationOptions
+    from ..physics.simulate.newton import SolverOptions
 
     frames = parse_range(options.range or "all")
     outputs = _outputs(options.output, list(map(str, options.motion)), options.shot_name)
@@ -174,7 +174,7 @@ def _written(
     report: Reporter,
 ) -> dict[str, object]:
     """Simulate into open files, frame by frame; return figures for people."""
-    from ..simulate import Simulator, shots_of
+    from ..physics.simulate import Simulator, shots_of
 
     simulator = Simulator(scene, fabric, settings, device=device, report=report)
     motions = [shot.motion for shot in shots]
@@ -251,7 +251,7 @@ class _Caches:
         """Turn the points of a shot into joints and blendshapes."""
         from ssilk_usd.trajectories import MeshTrajectories
 
-        from ..bake import rig_deformer, skin_trajectories
+        from ..delivery.bake import rig_deformer, skin_trajectories
 
         asked, path = self.shots[shot], self._path(shot)
         try:
@@ -298,7 +298,7 @@ class _Caches:
 
 def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> dict[str, str | float]:
     """Return everything that decides what a shot's file holds."""
-    from ..bake.inputs import stage_contents
+    from ..delivery.bake.inputs import stage_contents
 
     garment, _ = shared.wardrobe(options)
     names = ("fps", "tolerance", "iterations", "points", "no_body")

@@ -15,13 +15,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..delivery.targets import TARGETS
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
-from ..targets import TARGETS
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..assets import Deformer
+    from ..scene.assets import Deformer
 
 LARGEST = 5  # times the RMS tolerance: how far any vertex may be off
 
@@ -54,9 +54,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.trajectories import MeshTrajectories
     from ssilk_usd.units import StageUnits
 
-    from ..bake import cache_origin, motion_at, skin_trajectories
-    from ..decomposition import FitTolerance
-    from ..targets import cap_influences
+    from ..delivery.bake import cache_origin, motion_at, skin_trajectories
+    from ..delivery.targets import cap_influences
+    from ..scene.decomposition import FitTolerance
 
     target, where = TARGETS[options.target], options.motion or split_location(options.cache)[0]
     if options.output.suffix not in target.suffixes:
@@ -92,7 +92,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _deformer(options: argparse.Namespace, report: Reporter) -> Deformer:
     """Return the garment on its character: with a model's weights, or with those of the stage."""
-    from ..bake import rig_deformer, trained_deformer
+    from ..delivery.bake import rig_deformer, trained_deformer
 
     if options.model is None:
         return rig_deformer(shared.load_scene(options, report))

@@ -19,8 +19,8 @@ from ..events import Countdown, Message, Reporter, Result, Started
 from .options import check_output
 
 if TYPE_CHECKING:
-    from ..stress.outcome import CaseOutcome
-    from ..stress.subject import StressSubject
+    from ..quality.stress.outcome import CaseOutcome
+    from ..quality.stress.subject import StressSubject
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -45,8 +45,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Run the cases and tabulate them."""
-    from ..stress.cases import CASES
-    from ..stress.outcome import markdown
+    from ..quality.stress.cases import CASES
+    from ..quality.stress.outcome import markdown
 
     if options.output:
         check_output(options.output, options.model, options.stage)
@@ -79,9 +79,9 @@ def _subject(options: argparse.Namespace) -> StressSubject:
     from ssilk_usd.read_motion import read_motion
     from ssilk_usd.read_stage import open_stage
 
-    from ..bake import on_character
-    from ..checkpoint import load_model
-    from ..stress.subject import FULL, QUICK, StressSubject
+    from ..delivery.bake import on_character
+    from ..network.checkpoint import load_model
+    from ..quality.stress.subject import FULL, QUICK, StressSubject
 
     file = load_model(options.model)
     scene = on_character(file, open_stage(options.stage), options.root)

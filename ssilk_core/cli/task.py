@@ -11,11 +11,11 @@ import argparse
 import signal
 from pathlib import Path
 
+from ..delivery.farm.job import read_job
+from ..delivery.farm.openjd import OpenJdReporter
+from ..delivery.farm.work import bake_tasks, check_tasks
 from ..errors import EXIT_OK, EXIT_TASKS
 from ..events import Reporter
-from ..farm.job import read_job
-from ..farm.openjd import OpenJdReporter
-from ..farm.work import bake_tasks, check_tasks
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:

@@ -27,12 +27,12 @@ from ..events import Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..assets import Motion
-    from ..bake import BakeRollout
-    from ..checkpoint import ModelFile
-    from ..cost import ShotBytes
-    from ..evaluation.methods import EvaluationScene
-    from ..trade.measure import StoredTake, VariantMeter, Weigh
+    from ..delivery.bake import BakeRollout
+    from ..network.checkpoint import ModelFile
+    from ..quality.cost import ShotBytes
+    from ..quality.evaluation.methods import EvaluationScene
+    from ..quality.trade.measure import StoredTake, VariantMeter, Weigh
+    from ..scene.assets import Motion
 
 CLIPS = 2  # are measured on where --clips names none
 FRAMES = 60  # two seconds of each, for which the simulator of a cape takes a quarter of an hour on a processor
@@ -59,12 +59,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0, or 4 where variants could not be measured."""
-    from ..charts import write_chart
-    from ..trade.collision_cost import measure_collisions
-    from ..trade.plot import trade_panels
-    from ..trade.sweep import Results, sweep
-    from ..trade.table import caption, collision_table, table
-    from ..trade.variants import SIMULATOR, other_network, variants
+    from ..quality.charts import write_chart
+    from ..quality.trade.collision_cost import measure_collisions
+    from ..quality.trade.plot import trade_panels
+    from ..quality.trade.sweep import Results, sweep
+    from ..quality.trade.table import caption, collision_table, table
+    from ..quality.trade.variants import SIMULATOR, other_network, variants
 
     if options.output:
         if options.output.suffix != ".json":
@@ -115,10 +115,10 @@ class Bench:
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
-        from ..checkpoint import load_model
         from ..devices import select_device
-        from ..evaluation.takes import takes_of, within
         from ..files import sha256
+        from ..network.checkpoint import load_model
+        from ..quality.evaluation.takes import takes_of, within
 
         self.options, self.device = options, select_device(options.device)
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
@@ -171,9 +171,9 @@ class Bench:
 
     def meter(self, path: Path, file: ModelFile) -> VariantMeter:
         """Return the meter of a model on all takes, reduced for other motions."""
-        from ..evaluation.methods import build_take_set
-        from ..reduction import Reducer
-        from ..trade.measure import VariantMeter
+        from ..quality.evaluation.methods import build_take_set
+        from ..quality.reduction import Reducer
+        from ..quality.trade.measure import VariantMeter
 
         dressed = self._dressed(file)
         take_set = build_take_set(self.takes, dressed, file.joints)
@@ -183,15 +183,15 @@ class Bench:
         """Put a garment on the character of the stage."""
         from ssilk_usd.read_stage import open_stage
 
-        from ..bake import on_character
-        from ..evaluation.methods import EvaluationScene
+        from ..delivery.bake import on_character
+        from ..quality.evaluation.methods import EvaluationScene
 
         scene = on_character(file, open_stage(self.options.stage), self.options.root)
         return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
 
     def _weigh(self, path: Path) -> Weigh:
         """Return a function that gives the size of a model's shots of the first clip, without the body."""
-        from ..bake import BakeRequest, load_rollout, shot_bytes, stored_bytes, with_model
+        from ..delivery.bake import BakeRequest, load_rollout, shot_bytes, stored_bytes, with_model
 
         motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
 

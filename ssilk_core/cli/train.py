@@ -13,11 +13,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
 from ..events import Message, Reporter, Result, silent
-from ..wardrobe.training import WORSE_FIGURE
+from ..network.settings import ModelConfig, apply_overrides
+from ..training.settings import PRESETS, TrainConfig, preset_named
+from ..training.wardrobe.training import WORSE_FIGURE
 from . import options as shared
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .. import bake
+from ..delivery import bake
 from ..errors import EXIT_OK
 from ..events import Reporter
 

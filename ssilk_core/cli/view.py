@@ -21,7 +21,7 @@ from ..files import replacing
 from .options import RATE, NumberRange, check_output
 
 if TYPE_CHECKING:
-    from ..view.player import ShotPlayer
+    from ..delivery.view.player import ShotPlayer
 
 PAGE = ".html"
 
@@ -49,9 +49,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
-    from ..bake.opened import open_shot
-    from ..view.output import FILM, PICTURE, check_suffix
-    from ..view.shots import film_of_shots, sheet_of_shots
+    from ..delivery.bake.opened import open_shot
+    from ..delivery.view.output import FILM, PICTURE, check_suffix
+    from ..delivery.view.shots import film_of_shots, sheet_of_shots
 
     suffix = check_suffix(options.output, (FILM, PICTURE, PAGE))
     film = suffix == FILM
@@ -78,8 +78,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _write_page(path: Path, players: Sequence[ShotPlayer], labels: Sequence[str], report: Reporter) -> int:
     """Write a page that plays shots; return the number of their frames."""
-    from ..report.page import Section, page
-    from ..report.player import played
+    from ..delivery.report.page import Section, page
+    from ..delivery.report.player import played
 
     title = ", ".join(labels) or path.stem
     text = page(title, [Section("The shot", played(players, labels, report), plays=True)])
@@ -89,7 +89,7 @@ def _write_page(path: Path, players: Sequence[ShotPlayer], labels: Sequence[str]
 
 
 def _look(options: argparse.Namespace, film: bool):  # type: ignore[no-untyped-def]  # Look is heavy to import
-    from ..view.shots import Look
+    from ..delivery.view.shots import Look
 
     width, height = (480, 640) if film else (320, 440)
     if options.size is not None:

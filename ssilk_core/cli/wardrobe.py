@@ -29,10 +29,10 @@ from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
-from ..wardrobe.listing import WardrobeEntry, read_list
-from ..wardrobe.panel import ProgressTable, table
-from ..wardrobe.queue import End, Queue, Slot
-from ..wardrobe.training import GarmentTraining
+from ..training.wardrobe.listing import WardrobeEntry, read_list
+from ..training.wardrobe.panel import ProgressTable, table
+from ..training.wardrobe.queue import End, Queue, Slot
+from ..training.wardrobe.training import GarmentTraining
 from ..work_record import request_key
 from . import options as shared
 from . import train

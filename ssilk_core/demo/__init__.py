@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `ssilk demo` shows without any file of the user's: garments, motions and trained models.
+
+In: the demo body. Out: garment meshes, motions, and the models that ship, in `models/`.
+Open `shipped.py` first: it says which models ship and which garments they fit.
+"""

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..assets import Character, Floats, Garment, Ints, Mesh
 from ..errors import fail
+from ..scene.assets import Character, Floats, Garment, Ints, Mesh
 from .garments_dress import hooded_dress
 from .garments_fit import BodyFit, fit, outline, relax, through
 from .garments_mesh import loft

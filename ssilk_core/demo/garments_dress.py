@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Ints
+from ..scene.assets import Floats, Ints
 from .garments_fit import BodyFit, keep_off, outline, relax, through
 from .garments_mesh import cap, cut, length, loft
 

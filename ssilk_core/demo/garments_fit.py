@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..assets import Character, Floats, Ints
+from ..scene.assets import Character, Floats, Ints
 
 # Where joints stand in a standing adult, as (left, up) fractions of the height: used when a rig names them otherwise.
 PROPORTIONS = {

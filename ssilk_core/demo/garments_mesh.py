@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats, Ints
-from ..mesh.topology import border_vertices, edge_use
+from ..scene.assets import Floats, Ints
+from ..scene.mesh.topology import border_vertices, edge_use
 
 
 def along(line: Floats, count: int) -> Floats:

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Motion, Skeleton
 from ..errors import fail
-from ..kinematics import (
+from ..scene.assets import Floats, Motion, Skeleton
+from ..scene.kinematics import (
     invert_rigid,
     matrix_from_quaternion,
     multiply_quaternions,

@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..assets import Floats, Motion, Skeleton
 from ..errors import fail
-from ..kinematics import invert_rigid, quaternion_from_matrix
+from ..scene.assets import Floats, Motion, Skeleton
+from ..scene.kinematics import invert_rigid, quaternion_from_matrix
 from .motions_curves import FPS, about, apply, ease, euler_rotations
 
 SIDE_NAMES = ("Left", "Right")

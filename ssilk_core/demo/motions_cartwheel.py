@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats
+from ..scene.assets import Floats
 from .motions_biped import OUTWARD, SIDE_NAMES, Biped, Track
 from .motions_curves import about, apply, bump, clock, ease, keyframes
 

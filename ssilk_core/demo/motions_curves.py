@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..assets import Floats
+from ..scene.assets import Floats
 
 FPS = 30.0
 

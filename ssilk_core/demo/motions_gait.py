@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..assets import Floats
+from ..scene.assets import Floats
 from .motions_biped import OUTWARD, Biped, Track
 from .motions_curves import FPS, about, apply, bump, clock, ease, euler_rotations, keyframes, travel
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..assets import Floats
-from ..constants import GRAVITY
+from ..physics.constants import GRAVITY
+from ..scene.assets import Floats
 from .motions_biped import Biped, Track
 from .motions_curves import about, bump, clock, ease, keyframes, ramp
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..assets import Floats
+from ..scene.assets import Floats
 from .motions_biped import Biped, Track
 from .motions_curves import about, apply, clock, ease, keyframes, travel
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..assets import Mesh
-from ..checkpoint import ModelFile, load_model
 from ..errors import fail
+from ..network.checkpoint import ModelFile, load_model
+from ..scene.assets import Mesh
 
 FOLDER = Path(__file__).with_name("models")
 TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ..config import MOST_OF_ALL, TrainConfig
 from ..errors import fail
-from ..preflight.cost import SECONDS_PER_SAMPLE, step_seconds, trained_frames
+from .prediction import SECONDS_PER_SAMPLE, step_seconds, trained_frames
+from .settings import MOST_OF_ALL, TrainConfig
 from .step import EAGER_STEPS, Stepper
 
 PLANNED_SHARE = 0.98  # of the remaining time

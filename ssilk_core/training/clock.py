@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import inf
 
-from ..config import TrainConfig
 from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule
 from .job import TrainJob
+from .settings import TrainConfig
 from .state import RunState
 
 PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor

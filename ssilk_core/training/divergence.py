@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from ..assets import Motion
 from ..files import replacing
-from ..kinematics import MAX_JOINT_SPEED
-from ..motion_bank import MotionBank, usable_spans
-from ..tensors import pack_tensors
+from ..network.tensors import pack_tensors
+from ..scene.assets import Motion
+from ..scene.kinematics import MAX_JOINT_SPEED
+from .motion_bank import MotionBank, usable_spans
 from .skipped_steps import SkippedSteps
 from .state import learned_tensors
 from .step import Stepper

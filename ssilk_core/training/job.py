@@ -9,13 +9,14 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from ..assets import LOOSE, PINNED, Motion, Scene
-from ..config import ModelConfig, TrainConfig
 from ..errors import fail
-from ..fabrics import Fabric
-from ..mesh.stitches import find_stitches
+from ..network.settings import ModelConfig
+from ..scene.assets import LOOSE, PINNED, Motion, Scene
+from ..scene.fabrics import Fabric
+from ..scene.mesh.stitches import find_stitches
 from .perturb import perturb_motions
 from .recombine import recombine_motions
+from .settings import TrainConfig
 from .state import json_round_trip, scene_digest
 
 MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extra motions are left out for it

@@ -8,7 +8,7 @@ from math import log
 import torch
 from torch import Tensor
 
-from ..model.network import GarmentModel
+from ..network.model.network import GarmentModel
 
 MIN_DISTANCE = 1e-6  # floor for distances of latents, and of garments [m], before the logarithm
 

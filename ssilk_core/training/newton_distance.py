@@ -16,10 +16,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..assets import Scene
-from ..energy import GarmentEnergy
-from ..simulate.hessian import Hessian
-from ..simulate.membrane import outer
+from ..physics.energy import GarmentEnergy
+from ..physics.simulate.hessian import Hessian
+from ..physics.simulate.membrane import outer
+from ..scene.assets import Scene
 
 Planes = tuple[Tensor, Tensor]
 EVERY = 4  # of so many frames one is solved; its part of the gradient counts for all of them

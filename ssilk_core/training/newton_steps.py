@@ -18,12 +18,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ..assets import Scene
-from ..collision import PosedBody
-from ..constants import GRAVITY
-from ..fabrics import Fabric
-from ..simulate.incremental_potential import IncrementalPotential, StepInputs
-from ..simulate.newton import State, newton_step
+from ..physics.collision import PosedBody
+from ..physics.constants import GRAVITY
+from ..physics.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ..physics.simulate.newton import State, newton_step
+from ..scene.assets import Scene
+from ..scene.fabrics import Fabric
 
 REDUCTION, CG_ITERATIONS = 0.01, 300  # of the residual by the linear solve, and its longest
 VERTICES_AT_ONCE = 160_000  # of all frames whose Hessians are in memory together

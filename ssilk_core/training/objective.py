@@ -6,15 +6,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..assets import SkinWeights
-from ..collision import CollisionBody, Contacts
-from ..collision.contacts import no_planes
-from ..constants import GRAVITY
-from ..energy import GarmentEnergy
-from ..model.network import GarmentModel
-from ..motion_bank import MotionBank
-from ..skinning import Skinning
+from ..network.model.network import GarmentModel
+from ..physics.collision import CollisionBody, Contacts
+from ..physics.collision.contacts import no_planes
+from ..physics.constants import GRAVITY
+from ..physics.energy import GarmentEnergy
+from ..physics.skinning import Skinning
+from ..scene.assets import SkinWeights
 from .latent_regularization import latent_distortion
+from .motion_bank import MotionBank
 from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 

@@ -15,9 +15,9 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from ..config import TrainConfig
 from ..devices import select_device
 from ..errors import SsilkError, fail
+from .settings import TrainConfig
 
 BATCH_SETTINGS = ("batch", "pretraining_batch", "static_batch")  # totals over all processes
 TORCHRUN_VARIABLES = ("RANK", "LOCAL_RANK", "WORLD_SIZE")

@@ -9,17 +9,16 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ..collision import CollisionBody, limb_axes, reachable_body
-from ..config import TrainConfig
-from ..energy import GarmentEnergy
-from ..events import Message, Reporter, silent
-from ..kinematics import MAX_JOINT_SPEED
-from ..model.network import GarmentModel, model_joints
-from ..motion_bank import MotionBank, build_bank, usable_spans
-from ..preflight.finding import format_count
+from ..events import Message, Reporter, format_count, silent
+from ..network.model.network import GarmentModel, model_joints
+from ..physics.collision import CollisionBody, limb_axes, reachable_body
+from ..physics.energy import GarmentEnergy
+from ..scene.kinematics import MAX_JOINT_SPEED
 from .job import TrainJob
+from .motion_bank import MotionBank, build_bank, usable_spans
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
+from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
 from .step import Stepper
 from .validation import Validator

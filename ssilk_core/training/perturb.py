@@ -13,9 +13,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Ints, Motion, Skeleton
-from ..constants import GRAVITY
-from ..kinematics import bind_pose, matrix_from_quaternion, motion_transforms, multiply_quaternions, slerp
+from ..physics.constants import GRAVITY
+from ..scene.assets import Floats, Ints, Motion, Skeleton
+from ..scene.kinematics import bind_pose, matrix_from_quaternion, motion_transforms, multiply_quaternions, slerp
 from .recombine import limb_joints
 
 USUAL_TURN, LARGE_TURN = np.radians(12), np.radians(35)  # standard deviation about each axis

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..assets import Floats, Ints, Motion, Skeleton
-from ..kinematics import resample
+from ..scene.assets import Floats, Ints, Motion, Skeleton
+from ..scene.kinematics import resample
 
 LIMB_PROBABILITY = 0.4  # that a limb moves as in another clip
 

@@ -14,21 +14,20 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from ..config import MOST_SMOOTHED_VERTICES, TrainConfig
 from ..devices import select_device
 from ..errors import fail
-from ..events import Checkpoint, Message, Progress, Reporter, Started
-from ..kinematics import MAX_JOINT_SPEED, split_at_cuts
-from ..memory import StepMemory, decoded_frames, fits_in_memory, free_memory
-from ..preflight.finding import format_count
+from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
+from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
 from .budget import check_estimate, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
+from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .parts import build_parts
 from .run_files import RunFiles
+from .settings import MOST_SMOOTHED_VERTICES, TrainConfig
 from .state import Best, ReducedSettings, RunState, learned_tensors, load_state, restore, restore_learned
 from .validation import Score
 from .verdict import non_finite_terms, validation_message

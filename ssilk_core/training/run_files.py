@@ -10,10 +10,10 @@ from typing import Any
 import torch
 
 from .. import __version__
-from ..checkpoint import model_file, save_model
 from ..devices import device_name
 from ..files import remove_unfinished
-from ..model.network import GarmentModel
+from ..network.checkpoint import model_file, save_model
+from ..network.model.network import GarmentModel
 from .curve import curve_path, summary, write_curve
 from .divergence import fault_path, save_fault
 from .job import TrainJob

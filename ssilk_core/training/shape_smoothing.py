@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..assets import Mesh
-from ..config import MOST_SMOOTHED_VERTICES
-from ..mesh.laplacian import cotangent_weights, laplacian
-from ..mesh.topology import edges, vertex_areas
-from ..model.network import GarmentModel
+from ..network.model.network import GarmentModel
+from ..scene.assets import Mesh
+from ..scene.mesh.laplacian import cotangent_weights, laplacian
+from ..scene.mesh.topology import edges, vertex_areas
+from .settings import MOST_SMOOTHED_VERTICES
 
 COTANGENTS = (0.0, 5.0)  # bounds of the edge weights: S must not overshoot, and slivers must not weigh more
 LEAST_AREA = 1e-6  # of a vertex, relative to the mean: one without faces has none, and moves by itself

@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..assets import Scene
-from ..config import TrainConfig
 from ..errors import SsilkError, fail
-from ..fabrics import fabric_of_file
 from ..files import replacing
-from ..tensors import pack_tensors, read_tensors
+from ..network.tensors import pack_tensors, read_tensors
+from ..scene.assets import Scene
+from ..scene.fabrics import fabric_of_file
 from .curve import CurvePoint
+from .settings import TrainConfig
 from .step import Stepper
 from .validation import Score
 

@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..config import TrainConfig
-from ..model.network import GarmentModel
+from ..network.model.network import GarmentModel
 from .muon import Muon
 from .objective import Objective, total
+from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
 from .skipped_steps import SkippedSteps
 from .windows import WindowSampler

@@ -14,13 +14,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..assets import Motion, Scene
-from ..collision import CollisionBody, Contacts, CoveredSkin, ShownCounts
-from ..energy import TERMS, GarmentEnergy
-from ..energy.frames import FRAMES_PER_CHUNK, energy_terms
-from ..motion_bank import LatentModel, MotionBank, roll_states
-from ..shown_skin import ShownSkin
-from ..skinning import Skinning
+from ..physics.collision import CollisionBody, Contacts
+from ..physics.energy import TERMS, GarmentEnergy
+from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
+from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
+from ..physics.skin.figures import ShownSkin
+from ..physics.skinning import Skinning
+from ..scene.assets import Motion, Scene
+from .motion_bank import LatentModel, MotionBank, roll_states
 from .newton_steps import NewtonSteps
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .step_errors import StepErrors

@@ -8,7 +8,7 @@ from math import ceil, isfinite
 from typing import TYPE_CHECKING, Any
 
 from ..events import Message
-from ..shown_skin import MOST_MEAN, MOST_WORST
+from ..physics.skin.figures import MOST_MEAN, MOST_WORST
 
 if TYPE_CHECKING:
     from .validation import Score

@@ -6,9 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..config import TrainConfig
 from ..errors import fail
-from ..motion_bank import MotionBank
+from .motion_bank import MotionBank
+from .settings import TrainConfig
 
 
 def random_directions(count: int, rotated: float, generator: torch.Generator, device: torch.device) -> Tensor:

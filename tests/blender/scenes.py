@@ -19,7 +19,7 @@ LIVELY = """
 import sys
 from dataclasses import replace
 import numpy as np
-from ssilk_core.checkpoint import load_model, save_model
+from ssilk_core.network.checkpoint import load_model, save_model
 file, rng = load_model(sys.argv[1]), np.random.default_rng(3)
 parameters = dict(file.parameters)
 parameters["output.4.weight"] = parameters["output.4.weight"] * 300
@@ -30,7 +30,7 @@ save_model(sys.argv[1], replace(file, parameters=parameters))
 DECODED = """
 import sys
 import numpy as np
-from ssilk_core.bake import BakeRequest, load_rollout
+from ssilk_core.delivery.bake import BakeRequest, load_rollout
 model, stage, motion, seconds, lbs, output = sys.argv[1:]
 request = BakeRequest(model=model, stage=stage, motion=motion, pre_roll=float(seconds), lbs=lbs == "lbs")
 bake = load_rollout(request)

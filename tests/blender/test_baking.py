@@ -91,8 +91,8 @@ def test_a_reduced_model_leaves_its_proxies_at_rest(ready, trained, tmp_path, ss
 def test_levels_are_those_of_ssilk(bpy):
     from blender_addon.operators.baking import QUALITY_ITEMS
     from blender_addon.training_properties import CHOICES
-    from ssilk_core.config import PRESETS
-    from ssilk_core.quality import QUALITIES
+    from ssilk_core.quality.levels import QUALITIES
+    from ssilk_core.training.settings import PRESETS
 
     assert [name for name, *_ in CHOICES] == list(PRESETS)
     assert [name for name, *_ in QUALITY_ITEMS] == ["WHOLE", *QUALITIES]

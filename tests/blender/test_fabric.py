@@ -8,7 +8,7 @@ import pytest
 
 def test_every_fabric_and_model_can_be_chosen(bpy, skirt):
     from blender_addon.fabric_properties import CHOICES, MODELS, NUMBERS
-    from ssilk_core.fabrics import FABRICS, STRETCH_MODELS
+    from ssilk_core.scene.fabrics import FABRICS, STRETCH_MODELS
 
     assert [name for name, *_ in CHOICES] == list(FABRICS)
     assert {name for name, *_ in MODELS} == set(STRETCH_MODELS)

@@ -14,9 +14,9 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 from blender_addon.operators.gltf_export import proposed
 from blender_addon.scene import exporting
 from blender_addon.scene.exporting import SETTINGS, largest_loss
+from ssilk_core.delivery.gltf.container import GlbFile
+from ssilk_core.delivery.gltf.skinned import SkinnedGlb
 from ssilk_core.errors import SsilkError
-from ssilk_core.gltf.container import GlbFile
-from ssilk_core.gltf.skinned import SkinnedGlb
 
 from .conftest import activate
 from .scenes import shown

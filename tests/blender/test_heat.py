@@ -329,7 +329,7 @@ def world_points(evaluated, world) -> np.ndarray:
 def linearly_skinned(bpy, skirt) -> np.ndarray:
     """Skin by the model's LBS weights and Blender's own pose matrices."""
     from blender_addon.scene.models import model_of
-    from ssilk_core.checkpoint import load_model
+    from ssilk_core.network.checkpoint import load_model
 
     scene, armature = load_model(model_of(skirt)).scene, bpy.data.objects["Rig"]
     names = [path.rpartition("/")[2] for path in scene.joint_names]

@@ -139,7 +139,7 @@ def test_blender_imports_a_body_without_its_hidden_faces(bpy, tmp_path, variants
     from ssilk_usd.body_faces import BODY, FULL, HiddenPolygons, hide_polygons
     from ssilk_usd.units import StageUnits
 
-    from ssilk_core.assets import Mesh
+    from ssilk_core.scene.assets import Mesh
 
     points, quads = tube(8, 4, (0.0, 1.0), (0.2, 0.2))
     triangles = np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])

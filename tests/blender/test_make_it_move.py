@@ -22,7 +22,7 @@ def test_a_character_that_nothing_moves_gets_the_motions_of_the_demo(ready, monk
     from blender_addon.scene.armature import read_joints
     from blender_addon.scene.motions import sources
     from blender_addon.scene.units import scene_units
-    from ssilk_core.kinematics import motion_transforms
+    from ssilk_core.scene.kinematics import motion_transforms
 
     bpy, made = ready, []
     read = demo_motions.read_motions

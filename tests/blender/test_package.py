@@ -27,7 +27,7 @@ bpy.ops.extensions.package_install_files(filepath=sys.argv[1], repo="user_defaul
 for _ in range(2):
     assert package in bpy.context.preferences.addons
     assert "paint_classes" in dir(bpy.ops.ssilk) and hasattr(bpy.types.Object, "ssilk")
-    for name in ("ssilk_core.runtime", "ssilk_usd.units"):
+    for name in ("ssilk_core.network.runtime", "ssilk_usd.units"):
         assert ".local" in importlib.import_module(name).__file__  # where Blender puts wheels
     bpy.ops.preferences.addon_disable(module=package)
     assert not dir(bpy.ops.ssilk) and not hasattr(bpy.types.Object, "ssilk")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from blender_addon.findings import Clip, polygons_of, read_findings
-from ssilk_core.assets import Mesh
-from ssilk_core.preflight.motion import unread_motion
+from ssilk_core.authoring.preflight.motion import unread_motion
+from ssilk_core.scene.assets import Mesh
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
@@ -258,7 +258,7 @@ def test_a_modifier_before_the_armature_is_listed(ready, skirt):
 
 def test_joints_are_selected_as_bones(ready, skirt):
     from blender_addon.preflight_properties import keep_findings
-    from ssilk_core.preflight.finding import Finding
+    from ssilk_core.authoring.preflight.finding import Finding
 
     finding = Finding(severity="info", code="still", prim="", found="", elements="joints", indices=(1,))
     keep_findings(ready.context, "Skirt", [finding])

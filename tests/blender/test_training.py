@@ -20,7 +20,7 @@ from .scenes import ended, rig_and_animate
 
 READ = """
 import json, sys
-from ssilk_core.kinematics import motion_transforms
+from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_character import read_character
 from ssilk_usd.units import StageUnits

@@ -13,7 +13,11 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from ssilk_core.assets import (
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.physics.collision import CollisionBody
+from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
     TIGHT,
@@ -27,13 +31,9 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.collision import CollisionBody
-from ssilk_core.config import ModelConfig
-from ssilk_core.energy import GarmentEnergy
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import local_transforms, quaternion_from_matrix, rigid
-from ssilk_core.model.network import GarmentModel
-from ssilk_core.motion_bank import build_bank
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import local_transforms, quaternion_from_matrix, rigid
+from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
 
 if not torch.cuda.is_available():

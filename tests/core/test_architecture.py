@@ -15,8 +15,9 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CORE, USD, ADDON = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd", ROOT / "blender_addon"
 DOCUMENT = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-WIDEST = 6  # names in a row of the table
-JOIN_CORE_AND_USD = {"bake", "cli"}
+JOIN_CORE_AND_USD = {"delivery.bake", "cli"}
+LOOSE_MODULES = ["errors", "events", "files", "devices", "work_record"]
+IN_PARTS = {"scene", "physics", "network", "authoring", "quality", "delivery"}  # the table names all their parts
 
 
 def section(title: str) -> str:
@@ -30,10 +31,16 @@ def rows(title: str) -> list[list[str]]:
     return [re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in lines]
 
 
-LAYERS = rows("Layers of the core")
+def table(title: str) -> dict[str, list[str]]:
+    """Return the names in backticks in the second column of a section's table, by the name in the first."""
+    lines = [line.split("|") for line in section(title).splitlines() if line.startswith("| `")]
+    return {cells[1].strip(" `"): re.findall(r"`(\w+)`", cells[2]) for cells in lines}
+
+
+ROOMS = table("Rooms of the core")
+ORDER = [*LOOSE_MODULES, *ROOMS, "__main__"]
 USED_BY_USD = {name for row in rows("What ssilk_usd takes from the core") for name in row}
 PUBLIC = [name for row in rows("Public packages") for name in row]
-LAYER_OF = {name: number for number, row in enumerate(LAYERS) for name in row}
 
 
 def modules(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
@@ -41,9 +48,10 @@ def modules(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return [(path, path.relative_to(folder.parent).parts[:-1]) for path in sorted(folder.rglob("*.py"))]
 
 
-def imports(path: Path, package: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-    """Yield what a module imports anywhere in its code, as dotted parts, except for types alone."""
-    for node in executed(ast.parse(path.read_text(encoding="utf-8"))):
+def imports(path: Path, package: tuple[str, ...], *, types: bool = False) -> Iterator[tuple[str, ...]]:
+    """Yield what a module imports anywhere in its code, as dotted parts; for `types` alone too if asked."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree) if types else executed(tree):
         if isinstance(node, ast.Import):
             yield from (tuple(alias.name.split(".")) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -68,22 +76,87 @@ def public_classes(folder: Path) -> Iterator[tuple[str, str]]:
                 yield node.name, str(path.relative_to(ROOT))
 
 
-def test_every_part_of_the_core_stands_in_one_narrow_layer():
-    parts = {path.name.removesuffix(".py") for path in CORE.iterdir() if path.suffix == ".py" or path.is_dir()}
-    named = Counter(name for row in LAYERS for name in row)
-    assert set(named) == parts - {"__init__", "__pycache__"}
-    assert max(named.values()) == 1
-    assert max(map(len, LAYERS)) <= WIDEST
+def parts(folder: Path) -> set[str]:
+    """Return the names of the modules and packages in a package's folder."""
+    found = {path.name.removesuffix(".py") for path in folder.iterdir() if path.suffix == ".py" or path.is_dir()}
+    return found - {"__init__", "__pycache__", "models"}
+
+
+def resolved(target: tuple[str, ...], home: Path) -> tuple[str, ...]:
+    """Return the module of the package at `home` that an import of a name loads, as dotted parts."""
+    for length in range(len(target), 0, -1):
+        place = home.parent.joinpath(*target[:length])
+        if place.with_suffix(".py").is_file():
+            return target[:length]
+        if place.is_dir():
+            return (*target[:length], "__init__")
+    raise AssertionError(target)
+
+
+def graph(home: Path) -> dict[str, set[str]]:
+    """Return the modules of a package, and which others of it each imports anywhere, for types alone too."""
+    found: dict[str, set[str]] = {}
+    for path, package in modules(home):
+        own = (*package, path.stem)
+        targets = imports(path, package, types=True)
+        names = {resolved(target, home) for target in targets if target[0] == home.name}
+        found[".".join(own)] = {".".join(name) for name in names - {own}}
+    return found
+
+
+def circles(edges: dict[str, set[str]]) -> list[str]:
+    """Return the modules that are in import circles."""
+    left = {name: set(targets) for name, targets in edges.items()}
+    while free := [name for name, targets in left.items() if not targets & left.keys()]:
+        for name in free:
+            del left[name]
+    while ends := left.keys() - {target for targets in left.values() for target in targets}:
+        for name in ends:
+            del left[name]
+    return sorted(left)
+
+
+def test_the_core_has_the_rooms_and_parts_of_the_document():
+    assert parts(CORE) == set(ORDER)
+    assert len(ROOMS) <= 10 and len(LOOSE_MODULES) <= 5
+    for room, named in ROOMS.items():
+        present = parts(CORE / room)
+        folders = {name for name in present if (CORE / room / name).is_dir()}
+        assert set(named) <= present and folders <= set(named), room
+        assert room not in IN_PARTS or set(named) == present, room
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_says_at_its_door_what_is_in_it(room):
+    text = importlib.import_module(f"ssilk_core.{room}").__doc__ or ""
+    assert 3 <= len(text.strip().splitlines()) <= 9
+    opened = re.search(r"Open `([\w/.]+)` first", text)
+    assert opened and (CORE / room / opened.group(1)).is_file()
 
 
 @pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
-def test_the_core_imports_from_inner_layers_alone(path, package):
-    own = path.relative_to(CORE).parts[0].removesuffix(".py")
+def test_the_core_imports_from_inner_rooms_and_parts_alone(path, package):
+    own, *inner = path.relative_to(CORE).with_suffix("").parts
+    joins = ".".join((own, *inner)).startswith(tuple(JOIN_CORE_AND_USD))
+    named = ROOMS.get(own, [])
     for target in imports(path, package):
         assert target[0] not in ("pxr", "bpy"), target
-        assert target[0] != "ssilk_usd" or own in JOIN_CORE_AND_USD, target
-        if target[0] == "ssilk_core" and target[1] not in (own, "__version__"):
-            assert own != "__init__" and LAYER_OF[target[1]] < LAYER_OF[own], target
+        assert target[0] != "ssilk_usd" or joins, target
+        if target[0] != "ssilk_core" or target[1] == "__version__":
+            continue
+        if target[1] != own:
+            assert own != "__init__" and ORDER.index(target[1]) < ORDER.index(own), target
+        elif len(target) > 2 and inner[0] in named and target[2] in named:
+            assert named.index(target[2]) <= named.index(inner[0]), target
+
+
+@pytest.mark.parametrize("home", [CORE, USD, ADDON, ROOT / "benchmarks"], ids=lambda home: home.name)
+def test_no_modules_import_each_other_in_a_circle(home):
+    assert circles(graph(home)) == []
+
+
+def test_circles_are_found():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["b", "c"]
 
 
 @pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
@@ -101,8 +174,8 @@ def test_usd_needs_little_of_the_core(path, package):
 
 
 def test_baking_needs_no_training():
-    for path, package in modules(CORE / "bake"):
-        targets = imports(path, ("ssilk_core", *package))
+    for path, package in modules(CORE / "delivery" / "bake"):
+        targets = imports(path, ("ssilk_core", "delivery", *package))
         assert not [target for target in targets if target[:2] == ("ssilk_core", "training")], path
 
 

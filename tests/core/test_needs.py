@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
-from ssilk_core.checkpoint import load_model, network
-from ssilk_core.collision import nearest_planes, reachable_body, signed_distance
-from ssilk_core.config import ModelConfig, TrainConfig
 from ssilk_core.events import Event, Message
-from ssilk_core.fabrics import Fabric
-from ssilk_core.kinematics import deform, motion_transforms, skin_points, skinning_matrices
-from ssilk_core.rollout import garment_poses, roll
-from ssilk_core.runtime import Player
+from ssilk_core.network.checkpoint import load_model, network
+from ssilk_core.network.rollout import garment_poses, roll
+from ssilk_core.network.runtime import Player
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.physics.collision import nearest_planes, reachable_body, signed_distance
+from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import deform, motion_transforms, skin_points, skinning_matrices
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.run import train
+from ssilk_core.training.settings import TrainConfig
 
 CPU = torch.device("cpu")
 

@@ -15,7 +15,8 @@ from typing import Any
 
 from safetensors import safe_open
 
-from ssilk_core.config import ModelConfig, TrainConfig
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.training.settings import TrainConfig
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"

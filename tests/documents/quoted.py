@@ -12,15 +12,15 @@ from typing import Any
 
 from ssilk_usd import memory, trial
 
-from ssilk_core import checkpoint
-from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH
-from ssilk_core.config import PRESETS
-from ssilk_core.decomposition import FitTolerance
-from ssilk_core.fabrics import FABRICS, Fabric
-from ssilk_core.farm.openjd import CHUNK, CHUNK_SECONDS
-from ssilk_core.mesh import hidden_faces
-from ssilk_core.mesh.stitches import TOUCH
-from ssilk_core.refine import clearing
+from ssilk_core.delivery.farm.openjd import CHUNK, CHUNK_SECONDS
+from ssilk_core.network import checkpoint
+from ssilk_core.physics.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH
+from ssilk_core.physics.refine import clearing
+from ssilk_core.physics.skin import hidden_faces
+from ssilk_core.scene.decomposition import FitTolerance
+from ssilk_core.scene.fabrics import FABRICS, Fabric
+from ssilk_core.scene.mesh.stitches import TOUCH
+from ssilk_core.training.settings import PRESETS
 
 from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results

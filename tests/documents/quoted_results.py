@@ -8,12 +8,13 @@ from functools import partial
 from itertools import product
 from statistics import mean
 
-from ssilk_core.config import PRESETS, ModelConfig
 from ssilk_core.demo.shipped import shipped_path
-from ssilk_core.evaluation.solver_errors import AFTER
-from ssilk_core.fabrics import FABRICS
 from ssilk_core.files import sha256
-from ssilk_core.quality import QUALITIES
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.quality.evaluation.solver_errors import AFTER
+from ssilk_core.quality.levels import QUALITIES
+from ssilk_core.scene.fabrics import FABRICS
+from ssilk_core.training.settings import PRESETS
 
 from .measured import (
     GARMENTS,

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from statistics import median
 from typing import Any
 
-from ssilk_core.config import Preset
+from ssilk_core.training.settings import Preset
 
 from .measured import document, result
 

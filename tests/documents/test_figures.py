@@ -15,13 +15,14 @@ from ssilk_usd.check import TOLERANCE, WORLD
 from ssilk_usd.read_motion import FARTHEST
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
-from ssilk_core.bake.shown_skin import SKIN_FRAMES
 from ssilk_core.cli import parser
-from ssilk_core.collision.covered_skin import SKIN_POINTS
-from ssilk_core.config import ModelConfig, TrainConfig, apply_overrides
-from ssilk_core.fabrics import Fabric
-from ssilk_core.schemes import SCHEMES
-from ssilk_core.shown_skin import COVER_REACH, SHOW_DEPTH
+from ssilk_core.delivery.bake.shown_skin import SKIN_FRAMES
+from ssilk_core.network.schemes import SCHEMES
+from ssilk_core.network.settings import ModelConfig, apply_overrides
+from ssilk_core.physics.skin.covered_skin import SKIN_POINTS
+from ssilk_core.physics.skin.figures import COVER_REACH, SHOW_DEPTH
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.training.settings import TrainConfig
 from tests.documents import measured
 from tests.documents.measured import RESULTS, ROOT
 from tests.documents.quoted import QUOTED

@@ -108,7 +108,7 @@ def run(command: str, *more: str) -> int:
 def few_contacts() -> Iterator[None]:
     """Cloth touches the body at vertices and at few points between: what is tested here are commands and files."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ssilk_core.collision.samples.MAX_SPACING", 0.1)
+        patch.setattr("ssilk_core.physics.collision.samples.MAX_SPACING", 0.1)
         yield
 
 

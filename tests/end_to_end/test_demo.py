@@ -17,15 +17,15 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.stages import demo_body_path
 from ssilk_usd.write import write_garment, write_motion
 
-from ssilk_core.assets import Garment, Motion, Scene, Skeleton
-from ssilk_core.bake import BakeRequest, load_rollout
-from ssilk_core.checkpoint import ModelFile, load_model, save_model
 from ssilk_core.cli import demo, main, parser, view
 from ssilk_core.cli.options import load_scene
+from ssilk_core.delivery.bake import BakeRequest, load_rollout
+from ssilk_core.delivery.view.shots import Look
 from ssilk_core.demo import garments, motions, shipped
-from ssilk_core.energy import GarmentEnergy
 from ssilk_core.events import silent
-from ssilk_core.view.shots import Look
+from ssilk_core.network.checkpoint import ModelFile, load_model, save_model
+from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.scene.assets import Garment, Motion, Scene, Skeleton
 
 SHORT = shlex.split(
     "--set iterations=2 --set static_fraction=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set "

@@ -21,13 +21,13 @@ from ssilk_usd import layers as layers_of_usd
 from ssilk_usd import read_visibility
 
 from ssilk_core import files
-from ssilk_core.bake import LayerFolder
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import LayerFolder
+from ssilk_core.delivery.farm import cluster
+from ssilk_core.delivery.farm.job import read_job
 from ssilk_core.errors import SsilkError
-from ssilk_core.farm import cluster
-from ssilk_core.farm.job import read_job
 from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model, save_model
 
 BIN = Path(sys.executable).parent
 SHOTS = ("a", "b", "c")
@@ -316,7 +316,7 @@ def test_a_cluster_whose_workers_die_bakes_every_shot_once(farm, monkeypatch, ca
     assert run("task bundle/job.json -o quiet") == 0
 
     def dying(job, folder):
-        from ssilk_core.farm.cluster import bake_here
+        from ssilk_core.delivery.farm.cluster import bake_here
 
         first = not (tried := folder.with_name(f"tried_{job.shot}")).exists()
         tried.touch()
@@ -367,7 +367,7 @@ def test_what_a_killed_process_started_ends_with_it(tmp_path):
     child = [sys.executable, "-c", "import time; time.sleep(60)"]
     words = f"""
 import subprocess, time
-from ssilk_core.farm.watchdog import ended_together
+from ssilk_core.delivery.farm.watchdog import ended_together
 with ended_together():
     print(subprocess.Popen({child}).pid, flush=True)
     time.sleep(60)

@@ -14,11 +14,11 @@ import pytest
 from pxr import Gf, Sdf, Usd
 from ssilk_usd.play import Shot
 
-from ssilk_core.bake import origin
-from ssilk_core.bake.load import load_rollout
-from ssilk_core.bake.request import BakeRequest
-from ssilk_core.bake.rollout import _from_fraction
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import origin
+from ssilk_core.delivery.bake.load import load_rollout
+from ssilk_core.delivery.bake.request import BakeRequest
+from ssilk_core.delivery.bake.rollout import _from_fraction
 
 
 @pytest.fixture

@@ -14,10 +14,10 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_usd.play import Shot
 from ssilk_usd.read_mesh import read_mesh
 
-from ssilk_core.assets import Mesh
 from ssilk_core.cli import main
-from ssilk_core.gltf.geometry import ShapeNormals, drawn_mesh
-from ssilk_core.gltf.play import GlbShot
+from ssilk_core.delivery.gltf.geometry import ShapeNormals, drawn_mesh
+from ssilk_core.delivery.gltf.play import GlbShot
+from ssilk_core.scene.assets import Mesh
 
 TOLERANCE = 1e-5  # [m]
 TYPES = {5121: "u1", 5123: "<u2", 5125: "<u4", 5126: "<f4"}

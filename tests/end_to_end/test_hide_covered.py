@@ -15,9 +15,9 @@ from ssilk_usd.body_faces import BODY, COVERED_HIDDEN, FULL, open_with_full_bodi
 from ssilk_usd.play import Shot
 
 from ssilk_core.cli import main
-from ssilk_core.farm.job import read_job
-from ssilk_core.gltf.play import GlbShot
-from ssilk_core.targets import GLB, TARGETS
+from ssilk_core.delivery.farm.job import read_job
+from ssilk_core.delivery.gltf.play import GlbShot
+from ssilk_core.delivery.targets import GLB, TARGETS
 
 BAKE = "bake skirt.safetensors --stage rigged.usda --motion walk.usda --hide-covered"
 MINE = f"""#usda 1.0

@@ -25,8 +25,8 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_scene
 from ssilk_usd.trial import ending
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model
 
 SETTINGS = settings(max_examples=60, deadline=None, derandomize=True, database=None,
                     suppress_health_check=list(HealthCheck))  # fmt: skip

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Motion
 from ssilk_core.cli import main
+from ssilk_core.scene.assets import Motion
 
 SHARED = Path(__file__).parents[3] / "shared" / "data"
 needs_shared = pytest.mark.skipif(not SHARED.exists(), reason=f"{SHARED} is not here")

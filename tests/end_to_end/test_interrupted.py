@@ -19,10 +19,10 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
-from ssilk_core.collision.samples import MAX_SPACING
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.physics.collision.samples import MAX_SPACING
 
 TRAINED = (EXIT_OK, EXIT_WORSE)  # so few iterations may do no good
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")
@@ -71,7 +71,7 @@ def forks():
 def all_contacts():
     """Other processes compute them all, and are compared with this one."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ssilk_core.collision.samples.MAX_SPACING", MAX_SPACING)
+        patch.setattr("ssilk_core.physics.collision.samples.MAX_SPACING", MAX_SPACING)
         yield
 
 

@@ -18,12 +18,12 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdValidation
 from ssilk_usd.garment_api import SCHEMA, read_garment_record
 from ssilk_usd.play import Shot
 
-from ssilk_core.bake import BakeRequest, load_rollout, shot_bytes
-from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRequest, load_rollout, shot_bytes
+from ssilk_core.delivery.targets import GLB, TARGETS, Target, cap_influences
 from ssilk_core.files import sha256
-from ssilk_core.kinematics import deform
-from ssilk_core.targets import GLB, TARGETS, Target, cap_influences
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.scene.kinematics import deform
 
 STAGES = [name for name, target in TARGETS.items() if GLB not in target.suffixes]
 SHOT_FILES = ("anim.usdc", "points.usdc", "bake.json")

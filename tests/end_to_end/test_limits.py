@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from pxr import Gf, Sdf, Usd, UsdSkel
 
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main, parser
 from ssilk_core.cli.options import NumberRange
+from ssilk_core.delivery.farm.job import numbers
 from ssilk_core.errors import SsilkError
-from ssilk_core.farm.job import numbers
+from ssilk_core.network.checkpoint import load_model, save_model
 
 BAKE = "bake model.safetensors --stage rigged.usda"
 

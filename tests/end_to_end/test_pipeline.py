@@ -20,10 +20,10 @@ import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.bake import BakeRollout, bake_layers
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRollout, bake_layers
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE
+from ssilk_core.network.checkpoint import load_model, save_model
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
 SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"

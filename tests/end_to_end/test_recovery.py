@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.assets import PINNED
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.scene.assets import PINNED
 
 
 def test_a_bake_says_where_its_rollout_was_lost(toy, tmp_path, capsys):

@@ -8,8 +8,8 @@ import shlex
 
 import pytest
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
+from ssilk_core.network.checkpoint import load_model
 
 
 def run(command: str) -> int:

@@ -12,9 +12,9 @@ from pxr import Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.play import Shot
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.bake import BakeRequest, bake
 from ssilk_core.cli import main
-from ssilk_core.quality import QUALITIES
+from ssilk_core.delivery.bake import BakeRequest, bake
+from ssilk_core.quality.levels import QUALITIES
 
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda"]
 

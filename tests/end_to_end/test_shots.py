@@ -15,12 +15,12 @@ from pxr import Usd
 from ssilk_usd import layers as layers_of_usd
 from ssilk_usd.play import Shot
 
-from ssilk_core.bake import BakeRequest, LayerFolder, plan_layers
-from ssilk_core.bake import shots as gathering
-from ssilk_core.bake.record import portable
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRequest, LayerFolder, plan_layers
+from ssilk_core.delivery.bake import shots as gathering
+from ssilk_core.delivery.bake.record import portable
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model, save_model
 
 
 @pytest.fixture(scope="module")

@@ -8,10 +8,10 @@ import pytest
 from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_usd.play import Shot
 
-from ssilk_core.bake import BakeRequest, plan_layers
 from ssilk_core.cli import main, simulate
+from ssilk_core.delivery.bake import BakeRequest, plan_layers
 from ssilk_core.errors import fail
-from ssilk_core.simulate import Simulator
+from ssilk_core.physics.simulate import Simulator
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_points_that_no_skinning_reaches_are_kept_as_points(stage, monkeypatch, 
     def folded(*_, **__):
         fail("clip", "its skinning folds", "joints cannot reach it")
 
-    monkeypatch.setattr("ssilk_core.decomposition.decompose", folded)
+    monkeypatch.setattr("ssilk_core.scene.decomposition.decompose", folded)
     assert main([*SIMULATE, "short.usda", "-o", "kept.usdc"]) == 0
     assert "its skinning folds" in capsys.readouterr().err and not Shot(stage / "kept.usdc").is_skinned
 

@@ -11,10 +11,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from ssilk_usd.play import Shot
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.assets import Motion
-from ssilk_core.bake import motion_at
 from ssilk_core.cli import main
-from ssilk_core.gltf.play import GlbShot
+from ssilk_core.delivery.bake import motion_at
+from ssilk_core.delivery.gltf.play import GlbShot
+from ssilk_core.scene.assets import Motion
 
 FRAMES = 16
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda"]

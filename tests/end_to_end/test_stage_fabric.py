@@ -10,10 +10,10 @@ import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 from ssilk_usd.provenance import read_provenance
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_WORSE
-from ssilk_core.fabrics import FABRICS
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.scene.fabrics import FABRICS
 
 TOLD = "with density 0.4 kg/m2, thickness 0.0008 m, lame_mu 20 N/m, lame_lambda 10 N/m, bending 2e-05 N m; it has no "
 

@@ -14,8 +14,8 @@ import pytest
 
 from benchmarks.baselines.files import save_baseline
 from benchmarks.baselines.networks import BaselineConfig, baseline
-from ssilk_core.checkpoint import load_model, save_model
-from ssilk_core.schemes import SCHEMES
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.schemes import SCHEMES
 
 WORLD = "--stage rigged.usda --motions clips --index index.json --threads 1"
 

@@ -10,10 +10,10 @@ from dataclasses import replace
 
 import pytest
 
-from ssilk_core.checkpoint import load_model, save_model
 from ssilk_core.cli import main
-from ssilk_core.cost import Time
 from ssilk_core.errors import EXIT_WORSE
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.quality.cost import Time
 
 TRADE = "trade model.safetensors --stage rigged.usda --motions motions"
 
@@ -26,7 +26,7 @@ def run(command: str) -> int:
 def world(toy, tmp_path, monkeypatch):
     """A folder with the toy's files and three motions, as the working folder; few variants are tried."""
     for name, values in (("SHAPES", (0.5,)), ("JOINTS", (0.0,)), ("INFLUENCES", ()), ("RATES", (0.5,))):
-        monkeypatch.setattr(f"ssilk_core.trade.variants.{name}", values)
+        monkeypatch.setattr(f"ssilk_core.quality.trade.variants.{name}", values)
     monkeypatch.chdir(toy.copy(tmp_path))
     (tmp_path / "motions").mkdir()
     for name, frames in (("long", 14), ("short", 10), ("other", 14)):
@@ -37,7 +37,7 @@ def world(toy, tmp_path, monkeypatch):
 @pytest.fixture
 def no_clock(monkeypatch):
     """Takes no time to tell the time."""
-    monkeypatch.setattr("ssilk_core.trade.measure.play_time", lambda player, motion: Time(1.0, 2.0))
+    monkeypatch.setattr("ssilk_core.quality.trade.measure.play_time", lambda player, motion: Time(1.0, 2.0))
 
 
 def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.checkpoint import load_model
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
-from ssilk_core.wardrobe.listing import WardrobeEntry, read_list
-from ssilk_core.wardrobe.panel import ProgressTable, table
-from ssilk_core.wardrobe.queue import CommandTask, End, Queue
-from ssilk_core.wardrobe.training import WORSE_FIGURE, GarmentTraining
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list
+from ssilk_core.training.wardrobe.panel import ProgressTable, table
+from ssilk_core.training.wardrobe.queue import CommandTask, End, Queue
+from ssilk_core.training.wardrobe.training import WORSE_FIGURE, GarmentTraining
 
 LIST = """
 [defaults]

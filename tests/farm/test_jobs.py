@@ -15,16 +15,16 @@ from hypothesis import strategies as st
 from openjd.model import IntRangeExpr, create_job, decode_job_template, preprocess_job_parameters
 from pxr import Tf
 
-from ssilk_core.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
-from ssilk_core.bake.inputs import InputHashes
-from ssilk_core.bake.naming import file_name, pattern_name, prim_name
-from ssilk_core.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
+from ssilk_core.delivery.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
+from ssilk_core.delivery.bake.inputs import InputHashes
+from ssilk_core.delivery.bake.naming import file_name, pattern_name, prim_name
+from ssilk_core.delivery.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
+from ssilk_core.delivery.farm.job import FarmJob, numbers, read_job, write_job
+from ssilk_core.delivery.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Result, Started
-from ssilk_core.farm.job import FarmJob, numbers, read_job, write_job
-from ssilk_core.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.files import sha256
-from ssilk_core.reduction import ModelSize
+from ssilk_core.quality.reduction import ModelSize
 
 REQUEST = BakeRequest(model="/m/cape.safetensors", stage="/s/hero.usd", motion="/s/walk.usd")
 TASK = BakeTask(garment="cape", shot="walk", request=REQUEST)

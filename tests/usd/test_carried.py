@@ -12,9 +12,9 @@ from ssilk_usd.read_character import read_character
 from ssilk_usd.read_scene import read_scene
 from ssilk_usd.rig_io import write_rigged_stage
 
-from ssilk_core import kinematics
-from ssilk_core.assets import ProxyRig, Scene
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene import kinematics
+from ssilk_core.scene.assets import ProxyRig, Scene
 
 from .test_read import FRAMES, PARENTS, RECIPES, TRUTH, author, gf, moved, turned, usdskel_points
 

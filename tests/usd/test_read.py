@@ -14,9 +14,9 @@ from ssilk_usd.read_motion import motion_files, read_motion, read_motions
 from ssilk_usd.read_polygons import triangulate
 from ssilk_usd.read_scene import read_scene
 
-from ssilk_core import kinematics
-from ssilk_core.assets import Character, Mesh, Motion, Skeleton
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene import kinematics
+from ssilk_core.scene.assets import Character, Mesh, Motion, Skeleton
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared"
 needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the shared character and motions are not here")

@@ -14,9 +14,9 @@ from ssilk_usd.repair import repair_lock, write_repaired, write_with_units
 from ssilk_usd.repair_mesh import offset_points
 from ssilk_usd.units import StageUnits
 
-from ssilk_core.assets import Skeleton
+from ssilk_core.authoring.preflight.repair import MeshRepair
 from ssilk_core.errors import SsilkError
-from ssilk_core.preflight.repair import MeshRepair
+from ssilk_core.scene.assets import Skeleton
 
 SKELETON = Skeleton("/Rig", ("Hips", "Hips/Spine"), [-1, 0], *[np.tile(np.eye(4), (2, 1, 1))] * 2)
 # Two quads that meet at points 1, 2 and 4, 7 without being sewn, a lone point 8, and a second copy of the first quad.

@@ -13,9 +13,9 @@ from ssilk_usd.read_motion import read_motion
 from ssilk_usd.read_scene import read_rigged, read_scene
 from ssilk_usd.rig_io import read_proxy_rig, write_rigged_stage
 
-from ssilk_core import kinematics
-from ssilk_core.assets import Garment, ProxyRig, Scene, SkinWeights, classes_at
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene import kinematics
+from ssilk_core.scene.assets import Garment, ProxyRig, Scene, SkinWeights, classes_at
 
 JOINTS = ("Hips", "Hips/Spine", "Hips/Spine/Head")
 PROXIES = ("Hips/Spine/cape_0", "Hips/Spine/cape_0/cape_1", "Hips/Spine/cape_0/cape_2")

@@ -10,8 +10,8 @@ from pxr import Usd, UsdShade
 from ssilk_usd.read_scene import read_scene
 from ssilk_usd.rig_io import write_rigged_stage
 
-from ssilk_core.assets import Garment, ProxyRig, Scene, SkinWeights
-from ssilk_core.fabrics import fabric_of_surface
+from ssilk_core.scene.assets import Garment, ProxyRig, Scene, SkinWeights
+from ssilk_core.scene.fabrics import fabric_of_surface
 
 HEADER = '#usda 1.0\n( metersPerUnit = 1; upAxis = "Y" )\n'
 HERO = """

@@ -24,7 +24,8 @@ from ssilk_usd.skinned import SkinnedGarment
 from ssilk_usd.units import StageUnits
 from ssilk_usd.write import write_scene
 
-from ssilk_core.assets import (
+from ssilk_core.errors import SsilkError, VerificationError
+from ssilk_core.scene.assets import (
     Body,
     Character,
     Deformer,
@@ -37,8 +38,7 @@ from ssilk_core.assets import (
     Skeleton,
     SkinWeights,
 )
-from ssilk_core.errors import SsilkError, VerificationError
-from ssilk_core.kinematics import (
+from ssilk_core.scene.kinematics import (
     deform,
     local_transforms,
     matrix_from_quaternion,

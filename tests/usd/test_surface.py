@@ -11,8 +11,8 @@ from ssilk_usd.read_surface import read_surface
 from ssilk_usd.units import StageUnits
 from ssilk_usd.write_surface import write_surface
 
-from ssilk_core.assets import SurfaceMaterial
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene.assets import SurfaceMaterial
 
 MESH = """
         point3f[] points = [(0, 0, 0), (SIDE, 0, 0), (SIDE, SIDE, 0), (0, SIDE, 0)]

@@ -11,9 +11,9 @@ from itertools import count
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import local_transforms, sorted_influences, world_transforms
+from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .garment_api import GarmentRecord, apply_garment_api

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from ssilk_core.assets import Mesh
+from ssilk_core.scene.assets import Mesh
 
 from .read_stage import StageLike, open_stage
 

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
 
-from ssilk_core.assets import Floats
 from ssilk_core.errors import VerificationError
+from ssilk_core.scene.assets import Floats
 
 from .check_mesh import check_blendshapes, check_mesh, check_skin
 from .check_skel import check_animation, check_skeleton

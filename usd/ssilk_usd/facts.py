@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, Ints, Motion, Skeleton
+from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
 
 from .read_skin import match_joints
 from .read_stage import StageLike, open_stage, split_location, stage_name

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Usd
 
-from ssilk_core.assets import Motion, Skeleton
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Motion, Skeleton
 
 from .read_motion import find_animation, frame_rate, read_motion, sampled_span
 from .read_stage import needs_whole_files, open_stage, split_location

@@ -3,7 +3,7 @@
 
     FOLDER/assets/cape/asset.usda        component; payload and variants
     FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
-    FOLDER/assets/cape/used.json         what the name is used for; `ssilk_core.bake.names_used` writes it
+    FOLDER/assets/cape/used.json         what the name is used for; `ssilk_core.delivery.bake.names_used` writes it
     FOLDER/shots/walk/cape/anim.usdc     what moves; opens by itself
     FOLDER/shots/walk/cape/points.usdc   a point cache, where one is asked for
     FOLDER/shots/walk/shot.usda          every garment of the shot
@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Motion
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import replacing, sha256
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion
 
 from .author import Asset, define_asset, define_blendshapes, extent_array
 from .body_faces import HiddenPolygons, hide_polygons

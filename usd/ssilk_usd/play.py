@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints
 
 from .read_mesh import display_colour, is_drawn, is_garment, read_mesh
 from .read_stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name

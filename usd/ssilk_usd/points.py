@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Floats, Motion, Scene
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
-from ssilk_core.kinematics import lbs_deformer, lbs_poses
+from ssilk_core.scene.assets import Floats, Motion, Scene
+from ssilk_core.scene.kinematics import lbs_deformer, lbs_poses
 
 from .author import extent_array
 from .body_faces import HiddenPolygons

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats
+from ssilk_core.scene.assets import Floats
 
 from .read_spaces import SkelSource
 from .read_stage import PRIMS, apply, column_matrix, value, world_matrix

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Body, Character, Floats, SkinWeights
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.scene.assets import Body, Character, Floats, SkinWeights
 
 from .names import SKEL
 from .read_carried import carried_by

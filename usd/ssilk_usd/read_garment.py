@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 
 from .names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
 from .read_carried import carried_by

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
-from ssilk_core.assets import Floats, Ints, Mesh
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, Mesh
 
 from .names import CLASS, GARMENT, PROXIES
 from .read_polygons import triangulate

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import MAX_FPS, MIN_FPS, matrix_from_quaternion, quaternion_from_matrix, rigid
+from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
+from ssilk_core.scene.kinematics import MAX_FPS, MIN_FPS, matrix_from_quaternion, quaternion_from_matrix, rigid
 
 from .read_skeleton import skeletons
 from .read_skin import match_joints

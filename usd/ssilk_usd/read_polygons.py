@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ssilk_core.assets import Floats, Ints
+from ssilk_core.scene.assets import Floats, Ints
 
 _EPSILON = 1e-12
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Character, Garment, ProxyRig, Skeleton
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.scene.assets import Character, Garment, ProxyRig, Skeleton
 
 from .names import PROXIES
 from .read_character import read_character

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, GarmentPose, Mesh, ProxyRig, Skeleton
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import local_transforms
+from ssilk_core.scene.assets import Floats, GarmentPose, Mesh, ProxyRig, Skeleton
+from ssilk_core.scene.kinematics import local_transforms
 
 from .garment_api import GarmentRecord, read_garment_record
 from .play import Shot, frame_times

@@ -8,8 +8,8 @@ from collections import Counter
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
-from ssilk_core.assets import Floats, Ints, Skeleton
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, Skeleton
 
 from .names import PROXIES
 from .read_skin import match_joints

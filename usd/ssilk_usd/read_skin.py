@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Floats, Ints, SkinWeights
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, SkinWeights
 
 from .names import JOINTS, SKEL
 from .read_stage import EARLIEST, inherited, location

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from pxr import Usd
 
-from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import world_transforms
+from ssilk_core.scene.assets import Floats, Ints
+from ssilk_core.scene.kinematics import world_transforms
 
 from .read_stage import location
 from .units import StageUnits, scaling

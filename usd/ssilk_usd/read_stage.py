@@ -12,8 +12,8 @@ from typing import Any, TypeAlias, TypeVar, cast
 import numpy as np
 from pxr import Ar, Pcp, Tf, Usd, UsdGeom, UsdUtils
 
-from ssilk_core.assets import Floats
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats
 
 from . import memory, trial
 from .garment_api import register_schema

@@ -15,8 +15,8 @@ from math import inf, nan
 import numpy as np
 from pxr import Usd, UsdPhysics
 
-from ssilk_core.assets import PLATE_THICKNESS, Floats, Mesh, SurfaceMaterial
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import PLATE_THICKNESS, Floats, Mesh, SurfaceMaterial
 
 from .read_stage import has_value, inherited_target, location, value
 from .units import StageUnits

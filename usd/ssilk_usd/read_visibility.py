@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Motion
+from ssilk_core.scene.assets import Motion
 
 from .read_motion import find_animation
 from .read_stage import needs_whole_files, open_stage, split_location

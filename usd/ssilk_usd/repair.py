@@ -16,7 +16,7 @@ from .repair_mesh import rewrite_mesh
 from .units import StageUnits
 
 if TYPE_CHECKING:
-    from ssilk_core.preflight.repair import MeshRepair
+    from ssilk_core.authoring.preflight.repair import MeshRepair
 
 # What refers to points, edges or faces in ways that a repair would have to guess at.
 _LOCKS = {

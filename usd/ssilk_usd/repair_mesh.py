@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints
 
 from .read_stage import EARLIEST, location, value
 
 if TYPE_CHECKING:
-    from ssilk_core.preflight.repair import MeshRepair
+    from ssilk_core.authoring.preflight.repair import MeshRepair
 
 # Skinning and the tool's own data stay on points; vertices only merge where these agree.
 _ON_POINTS = ("skel:", "ssilk:")

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.scene.assets import Floats, Garment, Ints, ProxyRig, Scene, Skeleton, SkinWeights
 
 from .author import (
     bind_skin,

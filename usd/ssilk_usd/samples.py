@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, UsdSkel, Vt
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
 from ssilk_core.errors import fail
-from ssilk_core.kinematics import (
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
+from ssilk_core.scene.kinematics import (
     combined_transforms,
     continuous,
     local_transforms,

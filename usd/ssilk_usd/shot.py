@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from ssilk_core.assets import Deformer, GarmentPose, Motion
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
+from ssilk_core.scene.assets import Deformer, GarmentPose, Motion
 
 from .author import define_asset
 from .body_faces import HiddenPolygons

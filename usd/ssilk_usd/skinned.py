@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ssilk_core.assets import Deformer, Floats, GarmentPose, SkinWeights
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, SkinWeights
 
 from .names import shape_name
 

@@ -10,8 +10,8 @@ from typing import overload
 import numpy as np
 from pxr import Sdf, UsdGeom
 
-from ssilk_core.assets import Floats, Ints
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints
 
 from .play import Shot
 from .read_stage import USD_SUFFIXES, split_location

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssilk_core.assets import Floats
 from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats
 
 if TYPE_CHECKING:
     from pxr import Usd

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
-from ssilk_core.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, Skeleton
 from ssilk_core.files import replacing
+from ssilk_core.scene.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, Skeleton
 
 from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
 from .export import new_stage, save

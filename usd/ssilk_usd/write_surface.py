@@ -8,7 +8,7 @@ from math import isclose
 
 from pxr import Sdf, Usd, UsdPhysics, UsdShade, Vt
 
-from ssilk_core.assets import PLATE_THICKNESS, Mesh, SurfaceMaterial
+from ssilk_core.scene.assets import PLATE_THICKNESS, Mesh, SurfaceMaterial
 
 from .read_surface import PROPOSAL, deformable_body, read_surface
 from .units import StageUnits

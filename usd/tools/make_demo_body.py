@@ -17,7 +17,7 @@ from pxr import Gf, Kind, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.files import replacing
-from ssilk_core.kinematics import local_transforms
+from ssilk_core.scene.kinematics import local_transforms
 
 INFLUENCES = 4
 TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

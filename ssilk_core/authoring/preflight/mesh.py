@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check a garment's mesh on its own."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...events import format_count
+from ...scene.assets import Floats, Ints, Mesh
+from ...scene.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
+from .finding import Finding, Findings, index_tuple
+
+SAME_PLACE = 1e-6  # [m] size of the cells in which vertices count as coincident
+
+
+def isolated_vertices(mesh: Mesh) -> Findings:
+    """Yield the vertices that no face uses."""
+    lone = np.setdiff1d(np.arange(mesh.vertex_count), mesh.faces)
+    if len(lone):
+        yield Finding(
+            severity="error",
+            code="isolated-vertices",
+            prim=mesh.path,
+            count=len(lone),
+            found=f"not used by any face, out of {mesh.vertex_count:,}",
+            why="they have no mass and nothing attaches them",
+            fix="delete loose geometry",
+            fixable=True,
+            elements="vertices",
+            indices=index_tuple(lone),
+        )
+
+
+def duplicate_vertices(mesh: Mesh, mergeable: Ints) -> Findings:
+    """Yield the vertices that coincide with another; `mergeable` (N,) are those that --fix merges."""
+    copies = np.setdiff1d(
+        np.flatnonzero(shared_places(mesh.points)), np.setdiff1d(np.arange(mesh.vertex_count), mesh.faces)
+    )
+    if len(copies):
+        merged = np.isin(copies, mergeable)
+        yield Finding(
+            severity="warning",
+            code="duplicate-vertices",
+            prim=mesh.path,
+            count=len(copies),
+            found="at the same position as others: panels that are not sewn",
+            why="the cloth comes apart there as soon as it moves, or folds freely where stitches join islands",
+            fix="merge by distance, unless the cloth is meant to open there"
+            + (
+                "" if merged.all() else f" (--fix merges {np.count_nonzero(merged)}, whose weights and classes agree)"
+            ),
+            fixable=bool(merged.all()),
+            elements="vertices",
+            indices=index_tuple(copies),
+        )
+
+
+def duplicate_faces(mesh: Mesh) -> Findings:
+    """Yield the triangles that have the same vertices as an earlier one."""
+    _, first = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
+    copies = np.setdiff1d(np.arange(len(mesh.faces)), first)
+    if len(copies):
+        yield Finding(
+            severity="warning",
+            code="duplicate-faces",
+            prim=mesh.path,
+            count=len(copies),
+            found="with the same vertices as an earlier face",
+            why="the cloth is twice as heavy and stiff there, and does not bend along their edges",
+            fix="delete the duplicates",
+            fixable=True,
+            elements="faces",
+            indices=index_tuple(copies),
+        )
+
+
+def non_manifold_edges(mesh: Mesh) -> Findings:
+    """Yield the edges that more than two faces use; duplicate and collapsed faces do not count."""
+    pairs, uses = edge_use(distinct_faces(mesh.faces))
+    bad = pairs[uses > 2]
+    if len(bad):
+        yield Finding(
+            severity="warning",
+            code="non-manifold-edges",
+            prim=mesh.path,
+            count=len(np.unique(bad)),
+            found=f"on {format_count(len(bad), 'edges')} shared by more than two triangles",
+            why="cloth does not bend along such an edge, and geodesic distances are less accurate",
+            fix="delete inner faces, or split the parts that meet there",
+            elements="vertices",
+            indices=index_tuple(np.unique(bad)),
+        )
+
+
+def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
+    """Yield the triangles with zero area, of which --fix removes `collapsing`, and separately the slivers."""
+    longest, area = _longest_edges(mesh), face_areas(mesh.points, mesh.faces)
+    flat = 2 * area <= NO_AREA * longest**2
+    sliver = ~flat & (longest**2 > SLIVER * 2 * area)
+    if flat.any():
+        yield Finding(
+            severity="error",
+            code="degenerate-faces",
+            prim=mesh.path,
+            count=int(flat.sum()),
+            found=f"with zero area, out of {len(mesh.faces):,}",
+            why="the membrane energy is undefined on a triangle with zero area, and training refuses it",
+            fix="dissolve degenerate geometry"
+            + ("" if collapsing else "; --fix removes only faces whose corners coincide; others would leave a slit"),
+            fixable=collapsing == flat.sum(),
+            elements="faces",
+            indices=index_tuple(np.flatnonzero(flat)),
+        )
+    if sliver.any():
+        yield Finding(
+            severity="warning",
+            code="sliver-faces",
+            prim=mesh.path,
+            count=int(sliver.sum()),
+            found=f"more than {SLIVER:.0f} times as long as high",
+            why="the cloth is too soft there: the stiffness of slivers is limited so that they do not dominate",
+            fix="collapse their short edges or remesh",
+            elements="faces",
+            indices=index_tuple(np.flatnonzero(sliver)),
+        )
+
+
+def distinct_faces(faces: Ints) -> Ints:
+    """Return each triangle with three distinct corners once, with sorted corners, shape (N, 3)."""
+    corners = np.unique(np.sort(faces, axis=1), axis=0)
+    return corners[(np.diff(corners, axis=1) > 0).all(axis=1)]
+
+
+def shared_places(points: Floats) -> Ints:
+    """Return which points coincide with another to a micrometre, shape (V,)."""
+    _, place, uses = np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True, return_counts=True)
+    return uses[place.reshape(-1)] > 1
+
+
+def _longest_edges(mesh: Mesh) -> Floats:
+    corners = mesh.points[mesh.faces]
+    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Place proxy joints on the loose part of a garment (paper, Section 3.4 and Appendix A)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from ... import events
+from ...errors import fail
+from ...scene.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
+from ...scene.kinematics import rigid
+from ...scene.mesh.topology import vertex_areas, vertex_normals
+from .clusters import Cluster, Mask, Seam, build_cluster, distribute_proxies, find_pieces, find_seam
+from .hosts import Hosts
+from .proxy_weights import proxy_weights
+
+
+@dataclass(frozen=True)
+class RigOptions:
+    """How proxies are placed.
+
+    Attributes:
+        proxies: number of proxies on the loose part; with 0 the garment follows the character's joints.
+        max_proxies: limit up to which `proxies` is raised so that each loose cluster (each strip of a fringe)
+            gets one. Beyond it the smallest clusters follow the nearest proxies of their neighbours.
+        roots_per_cluster: number of proxies of a cluster whose parent is a character joint (the paper's j).
+        influences: largest number of proxies per vertex.
+        seam_blend: whether loose vertices near the seam keep a share of the body's weights.
+    """
+
+    proxies: int = 20
+    max_proxies: int = 64
+    roots_per_cluster: int = 4
+    influences: int = 4
+    seam_blend: bool = True
+
+    def __post_init__(self) -> None:
+        for name, least in (("proxies", 0), ("max_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
+            value = getattr(self, name)
+            if not value >= least:
+                fail("proxy rig", f"{name} = {value}", f"it must be at least {least}")
+
+
+def build_rig(
+    character: Character,
+    garment: Garment,
+    options: RigOptions | None = None,
+    *,
+    report: events.Reporter = events.silent,
+) -> ProxyRig:
+    """Place proxy joints on the loose part of a garment and skin it to them.
+
+    Each connected cluster of loose vertices gets a share of the proxies by its area, and at least one. They are
+    farthest-point samples by geodesic distance. The first lies at the seam, where the cloth hinges. Up to
+    `roots_per_cluster` of them, those nearest to the seam, are children of the character joint that carries the
+    seam. A breadth-first search over adjacent regions attaches each of the others to its nearest neighbour.
+
+    Weights fall off as exp(-(d/r)^2), where r is the mean spacing of the cluster's proxies. Unlike in the paper,
+    loose vertices near the seam keep a share of the weights of the nearest vertex on it. Without this the cloth
+    tears there as soon as a root rotates, because tight vertices follow only the body.
+
+    Stitches connect the islands that lie on one another. What is carried wholly follows its host and gets no proxies.
+
+    Args:
+        garment: has weights and classes.
+        report: receives progress after each proxy, and a message if the number of proxies was changed.
+
+    Raises:
+        SsilkError: the garment has no weights or classes, or an island has only loose vertices and no
+            stitch holds it.
+    """
+    options = options or RigOptions()
+    if garment.skin is None:
+        fail(garment.mesh.path, "no skinning weights", "weights are needed", "transfer them from the body")
+    if garment.classes is None:
+        fail(garment.mesh.path, "no vertex classes", "classes are needed", "classify the vertices")
+    assert garment.skin is not None and garment.classes is not None
+    hosts = Hosts.of(garment.mesh)
+    authored: Mask = np.equal(garment.classes, LOOSE)
+    loose, joined = hosts.carry(authored), hosts.joined_mesh
+    if options.proxies == 0 or not loose.any():
+        return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
+    body_weights = garment.skin.dense(character.skeleton.joint_count)
+    seam = find_seam(joined, loose)
+    clusters = _clusters(character, joined, loose, body_weights, seam, options, report)
+    weights = proxy_weights(
+        joined,
+        loose,
+        body_weights,
+        seam,
+        clusters,
+        influences=options.influences,
+        seam_blend=options.seam_blend,
+    )
+    influences = int((weights > 0).sum(axis=1).max()) + (options.influences if len(hosts.stitches) else 0)
+    held = np.concatenate([body_weights, np.zeros((len(weights), weights.shape[1] - body_weights.shape[1]))], axis=1)
+    weights = np.where(authored[:, None], hosts.blend(weights, authored), np.where(loose[:, None], held, weights))
+    return _assemble(character, garment.mesh, clusters, weights, influences, seam)
+
+
+def _clusters(
+    character: Character,
+    mesh: Mesh,
+    loose: Mask,
+    body_weights: Floats,
+    seam: Seam,
+    options: RigOptions,
+    report: events.Reporter,
+) -> list[Cluster]:
+    """Return the clusters that get proxies, in descending order of area."""
+    pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
+    count = _affordable(len(pieces), options, mesh.path, report)
+    shares = distribute_proxies(
+        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
+    )
+    parents, roots = character.skeleton.parents, options.roots_per_cluster
+    placed = events.Countdown(int(shares.sum()), report)
+    return [
+        build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots, placed=placed)
+        for piece, share in zip(pieces, shares)
+        if share
+    ]
+
+
+def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:
+    """Return the number of proxies, raised within the limit so that each piece gets one; report any change."""
+    count = max(options.proxies, min(piece_count, options.max_proxies))
+    if count > options.proxies:
+        text = f"{path}: {count} proxies instead of {options.proxies}: each of {piece_count} loose pieces needs one"
+        report(events.Message(text))
+    if count < piece_count:
+        text = (
+            f"{path}: the {piece_count - count} smallest of {piece_count} loose pieces follow the proxies of others"
+        )
+        report(events.Message(text, "warning"))
+    return count
+
+
+def _assemble(
+    character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, influences: int, seam: Seam
+) -> ProxyRig:
+    """Return the rig of all clusters; proxies are ordered by cluster, breadth first within each."""
+    skeleton = character.skeleton
+    parents: list[int] = []
+    for cluster in clusters:
+        first = skeleton.joint_count + len(parents)
+        parents += [cluster.joint if above < 0 else first + above for above in cluster.parents]
+    samples = np.concatenate([cluster.samples for cluster in clusters])
+    return ProxyRig(
+        mesh.path,
+        _names(mesh.path, skeleton.joint_names, parents),
+        np.array(parents),
+        _bind_transforms(mesh, samples, np.array(parents) - skeleton.joint_count, seam),
+        SkinWeights.from_dense(mesh.path, weights, influences),
+    )
+
+
+def _names(path: str, joint_names: tuple[str, ...], parents: list[int]) -> tuple[str, ...]:
+    """Return a USD joint path for each proxy: the path of its parent, then "<garment>_proxy_<number>"."""
+    garment = re.sub(r"\W", "_", path.rstrip("/").rsplit("/", 1)[-1], flags=re.ASCII)
+    stem = garment if re.match("[A-Za-z_]", garment) else f"_{garment}"
+    digits = max(2, len(str(len(parents) - 1)))
+    names = list(joint_names)
+    for number, parent in enumerate(parents):
+        names.append(f"{names[parent]}/{stem}_proxy_{number:0{digits}d}")
+    return tuple(names[len(joint_names) :])
+
+
+def _bind_transforms(mesh: Mesh, samples: Ints, parents: Ints, seam: Seam) -> Floats:
+    """Return bind transforms of proxies at `samples` (P,), shape (P, 4, 4).
+
+    y runs along the cloth, away from the body, and z along the normal. y points to the mean of the children. A
+    proxy without children continues the direction from its parent, and a root without children that from the seam.
+    `parents` (P,) is negative for roots.
+    """
+    points = mesh.points[samples]
+    came_from = np.where(parents[:, None] >= 0, points[np.maximum(parents, 0)], mesh.points[seam.nearest[samples]])
+    along = points - came_from
+    for proxy in np.unique(parents[parents >= 0]):
+        along[proxy] = points[parents == proxy].mean(axis=0) - points[proxy]
+    normals = vertex_normals(mesh.points, mesh.faces)[samples]
+    return rigid(np.array([_frame(y, z) for y, z in zip(along, normals)]), points)
+
+
+def _frame(along: Floats, normal: Floats) -> Floats:
+    """Return the rotation with y along `along` and z as close as possible to `normal`; arbitrary if both vanish."""
+    axes: list[Floats] = []
+    for wanted in (along, normal, *np.eye(3)):
+        rest = wanted - sum((axis * (axis @ wanted) for axis in axes), np.zeros(3))
+        length = np.linalg.norm(rest)
+        if len(axes) < 2 and length > 1e-6 * max(1.0, float(np.linalg.norm(wanted))):
+            axes.append(rest / length)
+    y, z = axes
+    return np.column_stack([np.cross(y, z), y, z])

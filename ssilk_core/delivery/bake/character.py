@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained garment on the character of a stage."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import fail
+from ...network.checkpoint import ModelFile
+from ...scene.assets import Character, Ints, Scene, Skeleton, SkinWeights
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
+ALLOWED, TODO = "a model bakes on the character it was trained with", "train on this character"
+
+
+def on_character(file: ModelFile, stage: Usd.Stage, root: str | None) -> Scene:
+    """Return a model's scene with the character of a stage; a model file keeps only the body near the garment.
+
+    Raises:
+        SsilkError: the stage's character is not the one that the model was trained with.
+    """
+    from ssilk_usd.read_character import read_character
+
+    character = read_character(stage, root=root, garment=None)
+    return replace(file.scene, character=in_order_of(file.scene.character.skeleton, character))
+
+
+def in_order_of(trained: Skeleton, character: Character) -> Character:
+    """Return a character with the skeleton of a model, whose joints are its own in another order perhaps.
+
+    Programs list joints in the order that they like: UsdSkel only wants parents before their children.
+
+    Raises:
+        SsilkError: the character has other joints, or other bind transforms.
+    """
+    order = _places(character.skeleton, trained)
+    _need_same_binds(character.skeleton, trained, order)
+    joints = np.argsort(order)  # of the model, for each joint of the character
+    bodies = (
+        replace(body, skin=SkinWeights(body.skin.path, joints[body.skin.indices], body.skin.weights))
+        for body in character.bodies
+    )
+    return replace(character, skeleton=trained, bodies=tuple(bodies))
+
+
+def _places(found: Skeleton, trained: Skeleton) -> Ints:
+    """Return where each joint of the model stands in a skeleton, by its path or unique name, shape (J,)."""
+    from ssilk_usd.read_skin import match_joints
+
+    order = np.array(match_joints(trained.joint_names, found.joint_names))
+    missing = [name for name, place in zip(trained.joint_names, order) if place < 0]
+    if missing:
+        fail(found.path, f"{len(missing)} of the model's joints are missing ({_some(missing)})", ALLOWED, TODO)
+    more = [name for place, name in enumerate(found.joint_names) if place not in order]
+    if more:
+        fail(found.path, f"{len(more)} of its joints are not the model's ({_some(more)})", ALLOWED, TODO)
+    above = np.where(found.parents[order] < 0, -1, np.argsort(order)[found.parents[order]])
+    hung = np.flatnonzero(above != trained.parents)
+    if len(hung):
+        fail(found.path, f"joint '{found.joint_names[order[hung[0]]]}' has another parent", ALLOWED, TODO)
+    return order
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:3])
+
+
+def _need_same_binds(found: Skeleton, trained: Skeleton, order: Ints) -> None:
+    """Raise `SsilkError` unless joints are bound where the model has them."""
+    names = [found.joint_names[place] for place in order]
+    difference = found.bind_transforms[order] - trained.bind_transforms
+    away = np.linalg.norm(difference[:, :3, 3], axis=1)
+    joint = int(away.argmax())
+    if not away[joint] < BIND_TOLERANCE:
+        fail(
+            found.path,
+            f"joint '{names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
+            ALLOWED,
+            TODO,
+        )
+    turned = np.abs(difference[:, :3, :3]).max(axis=(1, 2))
+    joint = int(turned.argmax())
+    if not turned[joint] < BIND_TOLERANCE:
+        fail(
+            found.path,
+            f"joint '{names[joint]}' is bound at another rotation than the model has it",
+            ALLOWED,
+            TODO,
+        )

@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many garments over many motions as a folder of layers, each task done once."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Container, Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import SsilkError
+from ...events import Message, Reporter, Result, Started, silent
+from ...files import FileHashes, remove_unfinished_in, replacing, sha256
+from ...work_record import is_file
+from ..targets import check_influences
+from .hiding import covered_polygons
+from .inputs import InputFiles, InputHashes, need_pinned
+from .load import LoadedGarment, load_garment
+from .names_used import GarmentUse, UsedNames, need_distinct_case, write_use
+from .origin import shot_metadata
+from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
+from .refinement import refined
+from .request import BakeRequest
+from .result import BakeResult
+from .rollout import BakeRollout
+from .shots import write_shot_stage
+from .shown_skin import ShownSkinMeter
+from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
+from .verification import verify_file
+from .write import result_of
+
+if TYPE_CHECKING:
+    from ssilk_usd.author import Asset
+    from ssilk_usd.layers import Layout, WrittenAsset
+
+
+def bake_layers(
+    requests: Iterable[BakeRequest],
+    folder: str | os.PathLike[str],
+    *,
+    include_body: bool = True,
+    points: bool = False,
+    verify: bool = True,
+    again: bool = False,
+    replace_names: bool = False,
+    report: Reporter = silent,
+) -> list[BakeResult]:
+    """Bake garments over motions as layers: an asset for each garment, a small layer for each garment in each shot,
+    and a stage for each shot.
+
+    Args:
+        folder: made where it is not there; its layout is in docs/pipeline.md.
+        include_body: write each character's body meshes; a shot shows those of one of its garments.
+        points: write point caches as well.
+        verify: re-skin each layer by UsdSkel and compare it with the decoder's own vertices.
+        again: bake what is there and current, too.
+        replace_names: bake even where the name of a garment or a shot was used for another input before.
+        report: takes events.
+
+    Returns:
+        A result for each request, those of one garment together.
+
+    Raises:
+        SsilkError: an input is missing or does not fit, two garments or two shots would have one name, a name was
+            used for another input, or a file cannot be written; what was finished before stays.
+        VerificationError: a layer is not what was computed; it is not kept.
+    """
+    tasks = plan_layers(
+        requests, include_body=include_body, points=points, verify=verify, replace_names=replace_names
+    )
+    layers, results = LayerFolder(folder), []
+    layers.need_names(tasks)
+    report(Started("bake", len(tasks), {"output": str(folder)}))
+    try:
+        for task in tasks:
+            results.append(layers.bake(task, again=again, report=report))
+            report(Result("bake", results[-1].figures("layer")))
+    except BaseException:  # what is finished is in its shot, whatever stops the rest, which is what is told
+        try:
+            layers.write_stages(tasks[: len(results)], report)
+        except SsilkError as error:
+            report(Message(str(error), "warning"))
+        raise
+    layers.write_stages(tasks, report)
+    return results
+
+
+class LayerFolder:
+    """A folder of layers under way.
+
+    The garment of the last task is kept: tasks of one garment that follow each other load it and write its asset
+    once.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], inputs: InputFiles | None = None) -> None:
+        self.path = Path(path)
+        self.inputs = inputs or InputFiles()
+        self._files = FileHashes()
+        self._checked: set[BakeTask] = set()  # tasks of which the names are known to be free
+        self._loaded: LoadedGarment | None = None
+        self._written: tuple[object, WrittenAsset] | None = None
+
+    def layout(self, task: BakeTask) -> Layout:
+        """Return where the files of a task lie."""
+        from ssilk_usd.layers import Layout
+
+        return Layout(self.path, task.garment, task.shot)
+
+    def garment(self, task: BakeTask) -> LoadedGarment:
+        """Return the garment of a task, ready for any motion; raise `SsilkError` as `load_garment`."""
+        request, kept = replace(task.request, motion="", range=None, handles=0), self._loaded
+        held = kept is not None and all(map(self.inputs.still_there, (kept.model_held, kept.stage_held)))
+        if kept is None or kept.request != request or not held:
+            kept = self._loaded = load_garment(request)
+        return kept
+
+    def is_done(self, task: BakeTask) -> bool:
+        """Return whether a task is done with its inputs as they are now, and its files are as they were written.
+
+        Raises:
+            SsilkError: an input is missing, cannot be read, or is not what the task's job was submitted with.
+        """
+        need_possible_names(task)
+        found = self.inputs.hashes(task.request)
+        if task.pinned:
+            need_pinned(task.request, task.pinned, found)
+        return self.is_written(task, found)
+
+    def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
+        """Return whether a task is done with inputs that hold this, and its files are as they were written."""
+        return (
+            has_possible_names(task)
+            and current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
+        )
+
+    def need_names(self, tasks: Iterable[BakeTask]) -> None:
+        """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
+        input, unless its task says so.
+
+        It lists the folders of all shots and assets, so it is for a whole command; `bake` lists none.
+        """
+        tasks = list(tasks)
+        need_distinct_case(self.path, tasks)
+        self._need_inputs(tasks)
+
+    def _need_inputs(self, tasks: Iterable[BakeTask]) -> None:
+        """Raise `SsilkError` where a name was used for another input, unless its task says so."""
+        names = UsedNames(self.path)
+        for task in tasks:
+            if not task.replace and task not in self._checked:
+                names.check(task)
+                self._checked.add(task)
+
+    def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
+        """Bake one garment in one shot, unless that is done already.
+
+        Any number of processes may bake the same task at the same time: each writes the same files. The record's key
+        is of what the inputs held while they were read.
+
+        Raises:
+            SsilkError: an input is missing or bad, or not what the task's job was submitted with, or a file cannot be
+                written.
+            VerificationError: the written layer is not what was computed; it is not kept.
+        """
+        need_possible_names(task)
+        layout, home = self.layout(task), self._home(task)
+        wanted = task.pinned or self.inputs.hashes(task.request)
+        if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
+            return replace(record.result, current=True)
+        self._need_inputs([task])
+        request = task.request
+        garment = self.garment(task)
+        rollout = garment.over(request.motion, range=request.range, handles=request.handles)
+        if task.pinned:
+            need_pinned(request, task.pinned, rollout.inputs)
+        rollout.tell(report)
+        check_influences(rollout.influences, request.target, request.model)
+        key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
+        write_use(self.path, task.garment, GarmentUse(inputs["model"], request.root))  # no asset is without it
+        asset = self._asset(task, garment, layout, report)
+        result, files = _write_layer(layout, asset.asset, rollout, task, report)
+        written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
+        write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=request.root))
+        return result
+
+    def _home(self, task: BakeTask) -> Path:
+        """Return the folder of the files that a task alone writes."""
+        return self.layout(task).animation.parent
+
+    def _asset(self, task: BakeTask, garment: LoadedGarment, layout: Layout, report: Reporter) -> WrittenAsset:
+        """Return the asset of a task, written unless the last task left the same."""
+        asked = (garment, task.include_body, layout.asset)
+        if self._written is None or self._written[0] != asked or not self._is_there(self._written[1]):
+            self._written = (asked, _write_asset(layout, garment, task, report))
+        return self._written[1]
+
+    def _is_there(self, asset: WrittenAsset) -> bool:
+        return all(is_file(path, digest, self._files.sha256) for path, digest in asset.digests)
+
+    def write_stages(self, tasks: Sequence[BakeTask], report: Reporter = silent) -> None:
+        """Write the stage of each shot of tasks, with all that is baked for it; warn of shots with an older asset.
+
+        Raises:
+            SsilkError: as `write_shot_stage` does; the stages of all other shots are written before.
+        """
+        layouts = [self.layout(task) for task in tasks]
+        known: dict[str, set[str]] = {}
+        for layout in layouts:
+            known.setdefault(layout.garment, set()).add(layout.shot)
+        needed: dict[str, set[str]] = {}
+        for layout in layouts:
+            needed.setdefault(layout.shot, set()).add(layout.garment)
+        replaced: dict[str, list[str]] = {}
+        for task in tasks:
+            if task.replace:
+                replaced.setdefault(task.shot, []).append(task.garment)
+        errors: list[SsilkError] = []
+        for shot, garments in needed.items():
+            try:
+                write_shot_stage(self.path, shot, report, needed=garments, replaced=replaced.get(shot, ()))
+            except SsilkError as error:
+                errors.append(error)
+        for layout in {layout.garment: layout for layout in layouts}.values():
+            outdated = list(_outdated_shots(layout, known[layout.garment]))
+            if outdated:
+                report(Message(
+                    f"{layout.asset}: {len(outdated)} shots were baked with the asset as it was before "
+                    f"({', '.join(outdated[:3])}); bake them again", "warning"))  # fmt: skip
+        if errors:
+            raise _as_one(errors, len(needed))
+
+    def remove_unfinished(self, tasks: Sequence[BakeTask]) -> None:
+        """Remove what processes that have ended left half written."""
+        layouts = [self.layout(task) for task in tasks if has_possible_names(task)]
+        paths = (path for each in layouts for path in (each.asset, each.stage, each.animation))
+        for folder in dict.fromkeys(path.parent for path in paths):
+            remove_unfinished_in(folder)
+
+
+def _as_one(errors: Sequence[SsilkError], shots: int) -> SsilkError:
+    """Return the error of shots whose stages could not be written."""
+    if len(errors) == 1:
+        return errors[0]
+    return SsilkError(f"{len(errors)} of {shots} shots have no current stage; the first: {errors[0]}")
+
+
+def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> WrittenAsset:
+    """Write the asset of a task where it is not there already; warn of changes that layers above may rely on."""
+    from ssilk_usd import layers
+
+    written = layers.write_asset(
+        layout, garment.deformer, garment.units, include_body=task.include_body, record=garment.record
+    )
+    for change in written.changes:
+        report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))
+    return written
+
+
+def _write_layer(
+    layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter
+) -> tuple[BakeResult, dict[Path, str]]:
+    """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
+    from ssilk_usd import layers
+
+    rollout = refined(rollout, report, add_shapes=True)
+    hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
+    meter = ShownSkinMeter(rollout)
+    common: dict[str, Any] = {
+        "units": rollout.units,
+        "start": rollout.start,
+        "samples_per_frame": task.request.samples_per_frame,
+        "lean": task.request.receiver.lean,
+    }
+    digests: dict[Path, str] = {}
+    if task.points:
+        digests[layout.points] = layers.write_points(
+            layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
+        )
+    with replacing(layout.animation) as unverified:
+        summary = layers.write_animation(
+            layout,
+            asset,
+            rollout.deformer,
+            rollout.motion,
+            meter.poses(),
+            **common,
+            hidden=rollout.hidden,
+            hidden_polygons=hidden,
+            provenance=shot_metadata(rollout, layout.animation, meter.stated),
+            path=unverified,
+            points=task.points,
+        )
+        verification = verify_file(rollout, unverified, report) if task.verify else None
+        digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file
+    rollout.warn(report)
+    return result_of(meter, layout.animation, summary, verification, hidden), digests
+
+
+def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:
+    """Yield the shots, besides the `current` ones, whose record has another asset of this garment than is there."""
+    digest = sha256(layout.geometry) if layout.geometry.is_file() else None
+    for path in sorted(layout.folder.glob(f"shots/*/{layout.garment}/{RECORD}")):
+        shot = path.parent.parent.name
+        if digest is None or shot in current:
+            continue
+        record, name = read_record(path.parent), os.path.relpath(layout.geometry, path.parent)
+        if record and record.files.get(name) != digest:
+            yield shot

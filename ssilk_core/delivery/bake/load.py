@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loading what a request names: the garment on its character, then the motion."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...devices import select_device
+from ...errors import fail
+from ...network.checkpoint import ModelFile, load_model
+from ...quality.levels import SizeReduction
+from ...quality.reduction import Reducer
+from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
+from ..targets import Target, cap_influences
+from .character import on_character
+from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
+from .request import ALLOWED_FPS, BakeRequest
+from .rollout import BakeRollout
+
+if TYPE_CHECKING:
+    from pxr import Usd
+    from ssilk_usd.frame_range import FrameRange
+    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.units import StageUnits
+
+    from ...network.model.network import GarmentModel
+
+LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
+
+
+@dataclass(frozen=True, eq=False)
+class _ReadMotion:
+    """A motion as it was read, the shot's samples of it, the same with those before them, how many these are, which
+    frames the shot's are, and at which the character becomes hidden (True) or visible (False)."""
+
+    source: Motion
+    sampled: Motion
+    whole: Motion
+    lead: int
+    frames: FrameRange | None
+    hidden: list[tuple[int, bool]]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedGarment:
+    """A garment on its character, ready for any motion.
+
+    Attributes:
+        model: the network; None under linear blend skinning.
+        deformer: the garment as its target takes it.
+        units: units and up axis of what is written.
+        model_held, stage_held: what model and stage held while they were read.
+        provenance: where the model comes from, as a shot stores it.
+        record: how the model was made, as its mesh stores it.
+    """
+
+    request: BakeRequest
+    file: ModelFile
+    model: GarmentModel | None
+    deformer: Deformer
+    units: StageUnits
+    model_held: InputContents
+    stage_held: InputContents
+    provenance: dict[str, object]
+    record: GarmentRecord
+
+    def over(self, motion: str, *, range: str | None = None, handles: int = 0) -> BakeRollout:
+        """Return the garment over a motion, "file[:/Prim/Path]"; range and handles are those of a request.
+
+        Raises:
+            SsilkError: the file is missing, does not fit, or lacks the range.
+        """
+        request = replace(self.request, motion=motion, range=range, handles=handles)
+        read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
+        source = read.source
+        kept, reduction = self._cut(source) if request.keep else (self, None)
+        provenance = {
+            **self.provenance,
+            **({"reduced": reduction.to_metadata()} if reduction else {}),
+            "request": request.to_metadata(),
+            "motion_sha256": held.first,
+        }
+        return BakeRollout(
+            request=request,
+            model=kept.model,
+            deformer=kept.deformer,
+            motion=read.sampled,
+            source=source,
+            whole=read.whole,
+            lead=read.lead,
+            frames=read.frames,
+            hidden=read.hidden,
+            units=self.units,
+            inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
+            provenance=provenance,
+            record=self.record,
+            fabric=self.file.fabric,
+            reduction=reduction,
+        )
+
+    def _read(self, request: BakeRequest) -> _ReadMotion:
+        from ssilk_usd.frame_range import read_frame_range
+        from ssilk_usd.read_motion import read_motion
+        from ssilk_usd.read_visibility import read_hidden
+
+        character, root, samples = self.file.scene.character, request.root, request.samples_per_frame
+        frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
+        if frames is None:
+            source = read_motion(request.motion, character.skeleton, root=root)
+            sampled, begun, handles = _sampled(source, (request.fps or source.fps) * samples, np.zeros(1)), 0, 0
+            whole = sampled
+        else:
+            fps = (request.fps or frames.fps) * samples
+            rate, handles = fps / frames.fps, frames.before * samples
+            # Samples before the range, on the shot's grid.
+            wanted = handles + round(max(LEAD, request.pre_roll) * fps)
+            begun = max(min(_floor(frames.earlier * rate), wanted), handles)
+            earlier = min(_ceil(begun / rate), frames.earlier)
+            last = min(_floor(frames.count * rate) + frames.after * samples, _floor(frames.later * rate))
+            later = max(min(_ceil(last / rate), frames.later), frames.count)
+            within = (frames.first - earlier * frames.step, frames.first + later * frames.step)
+            source = read_motion(request.motion, character.skeleton, root=root, within=within)
+            whole = _sampled(source, fps, earlier + np.arange(-begun, last + 1) / rate)
+            whole = replace(whole, start=frames.first / frames.step * fps / frames.fps - begun)
+            sampled = whole.clip(begun - handles, whole.frame_count)
+        hidden = read_hidden(request.motion, sampled, root=root)
+        return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
+
+    def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
+        """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
+        assert self.model is not None and self.request.keep is not None
+        reducer = Reducer(self.file, [motion])
+        found = reducer.reduce(self.request.keep)
+        model, deformer = _network_like(self.model, found.file, self.request)
+        return replace(self, model=model, deformer=deformer), SizeReduction.of(reducer.whole, found)
+
+
+def load_garment(request: BakeRequest) -> LoadedGarment:
+    """Load what a request names, except its motion.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others.
+    """
+    from ...network.checkpoint import network
+
+    device = select_device(request.device)
+    file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
+    (scene, units), stage_held = read_unchanged(
+        partial(stage_contents, request.stage), partial(_on_stage, file, request)
+    )
+    model = None if request.lbs else network(file, scene).to(device)
+    deformer = lbs_deformer(scene) if model is None else model.deformer()
+    return LoadedGarment(
+        request=request,
+        file=file,
+        model=model,
+        deformer=cap_influences(deformer, request.receiver),
+        units=units,
+        model_held=model_held,
+        stage_held=stage_held,
+        provenance={"model_sha256": model_held.digest, "training": file.provenance.get("ssilk", "")},
+        record=_record(file, model_held.digest),
+    )
+
+
+def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits]:
+    """Return a model's scene with the character of a stage, and the units of what is written."""
+    from ssilk_usd.read_stage import open_stage
+
+    stage = open_stage(request.stage)
+    return on_character(file, stage, request.root), _units(stage, request.receiver)
+
+
+def load_rollout(request: BakeRequest) -> BakeRollout:
+    """Load everything that a request names.
+
+    Raises:
+        SsilkError: a file is missing or does not fit the others.
+    """
+    return load_garment(request).over(request.motion, range=request.range, handles=request.handles)
+
+
+def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
+    """Return a rollout of another model of the same garment."""
+    assert rollout.model is not None
+    model, deformer = _network_like(rollout.model, file, rollout.request)
+    return replace(rollout, model=model, deformer=deformer)
+
+
+def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> tuple[GarmentModel, Deformer]:
+    """Return a model's network on the character of another network, and the garment as its target takes it."""
+    from ...network.checkpoint import network
+
+    model = network(file, replace(file.scene, character=like.scene.character))
+    model.to(select_device(request.device))
+    return model, cap_influences(model.deformer(), request.receiver)
+
+
+def _sampled(motion: Motion, fps: float, position: Floats) -> Motion:
+    """Return a motion at fractional frames `position`, shape (N,), which are those of a rate [1/s]."""
+    if not MIN_FPS <= fps <= MAX_FPS:
+        fail("--fps", f"{fps:g} frames per second", ALLOWED_FPS)
+    near = np.round(position)
+    whole = np.abs(position - near) < 1e-6
+    position = np.where(whole, near, position).clip(0, motion.frame_count - 1)
+    return Motion(motion.path, fps, *sample_motion(motion, position))
+
+
+def _floor(samples: float) -> int:
+    return int(np.floor(samples + 1e-6))
+
+
+def _ceil(frames: float) -> int:
+    return int(np.ceil(frames - 1e-6))
+
+
+def _units(stage: Usd.Stage, target: Target) -> StageUnits:
+    """Return a target's units and axis, or those of the character's stage where it takes any."""
+    from ssilk_usd.units import StageUnits
+
+    own = StageUnits.of(stage)
+    return StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis)
+
+
+def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
+    from ssilk_usd.garment_api import GarmentRecord
+
+    unused = {"collision"} if file.fabric.contact_model == "surface" else {"contact", "loose_contact"}
+    unused |= set() if file.fabric.stitch else {"stitch"}
+    values = asdict(file.fabric).items()
+    numbers = {name: float(value) for name, value in values if isinstance(value, int | float) and name not in unused}
+    return GarmentRecord(
+        model_hash=model_hash,
+        version=str(file.provenance.get("ssilk", "")),
+        seed=int(file.provenance.get("seed", 0)),
+        fabric=file.fabric.name,
+        parameters=numbers,
+    )

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the names in a folder of layers were used for: a name stays with its input."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NoReturn
+
+from ...errors import fail
+from ...files import replacing
+from .inputs import InputContents, model_contents, stage_contents
+from .plain import from_plain
+from .record import RECORD, RecordedInput, TaskRecord, portable, read_record
+from .task import BakeTask
+
+USED = "used.json"
+
+
+@dataclass(frozen=True)
+class GarmentUse:
+    """What the name of a garment was used for: its model, and the SkelRoot, where one was named.
+
+    It lies beside the asset, so that a task need not look for the garment in all shots.
+    """
+
+    model: RecordedInput
+    root: str | None
+
+
+def write_use(folder: Path, garment: str, use: GarmentUse) -> None:
+    """Write what a garment of a folder of layers is baked from, beside its asset; leave a file that says so alone.
+
+    Raises:
+        SsilkError: the file cannot be written.
+    """
+    if read_use(folder, garment) == use:
+        return
+    with replacing(_place(folder, garment)) as temporary:
+        temporary.write_text(json.dumps(asdict(use), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def read_use(folder: Path, garment: str) -> GarmentUse | None:
+    """Return what a garment was baked from; None where no file says so, or it is damaged."""
+    try:
+        return from_plain(GarmentUse, json.loads(_place(folder, garment).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return None
+
+
+def forget_use(folder: Path, garment: str) -> None:
+    """Free the name of a garment that is in no shot any more."""
+    _place(folder, garment).unlink(missing_ok=True)
+
+
+def _place(folder: Path, garment: str) -> Path:
+    return folder / "assets" / garment / USED
+
+
+def need_distinct_case(folder: Path, tasks: Iterable[BakeTask]) -> None:
+    """Raise `SsilkError` where a shot or garment differs from one in a folder of layers by its case alone.
+
+    Not every file system tells them apart.
+    """
+    tasks = list(tasks)
+    for kind, home, names in (
+        ("shot", folder / "shots", dict.fromkeys(task.shot for task in tasks)),
+        ("garment", folder / "assets", dict.fromkeys(task.garment for task in tasks)),
+    ):
+        there = set(os.listdir(home)) if home.is_dir() else set()
+        alike = {name.casefold(): name for name in sorted(there)}
+        for name in names:
+            if name not in there and (other := alike.get(name.casefold())):
+                fail(
+                    str(home),
+                    f"there is a {kind} '{other}', one with '{name}' on some disks",
+                    "files and folders are named by them",
+                    f"name this {kind} '{other}', or otherwise, with --{kind}-name",
+                )
+
+
+class UsedNames:
+    """The names of a folder of layers; what it reads of the folder is remembered.
+
+    An input is the same as before if it has the same path or the same contents.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._shots: dict[str, dict[str, TaskRecord | None]] = {}
+        self._garments: dict[str, GarmentUse | None] = {}
+
+    def check(self, task: BakeTask) -> None:
+        """Raise `SsilkError` where the names of a task were used for another motion, model or SkelRoot, or where it
+        would replace a garment of which no record tells what it was baked from."""
+        request, shot = task.request, self._shot(task.shot)
+        motions = [record.inputs["motion"] for record in shot.values() if record and "motion" in record.inputs]
+        for motion in motions:
+            if not self._same(motion, request.motion, stage_contents):
+                self._fail("shot", task.shot, motion.path, request.motion)
+        used = _use(shot.get(task.garment)) or self._garment(task.garment)
+        if task.garment in shot and not (used and motions):
+            fail(
+                str(self.folder / "shots" / task.shot / task.garment / RECORD),
+                "it does not tell what this garment was baked from",
+                "a name stays with its input",
+                "name the shot with --shot-name, or replace the garment with --replace",
+            )
+        if used is None:
+            return
+        if not self._same(used.model, request.model, model_contents):
+            self._fail("garment", task.garment, used.model.path, request.model)
+        if used.root != request.root:
+            roots = (f"{request.model}:{root}" if root else request.model for root in (used.root, request.root))
+            self._fail("garment", task.garment, *roots)
+
+    def _shot(self, name: str) -> dict[str, TaskRecord | None]:
+        """Return the records of the garments in a shot; None for one that is damaged."""
+        if name not in self._shots:
+            paths = sorted(self._records(name, "*"))
+            self._shots[name] = {path.parent.name: read_record(path.parent) for path in paths}
+        return self._shots[name]
+
+    def _garment(self, name: str) -> GarmentUse | None:
+        """Return what a garment was baked from in any of its shots, which share its asset."""
+        if name not in self._garments:
+            self._garments[name] = read_use(self.folder, name) or self._used_in_shots(name)
+        return self._garments[name]
+
+    def _used_in_shots(self, name: str) -> GarmentUse | None:
+        """Return what the records of a garment's shots tell, where its asset is of an older bake.
+
+        Raises:
+            SsilkError: it is in shots, and none of their records tells.
+        """
+        if not _place(self.folder, name).with_name("asset.usda").is_file():
+            return None
+        path = None
+        for path in self._records("*", name):
+            if use := _use(read_record(path.parent)):
+                return use
+        if path:
+            fail(
+                str(path),
+                f"it does not tell what the garment '{name}' was baked from",
+                "a name stays with its input",
+                "name this garment with --garment-name, or use the name all the same with --replace",
+            )
+        return None
+
+    def _records(self, shot: str, garment: str) -> Iterator[Path]:
+        return self.folder.glob(f"shots/{shot}/{garment}/{RECORD}")
+
+    def _same(self, before: RecordedInput, location: str, contents: Callable[[str], InputContents]) -> bool:
+        """Return whether an input is the one that a record names."""
+        from ssilk_usd.read_stage import split_location
+
+        if before.path == portable(location, self.folder):
+            return True
+        then, now = split_location(before.path), split_location(location)
+        if not Path(now[0]).is_file():
+            return True  # which is told when it is read
+        if then[1] != now[1]:
+            return False
+        place = self.folder / then[0]
+        return (place.is_file() and os.path.samefile(place, now[0])) or before.sha256 == contents(now[0]).digest
+
+    def _fail(self, kind: str, name: str, before: str, now: str) -> NoReturn:
+        fail(
+            str(self.folder),
+            f"the {kind} '{name}' was baked from '{before}', not from '{now}'",
+            "a name stays with its input",
+            f"name this {kind} with --{kind}-name, or use the name all the same with --replace",
+        )
+
+
+def _use(record: TaskRecord | None) -> GarmentUse | None:
+    """Return what a record tells of its garment; None where it does not name a model."""
+    return GarmentUse(record.inputs["model"], record.root) if record and "model" in record.inputs else None

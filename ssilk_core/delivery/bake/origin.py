@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a shot came from: what is written into it, and how its inputs are found again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ...errors import fail
+from ...files import relative_path, sha256
+from .opened import provenance_of
+from .record import RECORD
+from .request import BakeRequest
+from .result import SHOT_SHAPES
+from .rollout import BakeRollout
+
+
+def shot_metadata(rollout: BakeRollout, output: Path, shown_skin: Mapping[str, object]) -> dict[str, object]:
+    """Return what a shot says of its origin and quality; `recovered` and `shown_skin` fill while poses are written.
+
+    Args:
+        shown_skin: figures of the covered skin that shows.
+    """
+    refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
+    request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
+    return {
+        **rollout.provenance, "request": request, "recovered": rollout.recovered, "shown_skin": shown_skin, **refined
+    }  # fmt: skip
+
+
+def _from_folder(location: str, folder: Path) -> str:
+    """Return the path of an input from a shot's folder; its name alone where they share nothing but the root.
+
+    So nothing tells where a studio keeps its files, and the same files give the same bytes wherever they lie.
+    """
+    return relative_path(location, folder) or _name(location)
+
+
+def _name(location: str) -> str:
+    """Return the name of a location's file, with the prim that it names."""
+    file, mark, prim = location.partition(":/")
+    return Path(file).name + mark + prim
+
+
+@dataclass(frozen=True)
+class ShotOrigin:
+    """What a shot says of its origin.
+
+    Attributes:
+        request: what was baked, with the present paths of its inputs.
+        hashes: SHA-256 of "model" and "motion" when the shot was baked.
+    """
+
+    request: BakeRequest
+    hashes: Mapping[str, object]
+
+
+def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | None]) -> ShotOrigin:
+    """Read what a shot was baked from.
+
+    Args:
+        elsewhere: new paths of inputs that have moved, and not together with the shot.
+
+    Raises:
+        SsilkError: no such shot, one that does not say how it was baked, or an input that is not found.
+    """
+    allowed = "a shot written by 'ssilk bake' is needed"
+    if not shot.is_file():
+        fail(str(shot), "there is no such shot", allowed)
+    provenance = provenance_of(shot)
+    if "request" not in provenance:
+        fail(str(shot), "the file does not say how it was baked", allowed)
+    try:
+        stored = BakeRequest.from_metadata(provenance["request"])
+    except (TypeError, ValueError) as error:
+        fail(str(shot), f"the file does not say how it was baked as this version does ({error})", allowed,
+             "bake it again")  # fmt: skip
+    refined = provenance.get("refined")
+    if isinstance(refined, Mapping) and SHOT_SHAPES not in refined:
+        if provenance["request"].get("refined_output", "points") != "points":
+            fail(
+                str(shot),
+                "an earlier version fitted it to the joints and shapes of its model",
+                "refined shots have shapes of their own now",
+                "bake it again",
+            )
+        stored = replace(stored, refined_output="points")  # the default of earlier versions
+    beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
+    hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
+    found: dict[str, str] = {}
+    for name, path in stored.inputs.items():
+        near = str(beside[name]) if isinstance(beside, Mapping) and name in beside else path
+        found[name] = str(elsewhere.get(name) or _existing(shot, name, near, Path(path), hashes.get(name)))
+    return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
+
+
+def _existing(shot: Path, name: str, near: str, then: Path, held: object) -> Path:
+    """Return the place of an input where there is a file.
+
+    It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
+    from each folder above the shot, because some inputs may have stayed where they were. Of several files the first
+    that holds what the input held is taken. What bakes wrote is no input.
+
+    Args:
+        held: SHA-256 of the input when the shot was baked, where the shot says it.
+    """
+    parts = Path(near).parts
+    tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
+    places = [shot.parent / near, then, Path(tail), *(above / tail for above in shot.absolute().parents)]
+    there = [path for path in places if _file(path).is_file() and not _is_baked(_file(path), shot)]
+    if not there:
+        fail(str(shot), f"the {name} that it was baked from is not at {near}", f"--{name} gives its present path")
+    if len({_file(path).resolve() for path in there}) == 1:
+        return there[0]
+    return next((path for path in there if sha256(_file(path)) == held), there[0])
+
+
+def _file(place: Path) -> Path:
+    """Return the file of a place, which may name a prim in it."""
+    from ssilk_usd.read_stage import split_location
+
+    return Path(split_location(str(place))[0])
+
+
+def _is_baked(file: Path, shot: Path) -> bool:
+    """Return whether a file is the shot itself, or of the layers that bakes wrote for garments and shots.
+
+    Layers may be written into a folder that holds inputs too, so it is not the folder that tells.
+    """
+    of_garment = (file.parent / RECORD).is_file()
+    of_shot = file.name == "shot.usda" and any(file.parent.glob(f"*/{RECORD}"))
+    of_asset = file.name in ("asset.usda", "geometry.usdc") and file.parent.parent.name == "assets"
+    return file.samefile(shot) or of_garment or of_shot or of_asset

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a finished task leaves beside its files, so that nobody bakes it again: bake.json."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from ... import __version__, work_record
+from ...errors import SsilkError
+from ...files import relative_path, sha256
+from ...work_record import Hash, WorkRecord, request_key
+from .inputs import InputHashes
+from .plain import from_plain
+from .request import INPUTS, BakeRequest
+from .result import BakeResult
+from .task import BakeTask
+
+RECORD = "bake.json"
+
+
+@dataclass(frozen=True)
+class RecordedInput:
+    """An input of a finished task: its path relative to the folder of layers, with forward slashes; its SHA-256."""
+
+    path: str
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskRecord:
+    """A finished task.
+
+    Attributes:
+        key: of everything that its files depend on (see `task_key`).
+        files: SHA-256 of each file that it wrote, by path relative to the record's folder.
+        result: of its bake.
+        inputs: what was in each of the request's `INPUTS`, and where it was.
+        root: SkelRoot of the character, where one was named.
+    """
+
+    key: str
+    files: Mapping[str, str]
+    result: BakeResult
+    inputs: Mapping[str, RecordedInput] = field(default_factory=dict)
+    root: str | None = None
+
+    @property
+    def wearer(self) -> tuple[str | None, str | None]:
+        """The character that wears the garment in its shot: its motion and its SkelRoot."""
+        return (self.inputs["motion"].path if "motion" in self.inputs else None), self.root
+
+
+def task_key(task: BakeTask, contents: InputHashes) -> str:
+    """Return a hash of all that decides what a task writes: where its inputs lie makes no difference.
+
+    Args:
+        contents: what the request's inputs hold.
+    """
+    options = asdict(task)
+    del options["pinned"], options["replace"]
+    for name in INPUTS:
+        del options["request"][name]
+    return request_key({"ssilk": __version__, "options": options}, [*asdict(contents).items()])
+
+
+def inputs_of(request: BakeRequest, contents: InputHashes, folder: Path) -> dict[str, RecordedInput]:
+    """Return the inputs of a request as a record in a folder of layers names them.
+
+    Args:
+        contents: what they hold.
+    """
+    paths = request.inputs.items()
+    return {name: RecordedInput(portable(path, folder), getattr(contents, name)) for name, path in paths}
+
+
+def portable(location: str, folder: Path) -> str:
+    """Return "file[:/Prim]" relative to a folder, with forward slashes, so that both can move together.
+
+    Where the two share nothing but the root, a hash tells the file from others of its name, and nothing tells where a
+    studio keeps it.
+    """
+    from ssilk_usd.read_stage import split_location
+
+    file, prim = split_location(location)
+    path = relative_path(file, folder)
+    if path is None:
+        path = f"{hashlib.sha256(os.path.abspath(file).encode()).hexdigest()[:8]}/{Path(file).name}"
+    return f"{path}:{prim}" if prim else path
+
+
+def write_record(folder: Path, record: TaskRecord) -> None:
+    """Write a record into the folder of its files, last of all."""
+    inputs = {name: asdict(each) for name, each in record.inputs.items()}
+    detail = {**_portable(record.result), "inputs": inputs, "root": record.root}
+    written = WorkRecord(key=record.key, files=dict(record.files), detail=detail)
+    work_record.write_record(folder / RECORD, written)
+
+
+def _portable(result: BakeResult) -> dict[str, object]:
+    """Return a result without its folder, which can move."""
+    return {**asdict(result), "path": result.path.name}
+
+
+def read_record(folder: Path) -> TaskRecord | None:
+    """Return the record of a folder; None where none can be read, so that its task is done again.
+
+    Records of older bakes name neither inputs nor SkelRoot.
+    """
+    try:
+        found = work_record.read_record(folder / RECORD)
+        if found is None:
+            return None
+        detail = {**found.detail, "path": folder / found.detail["path"]}
+        inputs = {str(name): from_plain(RecordedInput, each) for name, each in detail.pop("inputs", {}).items()}
+        root = detail.pop("root", None)
+        result = from_plain(BakeResult, detail)
+        return TaskRecord(key=found.key, files=found.files, result=result, inputs=inputs, root=root)
+    except (SsilkError, ValueError, TypeError, KeyError, AttributeError):
+        return None
+
+
+def current_record(folder: Path, key: str, hashed: Hash = sha256) -> TaskRecord | None:
+    """Return the record of a task that is done: it has this key, and the files are as they were written.
+
+    Args:
+        hashed: gives the SHA-256 of a file.
+    """
+    record = read_record(folder)
+    if record is None or record.key != key:
+        return None
+    return record if WorkRecord(key=key, files=record.files).is_done(folder, hashed) else None

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rollouts refined by the simulator's solver, as joints and blendshapes or as points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from itertools import tee
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...devices import select_device
+from ...errors import SsilkError, VerificationError
+from ...events import Countdown, Message, Reporter, silent
+from ...scene.assets import Floats
+from .result import RefinementSummary, ShotShapes, Verification
+from .rollout import BakeRollout, Refinement
+
+if TYPE_CHECKING:
+    from ...physics.refine import RefinedFrame, Refiner
+    from ...scene.decomposition import Decomposition
+
+# Rounding points to float32 may raise the energy of a frame: by this near the origin [J], ...
+ROUNDING_ENERGY = 1e-6
+# ... and far from it as if each vertex were held by a spring stiffer than any fabric [N/m].
+ROUNDING_STIFFNESS = 1e3
+
+
+def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool = False) -> BakeRollout:
+    """Return a rollout with its refined frames, or the rollout itself where its request asks for none.
+
+    Where joints are written, its deformer gets the shot's own blendshapes. Points that these cannot reach are written
+    as points.
+
+    Args:
+        add_shapes: to those of the model, instead of in their place: assets are the same for all shots.
+
+    Raises:
+        SsilkError: a number of iterations that is not allowed.
+    """
+    if not rollout.request.refine or rollout.refinement is not None:
+        return rollout
+    from ...physics.refine import RefinementMeans
+
+    means, points = RefinementMeans(), []
+    for frame in _refined_frames(rollout, report):
+        points.append(frame.points)
+        means.changes.append(frame.change)
+    if rollout.request.writes_points:
+        found = _summary(rollout.request.refine, means.figures(), None)
+        return replace(rollout, refinement=Refinement(tuple(points), (), found))
+    try:
+        shot = _decomposed(rollout, points, add_shapes)
+    except SsilkError as error:  # what the solver made is kept
+        report(Message(f"{error} They are written as points.", "warning"))
+        as_points = replace(rollout, request=replace(rollout.request, refined_output="points"))
+        return replace(
+            as_points,
+            refinement=Refinement(tuple(points), (), _summary(rollout.request.refine, means.figures(), None)),
+        )
+    found = _summary(rollout.request.refine, means.figures(), ShotShapes.of(shot))
+    return replace(rollout, deformer=shot.deformer, refinement=Refinement(tuple(points), shot.poses, found))
+
+
+def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[Floats]:
+    """Yield the refined vertices of each frame in the world [m], shape (V, 3)."""
+    return (frame.points for frame in _refined_frames(rollout, report))
+
+
+def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedFrame]:
+    left_out, played = 0, rollout
+    if rollout.request.feedback:  # the cloth is on its way when the shot begins
+        left_out, played = rollout.lead, rollout.with_lead()
+        report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
+    told = Countdown(played.motion.frame_count, report)
+    for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices())):
+        told()
+        if number >= left_out:
+            yield frame
+
+
+def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:
+    """Return refined vertices as joints and blendshapes, found from the network's own poses."""
+    from ...scene.decomposition import decompose
+
+    deformer = rollout.deformer
+    if not add_shapes:
+        deformer = replace(deformer, shapes=deformer.shapes[:0])
+    poses = list(rollout.network_poses())
+    return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
+
+
+def _refiner(rollout: BakeRollout) -> Refiner:
+    from ...physics.refine import RefineOptions, Refiner
+
+    request = rollout.request
+    options = RefineOptions(iterations=request.refine, feedback=request.feedback)
+    device = select_device(request.device)
+    return Refiner(rollout.deformer.scene, rollout.fabric, options, fps=rollout.motion.fps, device=device)
+
+
+def _summary(iterations: int, means: dict[str, float], shapes: ShotShapes | None) -> RefinementSummary:
+    return RefinementSummary(
+        iterations=iterations,
+        energy_before_j=means["energy before [J]"],
+        energy_j=means["energy [J]"],
+        inside_before=means["inside the body before"],
+        inside=means["inside the body"],
+        moved_m=means["moved [m]"],
+        shapes=shapes,
+    )
+
+
+def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Reporter) -> Verification:
+    """Check points [m], shape (V, 3) each, that an earlier bake refined, without refining them again.
+
+    The last digits of a refinement depend on the machine, and the solver amplifies them. On any machine, no frame
+    may have more energy than the network's state, with inertia as it was refined with.
+
+    Raises:
+        VerificationError: a frame has more.
+    """
+    energies, (judged, measured) = [], tee(points)
+    told = Countdown(rollout.motion.frame_count, report)
+    changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged)
+    for frame, (change, vertices) in enumerate(zip(changes, measured)):
+        spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()
+        rounding = ROUNDING_ENERGY + len(vertices) * ROUNDING_STIFFNESS * spacing**2
+        if not change.after <= change.before + rounding:
+            raise VerificationError(
+                f"{rollout.request.motion}: refined frame {frame} has an energy of {change.after:.6g} J; at most "
+                f"the {change.before:.6g} J of the network's state is allowed."
+            )
+        energies.append(change.after)
+        told()
+    return Verification(frames=len(energies), mean_energy_j=float(np.mean(energies)))

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a bake and its verification found, with units in the names, and as figures for people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...physics.skin.figures import ShownSkin
+from ...quality.levels import SizeReduction
+
+if TYPE_CHECKING:
+    from ...scene.decomposition import Decomposition
+
+SHOT_SHAPES = "shapes of the shot"
+SKINNED = "skinned"  # what a shot says of the points of another simulator that it stands for
+
+
+@dataclass(frozen=True)
+class FrameSpan:
+    """Consecutive frames, both ends included."""
+
+    first: int
+    last: int
+
+    def __str__(self) -> str:
+        return f"{self.first} to {self.last}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verification:
+    """How a written shot compares with what was computed.
+
+    Points that an earlier bake refined are judged by energy instead: no frame has more than the network's state.
+    Joints and blendshapes that stand for refined, simulated or cached points are compared with these. Shots that were
+    refined with feedback are later checked for being complete alone.
+
+    Attributes:
+        frames: samples of the shot.
+        largest_error_m: distance of the vertex that is nearest to its bound [m]; None where energies were compared,
+            or nothing.
+        allowed_error_m: the bound there [m].
+        mean_energy_j: mean energy of the refined frames [J]; None where vertices were compared.
+        rms_error_m: RMS distance from the points that the shot stands for [m]; None where it holds its own vertices.
+    """
+
+    frames: int
+    largest_error_m: float | None = None
+    allowed_error_m: float | None = None
+    mean_energy_j: float | None = None
+    rms_error_m: float | None = None
+
+    def figures(self) -> dict[str, object]:
+        """Return figures for people."""
+        if self.mean_energy_j is not None:
+            return {
+                "frames of lower energy than the network's": self.frames,
+                "mean energy [J]": f"{self.mean_energy_j:.4g}",
+            }
+        if self.largest_error_m is None or self.allowed_error_m is None:
+            return {"frames that are complete": self.frames}
+        rms = {} if self.rms_error_m is None else {"RMS error [mm]": f"{1000 * self.rms_error_m:.3g}"}
+        return {
+            **rms,
+            "largest error [mm]": f"{1000 * self.largest_error_m:.3g}",
+            "allowed [mm]": f"{1000 * self.allowed_error_m:.3g}",
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotShapes:
+    """How vertices became joints and blendshapes.
+
+    Attributes:
+        count, local: the shot's own blendshapes, and those of them that move few vertices.
+        rms_mm, largest_mm: distance from the vertices over all of them and all frames [mm].
+        point_bytes: what the vertices take as float32 points.
+    """
+
+    count: int
+    local: int
+    rms_mm: float
+    largest_mm: float
+    point_bytes: int
+
+    @classmethod
+    def of(cls, shot: Decomposition) -> ShotShapes:
+        """Return the figures of a decomposition."""
+        vertices = shot.deformer.scene.garment.mesh.vertex_count
+        frames = sum(pose.frame_count for pose in shot.poses)
+        return cls(
+            count=shot.own_shapes,
+            local=shot.local_shapes,
+            rms_mm=1000 * shot.rms,
+            largest_mm=1000 * shot.largest,
+            point_bytes=12 * vertices * frames,  # three float32 each
+        )
+
+    def to_metadata(self) -> dict[str, float]:
+        """Return figures of four digits, as a shot stores them."""
+        return {
+            SHOT_SHAPES: self.count,
+            "of few vertices": self.local,
+            "joints lose, RMS [mm]": float(f"{self.rms_mm:.4g}"),
+            "joints lose, at most [mm]": float(f"{self.largest_mm:.4g}"),
+            "bytes of the points alone": self.point_bytes,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSummary:
+    """What the solver changed, as means over the frames.
+
+    Attributes:
+        iterations: of the solver in each frame, at most.
+        energy_before_j, energy_j: means of `refine.FrameChange.before` and `after` [J].
+        inside_before, inside: share of the vertices inside the body.
+        moved_m: RMS distance over the mass [m].
+        shapes: how the refined vertices became joints and blendshapes; None where points are written.
+    """
+
+    iterations: int
+    energy_before_j: float
+    energy_j: float
+    inside_before: float
+    inside: float
+    moved_m: float
+    shapes: ShotShapes | None = None
+
+    def to_metadata(self) -> dict[str, float]:
+        """Return figures of four digits, as a shot stores them."""
+        stated = {
+            "energy before [J]": self.energy_before_j,
+            "energy [J]": self.energy_j,
+            "inside the body before": self.inside_before,
+            "inside the body": self.inside,
+            "moved [m]": self.moved_m,
+        }
+        rounded = {name: float(f"{value:.4g}") for name, value in stated.items()}
+        return {"iterations": self.iterations, **rounded, **(self.shapes.to_metadata() if self.shapes else {})}
+
+    def figures(self) -> dict[str, object]:
+        """Return figures for people, in the units of the others: joules, shares in percent, lengths in mm."""
+        return {
+            "iterations": self.iterations,
+            "energy before [J]": float(f"{self.energy_before_j:.4g}"),
+            "energy [J]": float(f"{self.energy_j:.4g}"),
+            "inside the body before": f"{self.inside_before:.3%}",
+            "inside the body": f"{self.inside:.3%}",
+            "moved, RMS [mm]": float(f"{1000 * self.moved_m:.4g}"),
+            **(self.shapes.to_metadata() if self.shapes else {}),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeResult:
+    """A written shot, or a layer of one.
+
+    Attributes:
+        path: of the file.
+        frames: samples that were written, `samples_per_frame` of them in each frame.
+        fps: frames per second [1/s].
+        joints, proxies: joints of the shot; those of them that the garment adds.
+        blendshapes: of the garment.
+        size_bytes: of the file.
+        verification: None where none was asked for.
+        reduction: what was kept of the model, where less than all.
+        refinement: what the solver changed, where it was asked to.
+        shapes: how the vertices of another simulator became joints and blendshapes; None where nothing was fitted.
+        hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
+        recovered: frames at which the rollout was lost and the garment was put to rest.
+        shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
+        current: the file was there already and nothing was baked; the other figures are those of its bake.
+    """
+
+    path: Path
+    frames: int
+    fps: float
+    joints: int
+    proxies: int
+    blendshapes: int
+    size_bytes: int
+    verification: Verification | None = None
+    reduction: SizeReduction | None = None
+    refinement: RefinementSummary | None = None
+    shapes: ShotShapes | None = None
+    hidden_faces: int | None = None
+    recovered: tuple[FrameSpan, ...] = ()
+    shown_skin: ShownSkin | None = None
+    current: bool = False
+
+    def figures(self, kind: str = "shot") -> dict[str, object]:
+        """Return figures for people; `kind` is what the file is called."""
+        if self.current:
+            return {kind: str(self.path), "current": True}
+        refined = self.refinement.figures() if self.refinement else {}
+        return {
+            kind: str(self.path),
+            "frames": self.frames,
+            "fps": self.fps,
+            "joints": self.joints,
+            "proxies": self.proxies,
+            "blendshapes": self.blendshapes,
+            "bytes": self.size_bytes,
+            **(self.reduction.to_metadata() if self.reduction else {}),
+            **{f"refined: {name}": value for name, value in refined.items()},
+            **(self.shapes.to_metadata() if self.shapes else {}),
+            **(self.shown_skin.summary("time code") if self.shown_skin else {}),
+            **(self.verification.figures() if self.verification else {}),
+            **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
+            **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),
+        }

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The shots of a folder of layers: each gathers the garments that were baked for it, whoever baked them, and when."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Container, Hashable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...errors import fail
+from ...events import Message, Reporter, silent
+from .names_used import forget_use
+from .record import RECORD, TaskRecord, read_record
+
+if TYPE_CHECKING:
+    from ssilk_usd.layers import Layout
+
+
+def write_shot_stage(
+    folder: Path,
+    shot: str,
+    report: Reporter = silent,
+    *,
+    needed: Container[str] = frozenset(),
+    replaced: Collection[str] = (),
+) -> None:
+    """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read.
+
+    Args:
+        needed: garments that have to be in it.
+        replaced: garments whose motion may be another than that of the shot before; others of their characters that
+            follow another motion are told.
+
+    Raises:
+        SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
+            written.
+    """
+    from ssilk_usd.layers import Layout, write_stage
+
+    # Several processes may finish at once. Each writes its record, then the stage from all records that it finds, and
+    # does so again until it finds what it wrote the stage from. The last to rename its stage therefore sees every
+    # record that was there before, and none is lost. A lock would be no safer: flock does not reach across all shared
+    # file systems, and the lock file of a process that was killed would stop everybody else. Where a process is
+    # killed between the rename and the second look, the next bake of the shot, or the check of a job, puts it right.
+    while True:
+        found = _finished(folder, shot)
+        layouts = {Layout(folder, name, shot): wearer for name, wearer in _wearers(found).items()}
+        written = write_stage(layouts, needed)
+        if not layouts:
+            Layout(folder, "", shot).stage.unlink(missing_ok=True)
+        if _finished(folder, shot) == found:
+            break
+    for text in written.unreadable.values():
+        left = "the shot is without this garment, until it is baked again or taken out with 'ssilk remove'"
+        report(Message(f"{text.rstrip('.')}; {left}", "warning"))
+    for name in [name for name, record in found.items() if not record and name not in written.unreadable]:
+        place = folder / "shots" / shot / name / RECORD
+        kept = "the garment stays in the shot, but nothing tells what it was baked from"
+        report(Message(f"{place}: it is damaged; {kept}; bake it again with --replace", "warning"))
+    if behind := _behind(found, replaced):
+        text = f"{', '.join(behind)} follow another motion than {', '.join(replaced)}, with a body of their own"
+        todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
+        report(Message(f"{folder / 'shots' / shot}: {text}; {todo}", "warning"))
+    for name, other in written.bodies.items():
+        if (record := found[name]) and record.result.hidden_faces is not None:
+            text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
+            report(Message(text, "warning"))
+
+
+def _wearers(found: Mapping[str, TaskRecord | None]) -> dict[str, Hashable]:
+    """Return who wears each garment of a shot.
+
+    A record that is damaged or older names no motion. All garments of a shot share one, unless somebody replaced it,
+    so such a garment is taken to be of the first character that is known.
+    """
+    known = [record.wearer for record in found.values() if record and record.wearer[0]]
+
+    def wearer(record: TaskRecord | None) -> Hashable:
+        if record and record.wearer[0]:
+            return record.wearer
+        same = [one for one in known if record is None or one[1] == record.root]
+        return same[0] if same else (None, record.root if record else None)
+
+    return {name: wearer(record) for name, record in found.items()}
+
+
+def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -> list[str]:
+    """Return the garments with another motion than a `replaced` one, and with its stage and SkelRoot."""
+    ours = [record for name in replaced if (record := found.get(name))]
+
+    def is_behind(other: TaskRecord) -> bool:
+        return any(
+            other.wearer != one.wearer
+            and other.root == one.root
+            and other.inputs.get("stage") == one.inputs.get("stage")
+            for one in ours
+            if "motion" in other.inputs
+        )
+
+    return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
+
+
+def _finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:
+    """Return the records of the garments that are finished in a shot, by name; None for one that is damaged."""
+    home = folder / "shots" / shot
+    # Listed, because a client of a network file system may remember for a while that a single file was not there.
+    folders = sorted(path for path in home.iterdir() if path.is_dir()) if home.is_dir() else []
+    return {path.name: read_record(path) for path in folders if RECORD in os.listdir(path)}
+
+
+def remove_layers(folder: Path, names: Sequence[str], report: Reporter = silent) -> list[str]:
+    """Take garments out of shots: remove their layers, and write the stages of the shots again.
+
+    Assets stay. The name of a garment that is in no shot any more is free for another model.
+
+    Args:
+        folder: of the layers.
+        names: "shot/garment" each; both may be patterns, such as "*/cape".
+
+    Returns:
+        What was taken out, as "shot/garment".
+
+    Raises:
+        SsilkError: a name is that of no baked garment, or a file cannot be removed.
+    """
+    from ssilk_usd.layers import Layout
+
+    baked = sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in _layers(folder))
+    chosen: dict[str, Layout] = {}
+    for name in names:
+        matching = [one for one in baked if _matches(one, name)]
+        if not matching:
+            fail(f"{folder}", f"no garment is baked as '{name}'", _listed(baked), "name one as SHOT/GARMENT")
+        for one in matching:
+            shot, _, garment = one.partition("/")
+            chosen[one] = Layout(folder, garment, shot)
+    homes = [layout.animation.parent for layout in chosen.values()]
+    for home in homes:  # without its record a garment is in no stage
+        (home / RECORD).unlink(missing_ok=True)
+    for shot in sorted({layout.shot for layout in chosen.values()}):
+        write_shot_stage(folder, shot, report)
+    for layout in chosen.values():  # no stage refers to them any more
+        for path in (layout.animation, layout.points):
+            path.unlink(missing_ok=True)
+    for home in (*homes, *sorted({home.parent for home in homes})):
+        if not any(home.iterdir()):
+            home.rmdir()
+    left = {path.parent.name for path in _layers(folder)}
+    for garment in {layout.garment for layout in chosen.values()} - left:
+        forget_use(folder, garment)
+    return list(chosen)
+
+
+def _layers(folder: Path) -> list[Path]:
+    """Return a file of each baked garment in each shot, finished or not."""
+    return [path for name in ("anim.usdc", RECORD) for path in folder.glob(f"shots/*/*/{name}")]
+
+
+def _matches(name: str, pattern: str) -> bool:
+    parts = pattern.split("/")
+    return len(parts) == 2 and all(fnmatchcase(part, each) for part, each in zip(name.split("/"), parts))
+
+
+def _listed(names: Sequence[str]) -> str:
+    return f"there are {', '.join(dict.fromkeys(names[:5]))}" if names else "it holds no baked garment"

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tasks: one garment in one shot of a folder of layers, named so that no two write the same file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+from ...errors import fail
+from ...network.checkpoint import load_model
+from ..targets import check_influences
+from .inputs import InputHashes
+from .naming import file_name, location_stem, need_unique, prim_leaf, prim_name
+from .request import BakeRequest, need_body
+
+LONGEST_NAME = 255  # [bytes] of a file or folder
+
+
+@dataclass(frozen=True, kw_only=True)
+class BakeTask:
+    """One garment in one shot of a folder of layers.
+
+    Attributes:
+        garment: name of its prim and its folder.
+        shot: name of its folder.
+        request: what is baked.
+        include_body: write the character's body meshes into the asset as well.
+        points: write a point cache as well.
+        verify: re-skin the written layer and compare it.
+        pinned: what its inputs have to hold, as they did when its job was submitted; None for whatever they hold.
+        replace: bake even where one of the names was used for another input.
+    """
+
+    garment: str
+    shot: str
+    request: BakeRequest
+    include_body: bool = True
+    points: bool = False
+    verify: bool = True
+    pinned: InputHashes | None = None
+    replace: bool = False
+
+    @property
+    def name(self) -> str:
+        return f"{self.shot}/{self.garment}"
+
+
+def plan_layers(
+    requests: Iterable[BakeRequest],
+    *,
+    include_body: bool = True,
+    points: bool = False,
+    verify: bool = True,
+    replace_names: bool = False,
+) -> list[BakeTask]:
+    """Return a task for each request; tasks of one garment follow each other.
+
+    Garments and shots that a request does not name are named after their models, with the SkelRoot in front where one
+    is named, and after their motions. Each asset has the body of its character, whichever garments are baked with it;
+    a shot shows one of them.
+
+    Args:
+        points: write point caches as well; refined points are always written.
+        replace_names: bake even where a name was used for another input before.
+
+    Raises:
+        SsilkError: two garments or two shots would have one name, or a request is not for layers: its target takes
+            none, or all shots of a garment could not share one asset.
+    """
+    requests = list(requests)
+    _need_for_layers(requests, include_body)
+    tasks = [
+        BakeTask(
+            garment=_garment_name(request),
+            shot=_shot_name(request),
+            request=replace(request, garment=None, shot=None),
+            include_body=include_body,
+            points=points or request.writes_points,
+            verify=verify,
+            replace=replace_names,
+        )
+        for request in requests
+    ]
+    need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
+    need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
+    order = list(dict.fromkeys(task.garment for task in tasks))
+    seen: set[str] = set()
+    for task in tasks:
+        if task.name in seen:
+            fail(task.request.model, f"'{task.name}' is to be baked twice", "a garment is baked once in a shot")
+        seen.add(task.name)
+    return sorted(tasks, key=lambda task: order.index(task.garment))
+
+
+def has_possible_names(task: BakeTask) -> bool:
+    """Return whether file systems take the names of a task's folders."""
+    return max(len(os.fsencode(name)) for name in (task.garment, task.shot)) <= LONGEST_NAME
+
+
+def need_possible_names(task: BakeTask) -> None:
+    """Raise `SsilkError` where the name of a task's folder is longer than file systems take."""
+    if not has_possible_names(task):
+        fail(
+            f"{task.name[:60]}...",
+            f"a name of {max(len(task.garment), len(task.shot))} characters",
+            f"folders are named by it, and file systems take {LONGEST_NAME}",
+            "rename the model or the motion",
+        )
+
+
+def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> None:
+    for request in requests:
+        need_body(request, include_body)
+        if request.keep:
+            fail(
+                request.model,
+                "a size to keep, for layers",
+                "their assets are the same for all shots",
+                "bake models that 'ssilk reduce' made",
+            )
+        if ".usdc" not in request.receiver.suffixes:
+            fail(
+                f"--target {request.target}",
+                "layers",
+                f"it takes {', '.join(request.receiver.suffixes)}",
+                "bake one garment over one motion into such a file",
+            )
+    capped = {(each.model, each.target) for each in requests if each.receiver.influences and not each.lbs}
+    for model, target in sorted(capped):
+        check_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
+
+
+def _garment_name(request: BakeRequest) -> str:
+    stem = location_stem(request.model)
+    return prim_name(request.garment or (f"{prim_leaf(request.root)}_{stem}" if request.root else stem))
+
+
+def _shot_name(request: BakeRequest) -> str:
+    return file_name(request.shot or location_stem(request.motion))
+
+
+def _worn(request: BakeRequest) -> str:
+    return f"{request.model}:{request.root}" if request.root else request.model

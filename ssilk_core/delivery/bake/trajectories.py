@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Vertex trajectories of any simulator as a shot of joints and blendshapes, verified like every bake."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import fail
+from ...events import Message, Reporter, silent
+from ...files import relative_path, replacing, sha256
+from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.kinematics import held_at_cuts, sample_motion
+from ..targets import GLB
+from .character import on_character
+from .glb import warn_of_sets, write_glb_shot
+from .opened import open_shot
+from .result import SKINNED, BakeResult, ShotShapes, Verification
+from .verification import compare_trajectories, need_valid
+
+if TYPE_CHECKING:
+    from ssilk_usd.trajectories import MeshTrajectories
+    from ssilk_usd.units import StageUnits
+
+    from ...scene.decomposition import FitTolerance
+
+SLACK = 1e-4  # frames of a motion by which rounded time codes may lie outside it
+
+
+def rig_deformer(scene: Scene) -> Deformer:
+    """Return a garment on the rig of its stage: no blendshapes, and weights as they are there."""
+    return Deformer(scene, scene.rig.skin, np.zeros((0, scene.garment.mesh.vertex_count, 3)))
+
+
+def trained_deformer(model: str | os.PathLike[str], stage: str | os.PathLike[str], root: str | None) -> Deformer:
+    """Return a trained garment on the character of a stage, without its blendshapes.
+
+    Raises:
+        SsilkError: a file cannot be read, or the character is not the model's.
+    """
+    from ssilk_usd.read_stage import open_stage
+
+    from ...network.checkpoint import load_model, network
+
+    file = load_model(os.fspath(model))
+    deformer = network(file, on_character(file, open_stage(os.fspath(stage)), root)).deformer()
+    return replace(deformer, shapes=deformer.shapes[:0])
+
+
+def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
+    """Return the character's motion at the frames of a cache; nothing is interpolated across a cut.
+
+    Raises:
+        SsilkError: the motion does not last from the first to the last of them.
+    """
+    seconds = cache.seconds
+    position = seconds * motion.fps - motion.start
+    if not (position[0] > -SLACK and position[-1] < motion.frame_count - 1 + SLACK):
+        first, last = motion.start / motion.fps, (motion.start + motion.frame_count - 1) / motion.fps
+        fail(
+            motion.path,
+            f"it lasts from {first:.6g} s to {last:.6g} s",
+            f"{where} lasts from {seconds[0]:.6g} s to {seconds[-1]:.6g} s",
+            "name the motion that the cache was simulated on",
+        )
+    near = np.round(position)
+    position = np.where(np.abs(position - near) < SLACK, near, position).clip(0, motion.frame_count - 1)
+    position = held_at_cuts(motion, position)
+    return Motion(motion.path, cache.fps, *sample_motion(motion, position), start=float(seconds[0]) * cache.fps)
+
+
+def skin_trajectories(
+    deformer: Deformer,
+    motion: Motion,
+    points: Sequence[Floats],
+    output: str | os.PathLike[str],
+    *,
+    units: StageUnits,
+    origin: Mapping[str, object],
+    about: Mapping[str, object] | None = None,
+    hidden: Sequence[tuple[int, bool]] = (),
+    include_body: bool = True,
+    verify: bool = True,
+    tolerance: FitTolerance | None = None,
+    device: str = "cpu",
+    report: Reporter = silent,
+) -> BakeResult:
+    """Write vertex trajectories as joints and blendshapes into one file, which appears once it is verified.
+
+    Args:
+        deformer: the garment on its character; the shot has its blendshapes and as many more as it needs.
+        motion: of the character, at the frames of `points`; its start is the time code of the first one.
+        points: garment vertices of each frame in world space [m], shape (V, 3).
+        units: units and up axis of the file.
+        origin: where the points come from, as the file says it; without a cache it cannot be compared again.
+        about: what else the file says of itself.
+        hidden: from which frames on the garment is hidden (True) or seen (False).
+        tolerance: how near joints and blendshapes come to the points; `FitTolerance()` by default.
+
+    Raises:
+        SsilkError: points of another garment or motion, points that skinning cannot reach, or an output that cannot
+            be written.
+        VerificationError: the file is not what was computed; it is not kept.
+    """
+    from ssilk_usd.export import packaged
+    from ssilk_usd.shot import write_shot
+
+    from ...devices import select_device
+    from ...scene.decomposition import FitTolerance, decompose
+
+    path, tolerance = Path(output), tolerance or FitTolerance()
+    found = decompose(deformer, motion, points, tolerance=tolerance, device=select_device(device))
+    shapes = ShotShapes.of(found)
+    if path.suffix == GLB:
+        warn_of_sets(found.deformer, path, report)
+    said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
+    verification: Verification | None = None
+    with replacing(path) as unverified:
+        with packaged(unverified) as layer:
+            common: dict[str, Any] = {
+                "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said
+            }  # fmt: skip
+            if path.suffix == GLB:
+                summary = write_glb_shot(layer, found.deformer, motion, found.poses, **common)
+            else:
+                summary = write_shot(layer, found.deformer, motion, found.poses, units=units, **common)
+        if verify:
+            need_valid(unverified, report)
+            verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
+        else:
+            report(Message("not verified, as asked", "warning"))
+    return BakeResult(
+        path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
+        proxies=summary.proxy_count, blendshapes=summary.shape_count, size_bytes=path.stat().st_size,
+        verification=verification, shapes=shapes,
+    )  # fmt: skip
+
+
+def cache_origin(cache: str, mesh: str, output: Path) -> dict[str, object]:
+    """Return what a shot says of the cache that it was made from, so that it is found again."""
+    from ssilk_usd.read_stage import split_location
+
+    file = split_location(cache)[0]
+    return {
+        "cache": relative_path(file, output.absolute().parent) or Path(file).name,
+        "mesh": mesh,
+        "cache_sha256": sha256(Path(file)),
+    }

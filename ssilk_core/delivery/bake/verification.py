@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Written shots compared with what was computed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import VerificationError, fail
+from ...events import Message, Reporter, Result, Started, silent
+from ...files import sha256
+from ...scene.assets import Floats
+from ..targets import GLB
+from .load import load_rollout
+from .opened import open_shot, provenance_of
+from .origin import read_origin
+from .refinement import refined_points, verify_energies
+from .result import SKINNED, Verification
+from .rollout import BakeRollout
+
+if TYPE_CHECKING:
+    from ssilk_usd.check import PosedGarment
+
+    from ...scene.decomposition import FitTolerance
+
+
+def verify(
+    shot: str | os.PathLike[str],
+    *,
+    model: str | os.PathLike[str] | None = None,
+    stage: str | os.PathLike[str] | None = None,
+    motion: str | os.PathLike[str] | None = None,
+    cache: str | os.PathLike[str] | None = None,
+    device: str | None = None,
+    report: Reporter = silent,
+) -> Verification:
+    """Check a baked shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices.
+
+    A shot that was made from a point cache is compared with that.
+
+    Args:
+        shot: file written by `bake` or `skin`, or animation layer written by `bake_layers`.
+        model, stage, motion, cache: new path of an input that has moved, and not together with the shot.
+        device: where the network runs; None for where it ran for the bake.
+        report: takes events.
+
+    Raises:
+        SsilkError: the shot was not baked here, or an input is missing or does not fit.
+        VerificationError: a check fails, or a vertex is further off than allowed.
+    """
+    path = Path(shot)
+    said = _said_of_points(path)
+    if said is not None:
+        report(Started("verify", 1, {"shot": str(path)}))
+        found = _verify_skinned(path, said, cache, report)
+        report(Result("verify", {"shot": str(path), **found.figures()}))
+        return found
+    origin = read_origin(path, {"model": model, "stage": stage, "motion": motion})
+    rollout = load_rollout(replace(origin.request, device=device or origin.request.device))
+    for name, then in origin.hashes.items():
+        if then != rollout.provenance[f"{name}_sha256"]:
+            text = f"{getattr(origin.request, name)}: the {name} has changed since the shot was baked from it"
+            report(Message(text, "warning"))
+    report(Started("verify", rollout.motion.frame_count, {"shot": str(path)}))
+    found = verify_file(rollout, path, report)
+    report(Result("verify", {"shot": str(path), **found.figures()}))
+    return found
+
+
+def _verify_skinned(
+    shot: Path, said: Mapping[str, object], cache: str | os.PathLike[str] | None, report: Reporter
+) -> Verification:
+    """Compare a shot with the cache that it was made from.
+
+    Args:
+        said: what the shot says under `SKINNED`.
+        cache: present path of the cache, where it has moved.
+
+    Raises:
+        SsilkError: the cache is not found.
+        VerificationError: a check fails, or the shot is further off than it was made to be.
+    """
+    from ssilk_usd.trajectories import MeshTrajectories
+
+    from ...scene.decomposition import FitTolerance
+
+    if "cache" not in said:
+        fail(str(shot), "its points were simulated and not kept", "only a shot of a cache can be compared with it")
+    near = shot.parent / str(said["cache"])
+    path = Path(cache) if cache else near
+    if not path.is_file():
+        fail(str(shot), f"the cache that it was made from is not at {path}", "--cache gives its present path")
+    if sha256(path) != said.get("cache_sha256"):
+        report(Message(f"{path}: the cache has changed since the shot was made from it", "warning"))
+    need_valid(shot, report)
+    tolerance = FitTolerance(rms=float(str(said["rms"])), largest=float(str(said["largest"])))
+    return compare_trajectories(open_shot(shot), MeshTrajectories(f"{path}:{said['mesh']}"), tolerance=tolerance)
+
+
+def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verification:
+    """Check a file and compare it, re-skinned by its format's rules alone, with the rollout that it should hold.
+
+    Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own. Joints
+    of one are compared with the refined points, with the tolerance that they were fitted with. Of one with feedback
+    only the number of frames and vertices is checked, and that these are finite.
+
+    Raises:
+        VerificationError: a check fails, or a vertex is further off than allowed.
+    """
+    from ssilk_usd.check import compare_points
+
+    need_valid(path, report)
+    shot, samples = open_shot(path), rollout.request.samples_per_frame
+    times = shot.sample_times(samples)
+    if rollout.request.refine and rollout.refinement is None:
+        if rollout.request.feedback:
+            return _verify_extent(shot, times, path, rollout, report)
+        if not shot.is_skinned:
+            return verify_energies(rollout, map(shot.garment_points, times), report)
+        if not rollout.request.writes_points:
+            return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
+    expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
+    found = compare_points(shot, expected, samples_per_frame=samples)
+    if not found.passed:
+        raise VerificationError(
+            f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
+            f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; bake it again, closer to the "
+            "origin if it is many kilometres away."
+        )
+    return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
+
+
+def _verify_extent(
+    shot: PosedGarment, times: Sequence[float], path: Path, rollout: BakeRollout, report: Reporter
+) -> Verification:
+    """Check that a shot has all frames and vertices of a rollout.
+
+    Refined with feedback a frame depends on all before it, and on another machine other last digits grow with each.
+    """
+    if len(times) != rollout.motion.frame_count:
+        raise VerificationError(f"{path}: it has {len(times)} samples; {rollout.motion.frame_count} are needed.")
+    count = rollout.deformer.scene.garment.mesh.vertex_count
+    for time in times:
+        points = shot.garment_points(time)
+        if points.shape != (count, 3) or not np.isfinite(points).all():
+            raise VerificationError(
+                f"{path}: its garment at time code {time:g} is not {count} finite points; bake it again."
+            )
+    report(Message(f"{path}: refined with feedback; its vertices are not compared with the solver's again"))
+    return Verification(frames=len(times))
+
+
+def _said_of_points(shot: Path) -> Mapping[str, object] | None:
+    """Return what a shot says of the points that it was made from; None where it was baked from a model."""
+    said = provenance_of(shot).get(SKINNED) if shot.is_file() else None
+    return said if isinstance(said, Mapping) else None
+
+
+def compare_trajectories(
+    shot: PosedGarment, points: Iterable[Floats], *, tolerance: FitTolerance | None = None, samples_per_frame: int = 1
+) -> Verification:
+    """Compare the garment of a shot, re-skinned from its file alone, with the points that it stands for.
+
+    Args:
+        points: of each of its samples in the world [m], shape (V, 3).
+        tolerance: that it was fitted with; `FitTolerance()` by default.
+
+    Raises:
+        VerificationError: other frames or vertices, or they are further off than allowed.
+    """
+    from ssilk_usd.check import allowed_error
+
+    from ...scene.decomposition import FitTolerance
+
+    tolerance, times = tolerance or FitTolerance(), shot.sample_times(samples_per_frame)
+    squares, count, slack, worst = 0.0, 0, 0.0, (0.0, tolerance.largest, 0.0, 0)
+    for time, wanted in zip_longest(times, points):
+        if time is None or wanted is None:
+            raise VerificationError(f"{shot.name}: the shot has another number of frames than what it stands for.")
+        found = shot.garment_points(time)
+        if found.shape != wanted.shape:
+            raise VerificationError(
+                f"{shot.name}: the garment has {len(found)} vertices, but what it stands for has {len(wanted)}."
+            )
+        away = np.nan_to_num(np.linalg.norm(found - wanted, axis=-1), nan=np.inf)
+        slack = max(slack, allowed_error(wanted))
+        squares, count, vertex = squares + float((away**2).sum()), count + len(away), int(away.argmax())
+        bound = tolerance.largest + allowed_error(wanted)
+        worst = max(worst, (float(away[vertex]), bound, time, vertex), key=lambda each: each[0] / each[1])
+    rms = float(np.sqrt(squares / max(count, 1)))
+    if not (rms <= tolerance.rms + slack and worst[0] <= worst[1]):
+        raise VerificationError(
+            f"{shot.name}: joints and blendshapes are {1000 * rms:.3g} mm RMS from the points that they stand "
+            f"for, and vertex {worst[3]} at time code {worst[2]:g} is {1000 * worst[0]:.3g} mm off; "
+            f"{1000 * tolerance.rms:g} mm and {1000 * tolerance.largest:g} mm are allowed."
+        )
+    return Verification(frames=len(times), largest_error_m=worst[0], allowed_error_m=worst[1], rms_error_m=rms)
+
+
+def need_valid(path: Path, report: Reporter) -> None:
+    """Report what a shot's checks find; raise `VerificationError` for an error among it.
+
+    The checks are those of stages. A glTF binary is checked by reading it.
+    """
+    from ssilk_usd.check import check_shot
+
+    if path.suffix == GLB:
+        return
+    findings = check_shot(path)
+    for finding in findings:
+        report(Message(str(finding), "warning"))
+    errors = [finding for finding in findings if finding.severity == "error"]
+    if errors:
+        raise VerificationError(f"{path}: {len(errors)} checks failed, first at {errors[0].prim}: {errors[0].text}.")

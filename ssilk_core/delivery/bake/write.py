@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One garment over one motion as one file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ...errors import fail
+from ...events import Message, Reporter, Result, Started, silent
+from ...files import need_not_input, need_writable, replacing
+from ..targets import GLB
+from .glb import warn_of_sets, write_glb_shot
+from .hiding import covered_polygons
+from .origin import shot_metadata
+from .refinement import refined
+from .request import BakeRequest, need_body
+from .result import BakeResult, Verification
+from .shown_skin import ShownSkinMeter
+from .sizing import load_sized
+from .verification import verify_file
+
+if TYPE_CHECKING:
+    from ssilk_usd.body_faces import HiddenPolygons
+    from ssilk_usd.shot import ShotSummary
+
+
+def bake(
+    request: BakeRequest,
+    output: str | os.PathLike[str],
+    *,
+    quality: str | None = None,
+    budget: str | None = None,
+    include_body: bool = True,
+    verify: bool = True,
+    report: Reporter = silent,
+) -> BakeResult:
+    """Bake one garment over one motion into one file, which appears once it is verified.
+
+    Args:
+        output: the file; its suffix is one that the request's target takes.
+        quality: level of quality, a name in `ssilk_core.quality.levels.QUALITIES`.
+        budget: keep the most of the garment within "0.3ms" for each frame, or "2MB" for the file.
+        include_body: write the character's body meshes as well.
+        verify: re-skin the file by UsdSkel and compare it with the decoder's own vertices.
+        report: takes events.
+
+    Raises:
+        SsilkError: an input is missing or does not fit, or the file cannot be written.
+        VerificationError: the file is not what was computed; it is not kept, and an older one stays.
+    """
+    path = Path(output)
+    _check_output(request, path)
+    need_body(request, include_body)
+    rollout = load_sized(
+        request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
+    )
+    report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
+    rollout.tell(report)
+    rollout = refined(rollout, report)
+    if path.suffix == GLB:
+        warn_of_sets(rollout.deformer, path, report)
+    hidden = covered_polygons(rollout, report) if request.hide_covered else None
+    meter = ShownSkinMeter(rollout)
+    summary, verification = _write_verified(meter, path, include_body, hidden, verify, report)
+    result = result_of(meter, path, summary, verification, hidden)
+    rollout.warn(report)
+    report(Result("bake", result.figures()))
+    return result
+
+
+def result_of(
+    meter: ShownSkinMeter,
+    path: Path,
+    summary: ShotSummary,
+    verification: Verification | None,
+    hidden: HiddenPolygons | None,
+) -> BakeResult:
+    """Return the result of a rollout that was written."""
+    rollout = meter.rollout
+    return BakeResult(
+        path=path,
+        frames=summary.frame_count,
+        fps=summary.fps,
+        joints=summary.joint_count,
+        proxies=summary.proxy_count,
+        blendshapes=summary.shape_count,
+        size_bytes=path.stat().st_size,
+        verification=verification,
+        reduction=rollout.reduction,
+        refinement=rollout.refinement.summary if rollout.refinement else None,
+        hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
+        recovered=tuple(rollout.recovered),
+        shown_skin=meter.shown(),
+    )
+
+
+def _check_output(request: BakeRequest, path: Path) -> None:
+    """Raise `SsilkError` where the target does not take the file, or it cannot be written."""
+    from ssilk_usd.read_stage import split_location
+
+    suffixes = request.receiver.suffixes
+    if path.suffix not in suffixes:
+        fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
+    if path.suffix == GLB and request.writes_points:
+        fail(str(path), "refined points", "a glb holds joints and morph targets", "use --refined-output joints")
+    need_writable(path)
+    need_not_input(path, request.model, request.stage, split_location(request.motion)[0])
+
+
+def _write_verified(
+    meter: ShownSkinMeter,
+    output: Path,
+    include_body: bool,
+    hidden: HiddenPolygons | None,
+    verify: bool,
+    report: Reporter,
+) -> tuple[ShotSummary, Verification | None]:
+    """Write a file that appears once it is verified; return what it holds."""
+    from ssilk_usd.export import packaged
+
+    with replacing(output) as unverified:
+        with packaged(unverified) as layer:
+            summary = _write(layer, meter, output, include_body, hidden)
+        if not verify:
+            report(Message("not verified, as asked", "warning"))
+        return summary, verify_file(meter.rollout, unverified, report) if verify else None
+
+
+def _write(
+    layer: Path, meter: ShownSkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
+) -> ShotSummary:
+    """Write a shot of joints and blendshapes, or of refined points."""
+    from ssilk_usd.points import point_cache
+    from ssilk_usd.shot import write_shot
+
+    rollout = meter.rollout
+    common: dict[str, Any] = {
+        "start": rollout.start,
+        "samples_per_frame": rollout.request.samples_per_frame,
+        "include_body": include_body,
+        "hidden": rollout.hidden,
+        "hidden_polygons": hidden,
+        "provenance": shot_metadata(rollout, output, meter.stated),
+    }
+    if output.suffix == GLB:
+        return write_glb_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
+    common |= {"units": rollout.units, "record": rollout.record}
+    if not rollout.request.writes_points:
+        return write_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
+    meter.add_points()
+    with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
+        for frame, points in enumerate(rollout.points()):
+            cache.write(frame, points)
+    return cache.shot

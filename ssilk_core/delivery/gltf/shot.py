@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a baked garment and its character as one glb: joints, morph targets, and both in one animation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...files import replacing
+from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
+from ...scene.kinematics import (
+    combined_transforms,
+    continuous,
+    invert_rigid,
+    local_transforms,
+    quaternion_from_matrix,
+    sorted_influences,
+)
+from .container import INDICES, VERTICES, GlbBuilder
+from .geometry import ShapeNormals, drawn_mesh
+
+SET = 4  # influences in one attribute
+ARMATURE = 0  # the node above the joints, which follow it in their order
+GARMENT, BODY = "garment", "body"  # kinds of meshes, as the file says them
+AT_REST = 1e-7  # [m] by which a joint's place may differ and still count as the same
+# Plain colours, linear: the bake knows no materials. Cloth is seen from both sides.
+MATERIALS = (
+    ("Garment", (0.30, 0.06, 0.08, 1.0), True),
+    ("Body", (0.45, 0.42, 0.40, 1.0), False),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GlbLabels:
+    """Names and times that a glb holds beside its arrays.
+
+    Attributes:
+        character: name of the node above the joints.
+        joints: name of each joint, then of each proxy.
+        shapes: name of each blendshape of the deformer.
+        garment, bodies: names of the meshes.
+        start: time code of the first frame.
+        samples_per_frame: how many of the motion's frames make one of the shot's.
+    """
+
+    character: str
+    joints: Sequence[str]
+    shapes: Sequence[str]
+    garment: str
+    bodies: Sequence[str]
+    start: float = 0.0
+    samples_per_frame: int = 1
+
+
+def write_glb(
+    path: str | Path,
+    deformer: Deformer,
+    motion: Motion,
+    poses: Iterable[GarmentPose],
+    labels: GlbLabels,
+    *,
+    include_body: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: Sequence[NDArray[np.bool_]] | None = None,
+    provenance: Mapping[str, object] | None = None,
+) -> int:
+    """Write rest points, morph targets, weights and joint animation in metres, y up; return the number of targets.
+
+    Nodes stand as in the first frame. What stays there has no channel. All influences are written, four to a set.
+
+    Args:
+        motion: the character's motion at the shot's samples.
+        poses: consecutive chunks of frames that together cover the motion.
+        hidden: from which frames of the motion on the character is hidden (True) or seen (False). Hidden, its joints
+            are scaled to nothing, because plain glTF has no visibility.
+        hidden_polygons: of each body, those that are left out.
+        provenance: where the shot came from; looked at once the poses are taken.
+
+    Raises:
+        SsilkError: the file would be larger than its format allows, or cannot be written.
+    """
+    glb, scene = GlbBuilder(), deformer.scene
+    shapes = np.flatnonzero(deformer.shapes.any(axis=(1, 2)))
+    rotations, translations, weights = _sampled(deformer, motion, poses, shapes)
+    glb.add("nodes", {"name": labels.character})
+    for name, rotation, translation in zip(labels.joints, rotations[0], translations[0]):
+        glb.add("nodes", {"name": name, "rotation": rotation.tolist(), "translation": translation.tolist()})
+    nodes = glb.document["nodes"]
+    for joint, parent in enumerate(scene.parents):
+        nodes[ARMATURE if parent < 0 else 1 + parent].setdefault("children", []).append(1 + joint)
+    for name, colour, both in MATERIALS:
+        surface = {"baseColorFactor": colour, "metallicFactor": 0, "roughnessFactor": 0.9}
+        glb.add("materials", {"name": name, "doubleSided": both, "pbrMetallicRoughness": surface})
+    binds = invert_rigid(scene.bind_transforms).swapaxes(1, 2).astype(np.float32).reshape(-1, 16)  # by columns
+    joints = list(range(1, 1 + len(scene.parents)))
+    glb.add("skins", {"joints": joints, "skeleton": ARMATURE, "inverseBindMatrices": glb.array(binds, "MAT4")})
+    offsets = {labels.shapes[index]: deformer.shapes[index] for index in shapes}
+    drawn = [_add_mesh(glb, labels.garment, scene.garment.mesh, deformer.skin, offsets=offsets, at=weights[0])]
+    if include_body:
+        bodies = scene.character.bodies
+        masks: Sequence[NDArray[np.bool_] | None] = hidden_polygons or [None] * len(bodies)
+        for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
+            if mask is None or not mask.all():
+                drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
+    glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
+    glb.document["scene"] = 0
+    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, drawn[0])
+    timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
+              "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
+    glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
+    with replacing(path) as temporary:
+        glb.write(temporary)
+    return len(shapes)
+
+
+def _sampled(
+    deformer: Deformer, motion: Motion, poses: Iterable[GarmentPose], shapes: NDArray[np.int64]
+) -> tuple[Floats, Floats, Floats]:
+    """Return rotations (x, y, z, w), shape (F, J, 4), translations [m], shape (F, J, 3), and weights (F, K)."""
+    parts, before = [], None
+    for pose in poses:
+        local = local_transforms(combined_transforms(deformer, motion, pose), deformer.scene.parents)
+        turned = continuous(quaternion_from_matrix(local[..., :3, :3]), before)
+        before = turned[-1:]
+        parts.append((turned[..., [1, 2, 3, 0]], local[..., :3, 3], pose.weights[:, shapes]))
+    turns, places, weights = (np.concatenate(part).astype(np.float32) for part in zip(*parts))
+    return turns, places, weights
+
+
+def _add_mesh(
+    glb: GlbBuilder,
+    name: str,
+    mesh: Mesh,
+    skin: SkinWeights,
+    *,
+    offsets: Mapping[str, Floats] | None = None,
+    at: Floats | None = None,
+    hidden: NDArray[np.bool_] | None = None,
+) -> int:
+    """Add a skinned mesh and its node; return the node's index.
+
+    Args:
+        offsets: of each morph target [m], by name; only a garment has them, or none.
+        at: weights of the targets where no animation plays.
+    """
+    drawn, normals = drawn_mesh(mesh, hidden), ShapeNormals(mesh.points, mesh.faces)
+    points = mesh.points.astype(np.float32)[drawn.source]
+    attributes = {
+        "POSITION": glb.array(points, "VEC3", use=VERTICES, bounds=True),
+        "NORMAL": glb.array(normals.rest.astype(np.float32)[drawn.source], "VEC3", use=VERTICES),
+        **_influences(glb, skin, drawn.source),
+    }
+    if drawn.uvs is not None:
+        attributes["TEXCOORD_0"] = glb.array(drawn.uvs, "VEC2", use=VERTICES)
+    wide = len(points) > 2**16 - 1  # the largest number of each type means something else to graphics cards
+    faces = drawn.faces.reshape(-1).astype("<u4" if wide else "<u2")
+    is_garment = offsets is not None
+    primitive = {"attributes": attributes, "indices": glb.array(faces, "SCALAR", use=INDICES),
+                 "material": 0 if is_garment else 1}  # fmt: skip
+    item: dict[str, object] = {"name": name, "primitives": [primitive]}
+    if offsets and at is not None:
+        primitive["targets"] = [
+            {"POSITION": glb.offsets(offset[drawn.source].astype(np.float32)),
+             "NORMAL": glb.offsets(normals.change(offset).astype(np.float32)[drawn.source])}
+            for offset in offsets.values()
+        ]  # fmt: skip
+        item["weights"] = at.tolist()
+    kind = GARMENT if is_garment else BODY
+    item["extras"] = {"targetNames": list(offsets or ()), "kind": kind, "points": mesh.vertex_count}
+    return glb.add("nodes", {"name": name, "mesh": glb.add("meshes", item), "skin": 0})
+
+
+def _influences(glb: GlbBuilder, skin: SkinWeights, source: Ints) -> dict[str, int]:
+    """Add the influences in sets of four; return their attributes."""
+    indices, weights = sorted_influences(skin)
+    padding = ((0, 0), (0, -indices.shape[1] % SET))
+    indices, weights = (np.pad(part, padding)[source] for part in (indices, weights))
+    few = "u1" if indices.max() < 2**8 else "<u2"
+    found = {}
+    for number, start in enumerate(range(0, indices.shape[1], SET)):
+        part = slice(start, start + SET)
+        joints = np.where(weights[:, part] > 0, indices[:, part], 0).astype(few)
+        found[f"JOINTS_{number}"] = glb.array(joints, "VEC4", use=VERTICES)
+        found[f"WEIGHTS_{number}"] = glb.array(weights[:, part], "VEC4", use=VERTICES)
+    return found
+
+
+def _animate(
+    glb: GlbBuilder,
+    name: str,
+    fps: float,
+    samples: tuple[Floats, Floats, Floats],
+    hidden: Sequence[tuple[int, bool]],
+    garment: int,
+) -> None:
+    """Add one animation of what moves, and of the first joint's path, so that it always lasts as long."""
+    rotations, translations, weights = samples
+    samplers: list[dict[str, object]] = []
+    channels: list[dict[str, object]] = []
+    times = glb.array((np.arange(len(rotations)) / fps).astype(np.float32), "SCALAR", bounds=True)
+
+    def add(node: int, path: str, values: Floats, kind: str, at: int = times, between: str = "LINEAR") -> None:
+        samplers.append({"input": at, "output": glb.array(values, kind), "interpolation": between})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path}})
+
+    for joint in range(rotations.shape[1]):
+        if np.ptp(rotations[:, joint], axis=0).any():
+            add(1 + joint, "rotation", rotations[:, joint], "VEC4")
+        if joint == 0 or _moves(translations[:, joint]):
+            add(1 + joint, "translation", translations[:, joint], "VEC3")
+    if weights.shape[1]:
+        add(garment, "weights", weights.reshape(-1), "SCALAR")
+    if hidden:
+        when = glb.array(np.array([frame / fps for frame, _ in hidden], dtype=np.float32), "SCALAR", bounds=True)
+        scales = np.array([[0.0 if gone else 1.0] * 3 for _, gone in hidden], dtype=np.float32)
+        add(ARMATURE, "scale", scales, "VEC3", when, "STEP")
+    glb.add("animations", {"name": name, "samplers": samplers, "channels": channels})
+
+
+def _moves(places: Floats) -> bool:
+    """Return whether a joint leaves its place (F, 3) by more than what float64 rounds off on the way there."""
+    return bool((np.ptp(places, axis=0) > AT_REST).any())
+
+
+def _plain(value: object) -> object:
+    """Return nested mappings and lists as JSON holds them; what is no plain value as text, empty ones left out."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items() if item not in (None, [], {}, ())}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value if isinstance(value, bool | int | float | str) else str(value)

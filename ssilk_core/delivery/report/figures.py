@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections of a page from the JSON that other commands write: learning curves, extremes, trades, evaluations."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...errors import SsilkError, fail
+from ...physics.skin.figures import ShownSkin
+from ...quality.charts import ChartPanel, svg_chart
+from ...quality.stress.outcome import HEADER, CaseOutcome
+from ...quality.trade.plot import trade_panels
+from ...quality.trade.point import TradePoint
+from ...training.step_errors import StepErrors
+from ...training.verdict import curve_lbs
+from .page import Section, facts, flattened, table
+from .terms import SHARE, SHOWN
+
+MISSED = "energy that steps miss"
+
+MAX_COLUMNS = 12  # of a table of records; a page is not wider
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file; raise `SsilkError` where it is missing or not JSON."""
+    if not path.is_file():
+        fail(str(path), "there is no such file", "figures in JSON are needed")
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise SsilkError(f"{path}: not a JSON file ({error}); name a file that ssilk wrote.") from error
+
+
+def section_of(path: Path) -> Section:
+    """Return the section of a file of figures, chosen by what it holds.
+
+    Raises:
+        SsilkError: the file is not one of 'ssilk stress', 'ssilk trade' or 'ssilk evaluate'.
+    """
+    document = read_json(path)
+    kinds = {"outcomes": extremes, "points": trade, "figures": evaluation}
+    kind = next((key for key in kinds if isinstance(document, dict) and isinstance(document.get(key), list)), None)
+    if not kind:
+        fail(
+            str(path),
+            "not figures of a known kind",
+            f"a document with {' or '.join(kinds)} is needed",
+            "name a file that 'ssilk stress', 'ssilk trade' or 'ssilk evaluate' wrote",
+        )
+    return _made(path, kinds[str(kind)], document)
+
+
+def learning_of(path: Path) -> list[Section]:
+    """Return the section of the learning curve beside a model; none without a curve, or without validations.
+
+    Raises:
+        SsilkError: the file is not a learning curve.
+    """
+    document = read_json(path) if path.is_file() else {"points": []}
+    return [_made(path, learning, document)] if document.get("points", True) else []
+
+
+def _made(path: Path, make: Callable[[Mapping[str, Any]], Section], document: Mapping[str, Any]) -> Section:
+    try:
+        return make(document)
+    except (KeyError, TypeError, ValueError) as error:
+        raise SsilkError(f"{path}: these figures are incomplete ({error}); measure again.") from error
+
+
+def extremes(document: Mapping[str, Any]) -> Section:
+    """Return the table of 'ssilk stress'."""
+    found = [CaseOutcome.of(each) for each in document["outcomes"]]
+    bad = [number for number, outcome in enumerate(found) if outcome.verdict == "breaks"]
+    rest = facts({name: value for name, value in document.items() if name != "outcomes"})
+    return Section("Extremes", table(HEADER, [outcome.row() for outcome in found], bad) + rest)
+
+
+def trade(document: Mapping[str, Any]) -> Section:
+    """Return the charts and the tables of 'ssilk trade'."""
+    points = [TradePoint.of(each) for each in document["points"]]
+    panels = trade_panels(points, document["asked"].get("frames", {}))
+    chart = svg_chart("errors over costs", panels, size=(4.0, 3.4)) if points else ""
+    judged = records(document.get("judging", ()))
+    return Section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]))
+
+
+def evaluation(document: Mapping[str, Any]) -> Section:
+    """Return the table of 'ssilk evaluate'."""
+    rest = facts({name: value for name, value in document.items() if name != "figures"})
+    return Section("Evaluation", records(document["figures"]) + rest)
+
+
+def records(found: Sequence[Mapping[str, Any]]) -> str:
+    """Return records as a table with a column for each name that occurs, or a row for each where these are many."""
+    flat = [flattened(record) for record in found]
+    names = list(dict.fromkeys(name for record in flat for name in record))
+    if len(names) > MAX_COLUMNS:
+        return table(
+            ("", *(str(number) for number in range(1, len(flat) + 1))),
+            [[name, *(record.get(name, "") for record in flat)] for name in names],
+        )
+    return table(names, [[record.get(name, "") for name in names] for record in flat])
+
+
+def learning(document: Mapping[str, Any]) -> Section:
+    """Return the section of the learning curve that a training writes beside its model."""
+    points, lbs = document["points"], curve_lbs(document)
+    best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
+    times = [point["seconds"] for point in points]
+    totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
+    shown = {"total at validation": ("J", totals), SHARE: ("%", [100 * share for share in inside])}
+    found = [point["validation"].get("shown_skin") for point in points]
+    if all(found):
+        shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
+    steps = [point["validation"].get("step_errors") for point in points]
+    if all(steps):
+        shown[MISSED] = ("mJ", [1000 * each["energy"] for each in steps])
+    rows = [
+        [ChartPanel(title=title, x="training time [s]", y=unit, curves={"": (times, values)},
+                    marks={"best": (times[best], values[best])})]
+        for title, (unit, values) in shown.items()
+    ]  # fmt: skip
+    words = (
+        f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "
+        f"Linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body."
+    )
+    if found[best]:
+        words += f" At the best, {ShownSkin(**found[best])}."
+    if steps[best]:
+        words += f" At the best, {StepErrors(**steps[best])}."
+    return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sections about a shot: a verdict in words, its worst frames as pictures, and figures over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ...events import Countdown, Reporter, silent
+from ...quality.charts import ChartPanel, svg_chart
+from ...scene.assets import Floats, Mesh
+from ...scene.fabrics import Fabric
+from ..view.camera import follow_cameras
+from ..view.player import ShotPlayer
+from ..view.render import Image, render
+from ..view.shots import shot_surfaces
+from .page import Section, figure, table
+from .player import played
+from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
+from .verdict import verdict
+
+PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of the skin that shows
+APART = 0.5  # the least time between them [s]
+WIDTH, HEIGHT = 300, 400  # of a picture [pixels]
+LETTERS = "ABCDEFGH"
+
+
+@dataclass(frozen=True, eq=False)
+class ShotGarment:
+    """A garment of a shot: its index among the player's meshes, its mesh at rest, and its fabric."""
+
+    index: int
+    mesh: Mesh
+    fabric: Fabric
+
+
+def shot_sections(
+    player: ShotPlayer, garments: Sequence[ShotGarment], bodies: Mapping[int, Mesh], report: Reporter = silent
+) -> list[Section]:
+    """Return the sections about a shot.
+
+    Args:
+        player: the shot.
+        garments: those to measure.
+        bodies: the meshes that garments collide with, at rest, by their index in the player.
+    """
+    meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
+    told = Countdown(len(player.frame_times), report)
+    for time in player.frame_times:
+        points = player.points(time)
+        body = np.concatenate([points[index] for index in bodies]) if bodies else None
+        for each, meter in zip(garments, meters):
+            meter.add(points[each.index], body, time)
+        told()
+    first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
+    return [first, Section("The shot", played([player]), plays=True), *others]
+
+
+def joined(meshes: Sequence[Mesh]) -> Mesh | None:
+    """Return meshes as one, in their order; None for none."""
+    if not meshes:
+        return None
+    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
+    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
+    return Mesh(meshes[0].path, np.concatenate([mesh.points for mesh in meshes]), faces)
+
+
+def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
+    values = {name: np.array(found) for name, found in meter.values.items()}
+    bad = values["total"] - values["gravity"]  # a raised garment is no worse
+    apart = max(1, round(APART * player.fps))
+    worst = worst_frames(bad, PICTURES, apart)
+    worst += [
+        frame
+        for frame in worst_frames(np.where(meter.finite, values[SHOWN], np.nan), SKIN_PICTURES, apart)
+        if values[SHOWN][frame] > 0 and frame not in worst
+    ]
+    times, marks = np.arange(len(values["total"])) / player.fps, dict(zip(worst, LETTERS))
+    shown = [name for name in UNITS if meter.body or name not in ("collision", SHARE)]
+    if meter.energy.stitching is None:
+        shown.remove("stitch")
+    if meter.covered is None:
+        shown = [name for name in shown if name not in (SHOWN, BARE)]
+    panels = [
+        ChartPanel(
+            title=name, x="time [s]", y=UNITS[name], curves={"": (times, values[name])},
+            marks={letter: (times[frame], values[name][frame]) for frame, letter in marks.items()},
+        )
+        for name in shown
+    ]  # fmt: skip
+    charts = svg_chart(f"{', '.join(shown)} over time", [[panel] for panel in panels])
+    rows = [[f"{name} [{UNITS[name]}]", *_spread(values[name])] for name in shown]
+    name = player.meshes[garment.index].name
+
+    def shown_skin(frame: int) -> str:
+        return f", {values[SHOWN][frame]:.2f} % of the covered skin shows" if SHOWN in shown else ""
+
+    pictures = "".join(
+        figure(
+            picture(player, frame),
+            f"{letter}: frame {player.frame_times[frame]:g}, at {times[frame]:.2f} s, "
+            f"{bad[frame]:.4g} J without gravity{shown_skin(frame)}",
+            times[frame],
+        )
+        for frame, letter in marks.items()
+    )
+    found = meter.shown_skin(name)
+    charts += table(("", "mean", "median", "95 %", "most"), rows)
+    lost = [time for time, finite in zip(player.frame_times, meter.finite) if not finite]
+    if lost:
+        said = f"The garment is not finite in {len(lost)} of {len(times)} frames, first in frame {lost[0]:g}."
+        charts += f'<p class="note">{said} Energies leave these frames out; all covered skin counts as shown.</p>'
+    figures = {"shown_skin": asdict(found)} if found else {}
+    return [
+        verdict(name, values, found, player.frame_times, player.fps),
+        Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
+        Section(f"{name}: over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
+    ]
+
+
+def _spread(values: Floats) -> list[str]:
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return ["–"] * 4
+    return [f"{value:.4g}" for value in (values.mean(), np.median(values), np.quantile(values, 0.95), values.max())]
+
+
+def picture(player: ShotPlayer, frame: int) -> Image:
+    """Return a picture of one frame of a shot, framed to the figure."""
+    surfaces = shot_surfaces(player, frame)
+    points = np.concatenate([surface.points for surface in surfaces])
+    (camera,) = follow_cameras([points], player.fps, WIDTH / HEIGHT)
+    return render(surfaces, camera, WIDTH, HEIGHT, ground=float(points[:, 1].min()))

@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colours of skin and fabrics."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...scene.assets import Floats
+
+BODY = np.array([0.72, 0.70, 0.68])
+FABRICS = np.array([[0.72, 0.13, 0.17], [0.12, 0.42, 0.55], [0.90, 0.62, 0.18], [0.36, 0.28, 0.56]])
+
+
+def fabric_colour(number: int) -> Floats:
+    """Return the colour of the `number`-th garment of a picture, shape (3,)."""
+    return FABRICS[number % len(FABRICS)]

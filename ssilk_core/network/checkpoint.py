@@ -1,0 +1,363 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read and write model files: safetensors with everything that is needed to run, and the provenance in the header.
+
+Nothing is unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) or "model.*" (the
+parameters). Each has the narrowest type that holds it. The header has one JSON document under "ssilk". Quantised
+matrices are 16-bit integers, with their scales in "scale.model.*". A checksum covers everything. Models of earlier
+versions, the shipped ones among them, have none and are read without a warning, on which nobody could act.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import __version__
+from ..errors import SsilkError, fail
+from ..files import is_usd, replacing
+from ..scene.assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
+from ..scene.fabrics import Fabric, fabric_of_file
+from .packing import dequantize, narrowest, quantize
+from .parameters import Shapes, parameter_shapes
+from .settings import ModelConfig
+from .tensors import pack_tensors, read_tensors
+
+if TYPE_CHECKING:
+    from .model.network import GarmentModel
+
+FORMAT = 6  # models of format 5 have no `velocity_allowance`, and proxies of format 4 only turn
+OLDER_LIMITS = {"velocity_allowance": 0.5, "max_latent_step": 0.3}  # of models before format 6
+HEADER_NAME = "ssilk"  # of the JSON document in the metadata
+# Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
+RENAMED_SINCE_3 = {
+    "config": {"bound": "latent_bound", "push": "max_latent_step"},
+    "model": {"bound": "latent_bound", "push": "max_latent_step"},
+    "shipped": {"plain skinning [J]": "linear blend skinning [J]"},
+    "train": {
+        "warm": "static_fraction",
+        "warm_batch": "pretraining_batch",
+        "carry": "state_reuse",
+        "rotated": "rotated_fraction",
+        "recombined": "recombinations",
+        "resting": "static_batch",
+        "kick": "noise_probability",
+        "regularity": "latent_regularization",
+        "regularity_scale": "latent_regularization_scale",
+        "through_time": "bptt",
+        "warm_rate": "static_learning_rate",
+        "rate": "learning_rate",
+        "final_rate": "final_learning_rate",
+        "rate_warmup": "learning_rate_warmup",
+        "skin_rate": "skin_learning_rate_scale",
+        "shape_rate": "shape_learning_rate_scale",
+        "average": "ema_decay",
+        "surface": "closest_point",
+    },
+}
+# The header's lists and tables, as empty values of their types (tuples for JSON lists).
+HEADER: dict[str, Any] = {
+    "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
+}  # fmt: skip
+WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
+
+
+@dataclass(frozen=True, eq=False)
+class ModelFile:
+    """The contents of a model file.
+
+    Attributes:
+        scene: garment, rig and skeleton (no body meshes).
+        config: sizes of the network.
+        fabric: material that the network was trained with.
+        joints: character joints in the descriptors, shape (J',).
+        parameters: the network's tensors by name.
+        provenance: seed, schedule, versions, hashes of the inputs and validation results.
+    """
+
+    scene: Scene
+    config: ModelConfig
+    fabric: Fabric
+    joints: np.ndarray
+    parameters: dict[str, np.ndarray]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+
+def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
+    """Write a model file completely or not at all.
+
+    Args:
+        path: the file, .safetensors.
+        model: contents of the file.
+        pack: store parameter matrices in 16 bits and skinning weights in single precision, which halves the size
+            of the file. `benchmarks/precision.py` measures the effect on the result.
+    """
+    arrays = {name: narrowest(np.ascontiguousarray(value)) for name, value in _tensors(model).items()}
+    words = {HEADER_NAME: json.dumps(_document(model))}
+    with replacing(path) as temporary:
+        temporary.write_bytes(pack_tensors(_packed(arrays) if pack else arrays, words))
+
+
+def _tensors(model: ModelFile) -> dict[str, Any]:
+    """Return a model's tensors by their names in a file."""
+    scene = model.scene
+    skeleton, mesh, rig = scene.character.skeleton, scene.garment.mesh, scene.rig
+    return {
+        "scene.skeleton.parents": skeleton.parents,
+        "scene.skeleton.bind_transforms": skeleton.bind_transforms,
+        "scene.skeleton.rest_transforms": skeleton.rest_transforms,
+        "scene.mesh.points": mesh.points,
+        "scene.mesh.faces": mesh.faces,
+        "scene.mesh.polygon_counts": mesh.polygon_counts,
+        "scene.mesh.polygon_indices": mesh.polygon_indices,
+        "scene.classes": scene.classes,
+        "scene.plain.indices": scene.lbs_skin.indices,
+        "scene.plain.weights": scene.lbs_skin.weights,
+        "scene.rig.parents": rig.parents,
+        "scene.rig.bind_transforms": rig.bind_transforms,
+        "scene.rig.indices": rig.skin.indices,
+        "scene.rig.weights": rig.skin.weights,
+        "joints": model.joints,
+        **({} if mesh.uvs is None else {"scene.mesh.uvs": mesh.uvs}),
+        **{f"model.{name}": value for name, value in model.parameters.items()},
+    }
+
+
+def _document(model: ModelFile) -> dict[str, Any]:
+    """Return the JSON document of a model's header."""
+    skeleton, mesh, rig = model.scene.character.skeleton, model.scene.garment.mesh, model.scene.rig
+    return {
+        "format": FORMAT,
+        "ssilk": __version__,
+        "joint_names": skeleton.joint_names,
+        "proxy_names": rig.joint_names,
+        "paths": {"skeleton": skeleton.path, "garment": mesh.path, "rig": rig.path},
+        "config": asdict(model.config),
+        "fabric": asdict(model.fabric),
+        "provenance": model.provenance,
+        **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
+    }
+
+
+def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the tensors of a file with quantised matrices.
+
+    Vectors keep their precision, because errors in beta accumulate over time.
+    """
+    weights = {name: tensors[name].astype(np.float32) for name in WEIGHTS}
+    matrices = {
+        name: quantize(value) for name, value in tensors.items() if name.startswith("model.") and value.ndim > 1
+    }
+    steps = {name: pair[0] for name, pair in matrices.items()}
+    return {**tensors, **weights, **steps, **{f"scale.{name}": pair[1] for name, pair in matrices.items()}}
+
+
+def load_model(path: str | Path, shapes: Callable[[ModelFile], Shapes] | None = None) -> ModelFile:
+    """Read a model file.
+
+    Args:
+        path: the file, .safetensors.
+        shapes: returns the shapes that its parameters must have; by default those of a `GarmentModel`.
+
+    Raises:
+        SsilkError: the file is missing, truncated, not a model file or of an unsupported format, or its parameters
+            do not match the sizes in its header.
+    """
+    tensors, document = _read(Path(path))
+    try:
+        _need_header(document)
+        model = _model_of(tensors, document)
+        _need_fit(model, (shapes or _implied)(model))
+        return model
+    except SsilkError as error:
+        raise SsilkError(f"{path}: the model cannot be used: {error}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        first = str(error).partition("\n")[0]
+        raise SsilkError(
+            f"{path}: the model file is incomplete or inconsistent ({type(error).__name__}: {first}); "
+            "train again or fetch the file again."
+        ) from error
+
+
+def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    if not path.is_file():
+        fail(str(path), "there is no such model file", "a file written by 'ssilk train' is needed")
+    try:
+        tensors, words = read_tensors(path, HEADER_NAME)
+    except ValueError as error:
+        if is_usd(path):
+            fail(
+                str(path),
+                "this is a USD stage",
+                "a model is a .safetensors file that 'ssilk train' wrote",
+                "model and stage may have been swapped",
+            )
+        first = str(error).partition("\n")[0]
+        raise SsilkError(
+            f"{path}: this is not a safetensors file, or it is truncated or damaged ({first}); train again or fetch "
+            "the file again."
+        ) from error
+    header = words.get(HEADER_NAME, "")
+    if not header:
+        fail(str(path), "a safetensors file without SSILK's header", "a file written by 'ssilk train' is needed")
+    try:
+        document = json.loads(header)
+    except (TypeError, ValueError, RecursionError) as error:
+        raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
+    found = document.get("format") if isinstance(document, dict) else None
+    if found not in (3, 4, 5, FORMAT):
+        fail(str(path), f"model format {found}", f"this version reads formats 3 to {FORMAT}", "train it again")
+    if found == 3:
+        document = _from_format_3(document)
+    if found != FORMAT and isinstance(document.get("config"), dict):
+        document = {**document, "config": OLDER_LIMITS | document["config"]}
+    return tensors, document
+
+
+def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
+    """Convert the header of a format 3 model to format 4; damaged values stay for `_need_header` to report."""
+
+    def renamed(values: object, part: str) -> object:
+        names = RENAMED_SINCE_3.get(part, {})
+        return (
+            {names.get(name, name): value for name, value in values.items()} if isinstance(values, dict) else values
+        )
+
+    provenance = document.get("provenance")
+    if isinstance(provenance, dict):
+        provenance = {part: renamed(value, part) for part, value in provenance.items()}
+    return {**document, "config": renamed(document.get("config"), "config"), "provenance": provenance}
+
+
+def _need_header(document: dict[str, Any]) -> None:
+    """Raise `TypeError` unless every value in a header has the type that `save_model` writes."""
+    _need_types(document, HEADER)
+    _need_types(document["config"], vars(ModelConfig()))
+    _need_types(document["fabric"], vars(Fabric("")))
+    for words in (document["joint_names"], document["proxy_names"], document["paths"].values()):
+        _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
+    seed = document["provenance"].get("seed", 0)
+    if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
+        raise TypeError(f"the seed {str(seed)[:40]!r} is not a whole number of 64 bits")
+    colour = document.get("colour")
+    if colour is not None:
+        _need_types(dict(enumerate(colour)), dict.fromkeys(range(3), 0.0))
+        if not (isinstance(colour, list) and len(colour) == 3 and np.isfinite(colour).all()):
+            raise TypeError(f"the colour {str(colour)[:40]} is not three finite numbers")
+    widths = document["config"].get("widths", [])
+    _need_types(dict(enumerate(widths)), dict.fromkeys(range(len(widths)), 0))
+
+
+def _need_types(values: Mapping[Any, object], likes: Mapping[Any, object]) -> None:
+    """Raise `TypeError` unless values from JSON have the types of the values of the same names in `likes`."""
+    for name, value in values.items():
+        kind = type(likes.get(name, value))
+        if type(value) not in {float: (int, float), tuple: (list,)}.get(kind, (kind,)):
+            raise TypeError(f"{name!r} is {str(value)[:40]}, which is not of type {kind.__name__}")
+
+
+def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> ModelFile:
+    scene = _scene_of(tensors, document)
+    joints, skeleton = tensors["joints"], scene.character.skeleton
+    if not (joints.ndim == 1 and np.isin(joints, np.arange(skeleton.joint_count)).all()):
+        fail(
+            skeleton.path,
+            f"descriptors of joints {joints.tolist()}",
+            f"joints must lie in 0 to {skeleton.joint_count - 1}",
+            "train again",
+        )
+    return ModelFile(
+        scene,
+        ModelConfig(**document["config"]),
+        fabric_of_file(document["fabric"]),
+        joints.astype(np.int64),
+        _parameters(tensors, scene.garment.mesh.path),
+        document["provenance"],
+    )
+
+
+def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene:
+    """Return the garment, rig and skeleton of a file as a scene."""
+    paths = document["paths"]
+
+    def skin(name: str, path: str) -> SkinWeights:
+        return SkinWeights(path, tensors[f"scene.{name}.indices"], tensors[f"scene.{name}.weights"])
+
+    skeleton = Skeleton(
+        paths["skeleton"],
+        tuple(document["joint_names"]),
+        tensors["scene.skeleton.parents"],
+        tensors["scene.skeleton.bind_transforms"],
+        tensors["scene.skeleton.rest_transforms"],
+    )
+    mesh = Mesh(
+        paths["garment"],
+        tensors["scene.mesh.points"],
+        tensors["scene.mesh.faces"],
+        tensors["scene.mesh.polygon_counts"],
+        tensors["scene.mesh.polygon_indices"],
+        tensors.get("scene.mesh.uvs"),
+    )
+    rig = ProxyRig(
+        paths["rig"],
+        tuple(document["proxy_names"]),
+        tensors["scene.rig.parents"],
+        tensors["scene.rig.bind_transforms"],
+        skin("rig", paths["rig"]),
+    )
+    colour = document.get("colour")
+    if colour is not None:
+        red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
+        colour = red, green, blue
+    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour)
+    return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
+
+
+def _parameters(tensors: dict[str, np.ndarray], where: str) -> dict[str, np.ndarray]:
+    """Return the parameters of a file by name, dequantised if necessary."""
+    stored = {name: value for name, value in tensors.items() if name.startswith("model.")}
+    for name, value in stored.items():
+        if value.dtype.kind == "i":
+            stored[name] = dequantize(value, tensors[f"scale.{name}"])
+        finite = np.isfinite(stored[name]).all()
+        if not finite:
+            fail(where, f"parameter '{name[6:]}' holds NaN or infinity", "all must be finite", "train again")
+    return {name[6:]: value for name, value in stored.items()}
+
+
+def _implied(model: ModelFile) -> Shapes:
+    return parameter_shapes(model.scene, model.config, model.joints)
+
+
+def _need_fit(model: ModelFile, expected: Shapes) -> None:
+    """Raise `SsilkError` unless the parameters have the `expected` shapes."""
+    found = {name: value.shape for name, value in model.parameters.items()}
+    odd = next((name for name in {**expected, **found} if expected.get(name) != found.get(name)), "")
+    if odd:
+        fail(
+            f"parameter '{odd}'",
+            f"the model's parameters do not fit its header: shape {found.get(odd)}",
+            f"{expected.get(odd)} is needed",
+            "train again",
+        )
+
+
+def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
+    """Return a network as the contents of a model file."""
+    parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance)
+
+
+def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
+    """Build the network of a model file, on the file's scene or on one that also has the character's body."""
+    import torch
+
+    from .model.network import GarmentModel
+
+    model = GarmentModel(scene or file.scene, file.config, file.joints)
+    model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
+    return model.eval()

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptors: the features of a motion that the network receives (paper, Sections 3.1 and 3.2).
+
+The state of a garment does not depend on the position, heading or constant velocity of its character. Rotating
+character and gravity together only rotates the result. The descriptors have these symmetries by construction.
+Gravity enters as its direction in the frame of each joint. The root enters through its angular motion and through
+accelerations, not through a position, a heading or a velocity. Augmentation by a rotation of the character is
+therefore equivalent to the inverse rotation of gravity, which costs nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..physics.constants import GRAVITY
+from ..scene.assets import Floats, Motion, Skeleton
+from ..scene.kinematics import matrix_from_quaternion, motion_transforms
+
+RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
+SATURATION = 4.0  # limit of dynamic features, so that a teleport keeps the network within its trained range
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFeatures:
+    """Descriptors of a motion's frames without gravity, which depends on the augmentation.
+
+    Attributes:
+        static: 6D local rotations of the descriptor joints except the root, shape (F, S).
+        dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D).
+        down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
+    """
+
+    static: Floats
+    dynamic: Floats
+    down: Floats
+
+
+def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
+    """Return the joints flagged in `used` (J,) and all their ancestors, sorted, shape (J',)."""
+    keep = np.array(used, dtype=bool)
+    for joint in range(skeleton.joint_count - 1, -1, -1):
+        if keep[joint] and skeleton.parents[joint] >= 0:
+            keep[skeleton.parents[joint]] = True
+    return np.flatnonzero(keep)
+
+
+def pose_features(
+    motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None
+) -> PoseFeatures:
+    """Return the descriptors of every frame of a motion; frames before the first repeat it.
+
+    `world` is `motion_transforms` of the motion, if it is already computed.
+    """
+    world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
+    local = matrix_from_quaternion(motion.rotations[:, joints])
+    inner = [i for i, joint in enumerate(joints) if skeleton.parents[joint] >= 0]
+    static = six_d(local[:, inner]).reshape(len(local), -1)
+    root = world[:, 0, :3, :3]
+    rate, change = _differences(static, motion.fps)
+    turn = [
+        six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
+    ]
+    acceleration = _differences(world[..., :3, 3], motion.fps)[1] / (RATE_TIME**2 * GRAVITY)
+    acceleration = np.einsum("fba,fjb->fja", root, acceleration).reshape(len(local), -1)
+    dynamic = np.concatenate([rate, change, *turn, acceleration], axis=1)
+    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), np.swapaxes(world[..., :3, :3], -1, -2))
+
+
+def six_d(rotations: Floats) -> Floats:
+    """Return the first two columns of rotation matrices (..., 3, 3), flattened to (..., 6) [ZBL*19]."""
+    return np.swapaxes(rotations[..., :2], -1, -2).reshape(*rotations.shape[:-2], 6)
+
+
+def _past(values: Floats, steps: int) -> Floats:
+    """Return the values `steps` frames earlier, and the first value before the first frame."""
+    return values[np.maximum(np.arange(len(values)) - steps, 0)]
+
+
+def _differences(values: Floats, fps: float) -> tuple[Floats, Floats]:
+    """Return first and second backward differences per RATE_TIME.
+
+    The first frame repeats the first difference of the next. The second difference is zero in the first two frames.
+    """
+    first = np.zeros_like(values)
+    first[1:] = values[1:] - values[:-1]
+    if len(values) > 1:
+        first[0] = first[1]
+    second = np.zeros_like(values)
+    second[2:] = first[2:] - first[1:-1]
+    return first * fps * RATE_TIME, second * (fps * RATE_TIME) ** 2

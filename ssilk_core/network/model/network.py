@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole model: initialiser P, stepper S, decoder D and the deformation they drive (paper, Figure 2)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ...scene.assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
+from ...scene.kinematics import ProxyAxes
+from ..descriptors import descriptor_joints
+from ..parameters import descriptor_sizes
+from ..settings import ModelConfig
+from .decoder import Decoder
+from .integrators import integrator
+
+
+def mlp(
+    inputs: int, widths: tuple[int, ...], outputs: int, generator: torch.Generator, last: float, bias: bool = True
+) -> nn.Sequential:
+    """Return a multilayer perceptron with SiLU; `last` scales the initial weights of the last layer."""
+    sizes = [inputs, *widths, outputs]
+    layers: list[nn.Module] = []
+    for index, (fan_in, fan_out) in enumerate(pairwise(sizes)):
+        final = index == len(sizes) - 2
+        linear = nn.Linear(fan_in, fan_out, bias=bias or not final)
+        with torch.no_grad():
+            scale = (last if final else 1.0) * (2 / fan_in) ** 0.5
+            linear.weight.copy_(scale * torch.randn(fan_out, fan_in, generator=generator))
+            if linear.bias is not None:
+                linear.bias.zero_()
+        layers += [linear] if final else [linear, nn.SiLU()]
+    return nn.Sequential(*layers)
+
+
+class GarmentModel(nn.Module):
+    """A garment on a character, as a latent simulator.
+
+    Args:
+        scene: character, garment and rig.
+        config: sizes of the network.
+        joints: character joints in the descriptors (`descriptors.descriptor_joints`).
+        seed: of the initial parameters.
+    """
+
+    def __init__(self, scene: Scene, config: ModelConfig, joints: np.ndarray, seed: int = 0) -> None:
+        super().__init__()
+        self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
+        self.axes = ProxyAxes.of(scene)
+        generator = torch.Generator().manual_seed(seed)
+        self.decoder = Decoder(scene, config, generator)
+        static, dynamic = descriptor_sizes(scene, self.joints)
+        z = config.latent
+        self.initialiser = mlp(static, config.widths, z, generator, 1.0)
+        # Zero: training starts as the scheme integrates without S.
+        self.integrator = integrator(config, dynamic)
+        scheme = self.integrator.scheme
+        seen = scheme.states * z + static + dynamic
+        self.stepper = mlp(seen, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
+        # Small: training starts as linear blend skinning.
+        self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
+
+    def initial(self, static: Tensor) -> Tensor:
+        """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
+        return self.integrator.bound(self.initialiser(static))
+
+    def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+        """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
+        return self.integrator(self.stepper, before, now, rest, pose)
+
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+        """Return `states`, each (batch, latent), followed by those of the next frames.
+
+        Args:
+            states: at least the two before the first of these frames.
+            rest: quasi-static latents of the frames, shape (F, batch, latent).
+            pose: their dynamic descriptors, shape (F, batch, D).
+        """
+        states = list(states)
+        precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
+        for frame in zip(*(values.unflatten(0, rest.shape[:2]) for values in precomputed)):
+            states.append(self.integrator.step(self.stepper, states[-2], states[-1], frame))
+        return states
+
+    def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Return activations (K, N) in [-1, 1] and proxy transforms (P, 3, 4, N) of latents (N, latent) (Eq. 7)."""
+        return self.decoder.activations(self.output(z))
+
+    def vertices(self, z: Tensor, character: Tensor) -> Tensor:
+        """Decode latents (N, latent) over character skinning matrices (J, 3, 4, N) to positions (V, 3, N) [m]."""
+        return self.decoder.vertices(self.output(z), character)
+
+    @torch.no_grad()
+    def deformer(self) -> Deformer:
+        """Return the trained garment for files: shapes for weights in [0, 1], with W^g and W^p made sparse.
+
+        An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k, has a
+        constant weight of one: it moves the middle of the range back to the rest shape, or to that of a reduced
+            model.
+        """
+        scene, decoder = self.scene, self.decoder
+        dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
+        dense[:, decoder.used.cpu().numpy()] = decoder.skin_weights().double().cpu().numpy()
+        skin = SkinWeights.from_dense(scene.rig.path, dense)
+        free = decoder.shapes.double().permute(2, 0, 1).cpu().numpy()
+        shapes = np.zeros((decoder.shape_count, scene.garment.mesh.vertex_count, 3))
+        shapes[:, decoder.free.cpu().numpy()] = 2 * free
+        if decoder.has_constant:
+            constant = -shapes.sum(0, keepdims=True) / 2
+            constant[0, decoder.free.cpu().numpy()] += decoder.offset.cpu().numpy()
+            shapes = np.concatenate([shapes, constant])
+        return Deformer(scene, skin, shapes)
+
+    @torch.no_grad()
+    def file_pose(self, activation: Tensor, transforms: Tensor) -> tuple[Floats, Floats, Floats | None]:
+        """Return the values that a file stores, as `GarmentPose` has them.
+
+        Returns:
+            Local proxy quaternions (N, P, 4), weights (N, K + 1) in [0, 1], and local translations (N, P, 3) [m],
+            None where proxies do not move.
+        """
+        turned, moved = self.axes.to_local(transforms.double().permute(3, 0, 1, 2).cpu().numpy())
+        weights = (activation.double().T.cpu().numpy() + 1) / 2
+        if self.decoder.has_constant:
+            weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
+        return turned, weights.clip(0, 1), moved if self.config.translations else None
+
+    @torch.no_grad()
+    def network_pose(self, pose: GarmentPose) -> tuple[Tensor, Tensor]:
+        """Invert `file_pose`: activations (K, N) and transforms (P, 3, 4, N), on the model's device."""
+        parameter = self.decoder.shapes
+        transforms = self.axes.to_bind(pose.rotations, pose.translations)
+        activation = 2 * pose.weights[:, : self.decoder.shape_count].astype(np.float64).T - 1
+        return (
+            torch.as_tensor(activation, dtype=torch.float32, device=parameter.device),
+            torch.as_tensor(transforms.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),
+        )
+
+
+def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
+    """Return the joints for a garment's descriptors: those that it is skinned to, or that move body parts in reach.
+
+    Args:
+        scene: character, garment and rig.
+        colliding: flag of each joint that moves a reachable body vertex, shape (J,).
+    """
+    skeleton = scene.character.skeleton
+    used = np.array(colliding, dtype=bool)
+    for skin in (scene.rig.skin, scene.lbs_skin):
+        indices = skin.indices[skin.weights > 0]
+        used[indices[indices < skeleton.joint_count]] = True
+    for parent in scene.rig.parents:
+        if parent < skeleton.joint_count:
+            used[parent] = True
+    return descriptor_joints(skeleton, used)

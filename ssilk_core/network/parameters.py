@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compute the shapes of a network's parameters, so that a file can be checked without building the network."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from ..scene.assets import PINNED, Ints, Scene
+from .schemes import SCHEMES
+from .settings import ModelConfig
+
+Shapes = dict[str, tuple[int, ...]]
+
+# Outputs of D for a proxy at rest, a 6D rotation and a displacement, and their units: displacements in decimetres, so
+# that outputs of one size turn and move a proxy about as far.
+IDENTITY = np.array([1, 0, 0, 0, 1, 0, 0, 0, 0], dtype=np.float32)
+OUTPUT_SCALE = np.array([1, 1, 1, 1, 1, 1, 0.1, 0.1, 0.1], dtype=np.float32)
+
+
+def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
+    """Return the shape of each parameter of `model.network.GarmentModel` by name."""
+    free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
+    static, dynamic = descriptor_sizes(scene, joints)
+    scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
+    reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
+    return {
+        "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
+        "decoder.shapes": (free, 3, config.shapes),
+        **(reduced if config.activations else {}),
+        **{f"integrator.{name}": (z,) for name in scheme.parameters},
+        **_layers("initialiser", (static, *widths, z)),
+        **(
+            _layers("stepper", (scheme.states * z + static + dynamic, *widths, z), scheme.bias)
+            if scheme.states
+            else {}
+        ),
+        **_layers("output", (z, *widths, config.activation_count + config.proxy_outputs * proxies)),
+    }
+
+
+def descriptor_sizes(scene: Scene, joints: Ints) -> tuple[int, int]:
+    """Return the number of static features, including gravity, and the number of dynamic features."""
+    inner = int((scene.character.skeleton.parents[joints] >= 0).sum())
+    return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)
+
+
+def _layers(name: str, sizes: tuple[int, ...], bias: bool = True) -> Shapes:
+    """Return the shapes of an MLP's parameters; odd indices are activations, which have none."""
+    shapes: Shapes = {}
+    for index, (inputs, outputs) in enumerate(pairwise(sizes)):
+        shapes[f"{name}.{2 * index}.weight"] = (outputs, inputs)
+        if bias or index < len(sizes) - 2:
+            shapes[f"{name}.{2 * index}.bias"] = (outputs,)
+    return shapes

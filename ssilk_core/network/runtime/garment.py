@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A trained garment in numpy: its networks, its decoder and its skin, without any motion."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import fail
+from ...scene.assets import Deformer
+from ..checkpoint import ModelFile
+from ..parameters import descriptor_sizes
+from .decoder import NumpyDecoder
+from .deformer import deformer
+from .kinematics import ProxyKinematics
+from .networks import evaluate, layers
+from .skinning import tiles
+from .stepper import SoftClamp, SpringStepper, diverged
+
+
+class NumpyGarment:
+    """A trained garment whose networks are evaluated with numpy.
+
+    Raises:
+        SsilkError: the runtime does not support the model's integration scheme.
+    """
+
+    def __init__(self, file: ModelFile) -> None:
+        scene, config = file.scene, file.config
+        if config.scheme not in ("spring_verlet", "quasi_static"):
+            fail(
+                scene.garment.mesh.path,
+                f"the model's scheme is '{config.scheme}'",
+                "the runtime plays 'spring_verlet' and 'quasi_static'",
+                "play it in PyTorch with ssilk_core.network.rollout, or train with one of these",
+            )
+        self.file, self.skeleton = file, scene.character.skeleton
+        static, _ = descriptor_sizes(scene, file.joints)
+        self.initialiser = layers(file.parameters, "initialiser")
+        steps = config.scheme == "spring_verlet"
+        self.stepper = SpringStepper(config, file.parameters, static) if steps else None
+        self.decoder = NumpyDecoder(scene, file.parameters, config)
+        self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
+        self.tiles = tiles(scene, file.parameters)
+
+    def deformer(self) -> Deformer:
+        """Return the trained garment's skin and shapes, as files and host applications hold them."""
+        return deformer(self.file)
+
+    def quasi_static(self, static: NDArray) -> NDArray:
+        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
+        rest = np.ascontiguousarray(evaluate(self.initialiser, static.T).T)
+        SoftClamp(self.file.config.latent_bound, rest.shape)(rest)
+        rest[diverged(rest)] = 0
+        return rest

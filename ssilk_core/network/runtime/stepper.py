@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recurrence of `model.integrators.SpringVerlet`, one frame at a time, in few numpy calls.
+
+With p the quasi-static state, w = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in w and v
+plus a part that the pose alone decides, as it decides all of what S gives to a garment at rest:
+
+    z_t = p + f + soft_clamp(u - k f),    f = w + beta v,    u = s (S(w, v, pose) - S(0, 0, pose held still))
+
+with the norm of u clipped: |u| <= (|k f| + |v|) / 2 + |rates of the pose| / 20.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..settings import (
+    DISTANCE_SCALE,
+    DIVERGENCE_BOUND,
+    MAX_OUTPUT,
+    OUTPUT_SCALE,
+    RATE_ALLOWANCE,
+    RECOVERY_FRAMES,
+    SPRING_ALLOWANCE,
+    VELOCITY_SCALE,
+    ModelConfig,
+)
+from .networks import Layer, Parameters, as_float32, evaluate_tail, layers
+
+MAX_SCALED_OUTPUT = OUTPUT_SCALE * MAX_OUTPUT
+SAFE_SQUARED_NORM = MAX_SCALED_OUTPUT**2  # a vector with a smaller one has no entry that needs clamping
+
+
+def diverged(states: NDArray) -> NDArray:
+    """Return which states (F, latent) have diverged or are not finite, shape (F,)."""
+    return ~(np.abs(states).max(axis=1) < DIVERGENCE_BOUND)  # false for NaN too
+
+
+class SoftClamp:
+    """`model.integrators.soft_clamp` in place, with preallocated buffers."""
+
+    def __init__(self, bound: float, shape: tuple[int, ...]) -> None:
+        self.half = bound / 2 or np.inf
+        self.high = np.full(shape, self.half, dtype=np.float32)
+        self.low, self.inner, self.over = -self.high, np.empty_like(self.high), np.empty_like(self.high)
+
+    def __call__(self, values: NDArray) -> None:
+        """Clamp values in place."""
+        inner, over = self.inner, self.over
+        largest = np.abs(values, over).argmax()  # four times as fast as `max`
+        if over.item(largest) <= self.half:
+            return
+        np.minimum(values, self.high, inner)
+        np.maximum(inner, self.low, inner)
+        np.subtract(values, inner, over)
+        np.divide(over, self.high, over)
+        np.tanh(over, over)
+        np.multiply(over, self.high, over)
+        np.add(inner, over, values)
+
+
+class LayerBuffers:
+    """A hidden layer for single frames, with preallocated buffers.
+
+    Args:
+        rows: weights (inputs, hidden); a last row of biases where these are not added otherwise.
+    """
+
+    def __init__(self, rows: NDArray) -> None:
+        self.rows, hidden = rows, rows.shape[1]
+        # Separate arrays: numpy treats neighbours in memory as overlapping, which makes its exponential 20 times
+        # slower.
+        self.active, self.scale = np.ones(hidden + 1, np.float32), np.empty(hidden, np.float32)
+        self.sums = self.active[:-1]  # the last entry stays 1 and multiplies the next layer's biases
+        self.one = np.ones_like(self.scale)  # adding an array of 512 is faster in numpy than adding a scalar
+
+    def activate(self) -> NDArray:
+        """Turn the sums into activations in place; return these, followed by a one."""
+        sums, scale = self.sums, self.scale
+        np.exp(sums, scale)
+        np.add(scale, self.one, scale)
+        np.divide(sums, scale, sums)
+        return self.active
+
+
+@dataclass(frozen=True, eq=False)
+class StepperInputs:
+    """Inputs of the stepper for F frames.
+
+    Attributes:
+        history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
+        pose_sums: contribution of the pose to the sums of S's first layer, shape (F, hidden).
+        output_at_rest: s S(0, 0, pose held still), shape (F, latent).
+        rate_allowance: limit of |u| due to the pose's rates, shape (F,).
+        first: first frame that the stepper computes; the garment is at rest in earlier ones.
+    """
+
+    history: NDArray
+    pose_sums: NDArray
+    output_at_rest: NDArray
+    rate_allowance: NDArray
+    first: int
+
+
+class SpringStepper:
+    """Rolls out latents.
+
+    Args:
+        config: sizes and bounds; parameters: of the whole network.
+        static: size of the static part of a dynamic descriptor.
+    """
+
+    def __init__(self, config: ModelConfig, parameters: Parameters, static: int) -> None:
+        beta, share = (parameters[f"integrator.{name}"] for name in ("beta", "share"))
+        first, *hidden, last = layers(parameters, "stepper")
+        blocks = np.cumsum([config.latent] * 3 + [static])
+        of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
+        speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
+        self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
+        self.first = as_float32(np.hstack([of_now - away, speed - away * beta]).T)
+        self.later = [*hidden, Layer(as_float32(OUTPUT_SCALE * last.rows))]
+        self.beta = beta.astype(np.float32)
+        self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
+        self.config = config
+
+    def prepare(self, rest: NDArray, static: NDArray, rates: NDArray, before: NDArray | None) -> StepperInputs:
+        """Return the inputs of F frames.
+
+        Args:
+            rest: quasi-static latents (F, latent); static, rates: descriptors (F, S) and (F, R).
+            before: the two latents before the first frame (2, latent); None at the start of a motion, at rest.
+        """
+        still = self.of_still @ np.hstack([rest, static]).T + self.bias
+        pose_sums = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
+        output = evaluate_tail(self.later, still).T
+        output_at_rest = np.ascontiguousarray(output.clip(-MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT))
+        rate_allowance = RATE_ALLOWANCE * np.linalg.norm(rates, axis=1)
+        history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
+        history[:-2, 0] = rest
+        if before is None:
+            history[2:4, 1] = rest[:2]
+            return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, 2)
+        history[:2, 1] = before
+        return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, 0)
+
+    def roll(self, inputs: StepperInputs) -> NDArray:
+        """Return the latents of all frames (F, latent), written into `inputs`."""
+        z, rest, start = inputs.history[2:, 1], inputs.history[:-2, 0], inputs.first
+        while start < len(z):
+            self._advance(inputs, start)
+            bad = diverged(z[start:])
+            if not bad.any():
+                break
+            first = start + int(bad.argmax())
+            start = first + RECOVERY_FRAMES
+            z[first:start] = rest[first:start]
+        return z
+
+    def _advance(self, inputs: StepperInputs, start: int) -> None:
+        z, of_velocity, history = self.config.latent, self.config.velocity_allowance, inputs.history[start:]
+        buffers = [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
+        differences = np.empty((2, z), np.float32)
+        along, pull, own = (np.empty(z, np.float32) for _ in range(3))
+        state, (away, velocity) = differences.reshape(-1), differences
+        sums, last = buffers[0].sums, self.later[-1].rows
+        clamp_step, clamp_state = (
+            SoftClamp(self.config.max_latent_step, (z,)),
+            SoftClamp(self.config.latent_bound, (z,)),
+        )
+        poses = inputs.pose_sums[start:], inputs.output_at_rest[start:], inputs.rate_allowance[start:].tolist()
+        frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
+        with np.errstate(over="ignore", invalid="ignore"):  # `roll` handles diverged states
+            for past, rest, now, new, pose_sum, at_rest, rate_limit in frames:
+                np.subtract(now, past, differences)
+                np.dot(state, self.first, sums)
+                np.add(sums, pose_sum, sums)
+                hidden = buffers[0].activate()
+                for buffer in buffers[1:]:
+                    np.dot(hidden, buffer.rows, buffer.sums)
+                    hidden = buffer.activate()
+                np.dot(hidden, last, own)
+                if not own.dot(own) < SAFE_SQUARED_NORM:
+                    np.clip(own, -MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT, own)
+                np.multiply(self.beta, velocity, along)
+                np.add(along, away, along)
+                np.multiply(self.stiffness, along, pull)
+                np.subtract(own, at_rest, own)
+                limit = (
+                    SPRING_ALLOWANCE * sqrt(pull.dot(pull)) + of_velocity * sqrt(velocity.dot(velocity)) + rate_limit
+                )
+                size = sqrt(own.dot(own))
+                if size > limit:
+                    np.multiply(own, limit / size, own)
+                np.subtract(own, pull, own)
+                clamp_step(own)
+                np.add(own, along, own)
+                np.add(own, rest, new)
+                clamp_state(new)

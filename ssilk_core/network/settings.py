@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of a model, and how settings are checked and overridden by name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+from ..errors import fail
+from .schemes import need_scheme
+
+MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
+NO_BOUND = 1e9  # upper limit of settings without a limit of their own
+
+# Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
+VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
+MAX_OUTPUT = 100.0  # limit of each output of S: finite, and far above `max_latent_step`
+SPRING_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
+DIVERGENCE_BOUND = 1e3  # a latent beyond this has diverged; those of trained models stay below ten
+RECOVERY_FRAMES = 15  # frames at rest after a diverged state, half a second at 30 frames per second
+
+
+def need_between(config: object, low: float, high: float, *names: str) -> None:
+    """Raise `SsilkError` unless each of these settings lies in [low, high]."""
+    for name in names:
+        value = getattr(config, name)
+        if not low <= value <= high:
+            fail(f"setting '{name}'", f"{value:g}", f"it must lie between {low:g} and {high:g}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelConfig:
+    """Shape of the network.
+
+    Attributes:
+        latent: number of dimensions of the latent state z.
+        widths: widths of the hidden layers of the initialiser P, the stepper S and the decoder D.
+        shapes: number K of blendshapes; with zero only proxies deform the garment.
+        activations: number of activations that D outputs, if it differs from K ("ssilk reduce"); zero for K.
+        translations: whether proxies move as well as turn; in the paper they only turn.
+        scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
+            quasi-static state, "quasi_static" is that state itself.
+        latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
+        max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
+        stiffness: largest spring constant of "spring_verlet", in (0, 1].
+        velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
+            and the rates of the pose allow (`model.integrators.SpringVerlet`).
+        fps: steps of the model per second [1/s].
+    """
+
+    latent: int = 128
+    widths: tuple[int, ...] = (256, 512, 512)
+    shapes: int = 64
+    activations: int = 0
+    translations: bool = False
+    scheme: str = "spring_verlet"
+    latent_bound: float = 4.0
+    max_latent_step: float = 1.0
+    stiffness: float = 0.2
+    velocity_allowance: float = 0.9
+    fps: float = 30.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "widths", tuple(self.widths))
+        need_scheme(self.scheme)
+        if not 1 <= min(self.widths) <= max(self.widths) <= MAX_SIZE:
+            fail("model", f"widths = {self.widths}", f"each must be at least 1 and at most {MAX_SIZE}")
+        need_between(self, 1, MAX_SIZE, "latent")
+        need_between(self, 1, NO_BOUND, "fps")
+        need_between(self, 0, MAX_SIZE, "shapes", "activations")
+        need_between(self, 0, NO_BOUND, "latent_bound", "max_latent_step")
+        need_between(self, 1e-6, 1, "stiffness")
+        need_between(self, 0, 1, "velocity_allowance")
+
+    @property
+    def activation_count(self) -> int:
+        """Return the number of activations that D outputs."""
+        return self.activations or self.shapes
+
+    @property
+    def proxy_outputs(self) -> int:
+        """Return the number of outputs of D for each proxy: a 6D rotation and, where proxies move, a displacement."""
+        return 9 if self.translations else 6
+
+
+def _converted(kind: type, text: str) -> Any:
+    if kind is bool:
+        return {"true": True, "false": False}[text.lower()]
+    return kind(text)
+
+
+Config = TypeVar("Config")
+
+
+def apply_overrides(config: Config, assignments: list[str]) -> Config:
+    """Return `config` with "name=value" assignments applied, each converted to the type of its field.
+
+    Raises:
+        SsilkError: a name is unknown, or a value cannot be converted.
+    """
+    types = {item.name: type(getattr(config, item.name)) for item in fields(config)}  # type: ignore[arg-type]
+    changes: dict[str, Any] = {}
+    for assignment in assignments:
+        name, _, text = assignment.partition("=")
+        if name not in types:
+            fail(f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
+        try:
+            changes[name] = (
+                tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
+            )
+        except (ValueError, KeyError):
+            fail(
+                f"option '{assignment}'",
+                f"'{text}' is not a value for '{name}'",
+                f"a value of type {types[name].__name__} is needed",
+            )
+    return replace(config, **changes)  # type: ignore[type-var]

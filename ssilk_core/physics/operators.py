@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sparse linear operators on vertex positions, with a deterministic gradient.
+
+Positions are laid out (vertices, 3, frames): frames of a vertex are contiguous, so that gathering a vertex is one
+block copy. The transposed operator, a sum over the incident elements of each vertex, needs no atomics.
+"""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..scene.assets import Floats, Ints
+
+
+class _Apply(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: torch.autograd.function.FunctionCtx, x: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
+        ctx.matrix, ctx.transposed = matrix, transposed  # type: ignore[attr-defined]
+        return matrix @ x
+
+    @staticmethod
+    def backward(ctx: torch.autograd.function.FunctionCtx, grad: Tensor) -> tuple[Tensor, None, None]:
+        matrix, transposed = ctx.matrix, ctx.transposed  # type: ignore[attr-defined]
+        return _Apply.apply(grad.contiguous(), transposed, matrix), None, None
+
+
+class SparseOperator:
+    """A sparse matrix that maps (vertices, 3, frames) to (rows, 3, frames)."""
+
+    def __init__(
+        self,
+        rows: Ints,
+        columns: Ints,
+        values: Floats,
+        shape: tuple[int, int],
+        device: torch.device,
+        dtype: torch.dtype,
+    ) -> None:
+        self.matrix = _csr(rows, columns, values, shape, device, dtype)
+        self.transposed = _csr(columns, rows, values, (shape[1], shape[0]), device, dtype)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Apply the operator to `x`, shape (vertices, 3, frames)."""
+        flat = x.reshape(x.shape[0], -1)
+        return _Apply.apply(flat, self.matrix, self.transposed).reshape(-1, *x.shape[1:])
+
+    def adjoint(self, y: Tensor) -> Tensor:
+        """Apply the transposed operator to `y`, shape (rows, 3, frames); without gradients."""
+        return (self.transposed @ y.flatten(1)).reshape(-1, *y.shape[1:])
+
+
+def _csr(
+    rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int], device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    order = np.lexsort((columns, rows))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=shape[0]))])
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", message="Sparse (CSR|invariant)"
+        )  # beta notice; the indices are sorted here
+        return torch.sparse_csr_tensor(
+            torch.as_tensor(starts, dtype=torch.int32, device=device),
+            torch.as_tensor(np.asarray(columns)[order], dtype=torch.int32, device=device),
+            torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device),
+            size=shape,
+        )
+
+
+def difference_operator(
+    heads: Ints, tails: Ints, vertex_count: int, device: torch.device, dtype: torch.dtype
+) -> SparseOperator:
+    """Return the operator whose row i is x[heads[i]] - x[tails[i]]."""
+    count = len(heads)
+    rows = np.concatenate([np.arange(count), np.arange(count)])
+    values = np.concatenate([np.ones(count), -np.ones(count)])
+    return SparseOperator(rows, np.concatenate([heads, tails]), values, (count, vertex_count), device, dtype)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Posed characters for the simulator, and the spans of their motions between cuts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...scene.assets import Floats, Motion, Scene
+from ...scene.kinematics import (
+    frames_at,
+    matrix_from_quaternion,
+    rigid,
+    sample_motion,
+    skinning_matrices,
+    split_at_cuts,
+    world_transforms,
+)
+from ..collision import CollisionBody, PosedBody, limb_axes
+from ..skinning import blend_matrices, transform_points
+
+
+@dataclass(frozen=True, eq=False)
+class MotionSpan:
+    """A part of a shot without cuts, sampled at the solver's steps.
+
+    Attributes:
+        shot: index of its motion.
+        first: its first frame in the shot.
+        substeps: steps for each frame of the shot.
+        motion: its poses, one for each step.
+    """
+
+    shot: int
+    first: int
+    substeps: int
+    motion: Motion
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames of the shot in this span."""
+        return (self.motion.frame_count - 1) // self.substeps + 1
+
+
+def split_into_spans(
+    motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None
+) -> list[MotionSpan]:
+    """Return the spans of a motion between its cuts, each at most `longest` frames of a shot at `fps`."""
+    spans, first, source = [], 0, 0
+    for part in split_at_cuts(motion):
+        stop = frames_at(source + part.frame_count, motion.fps, fps)
+        most = longest or max(1, stop - first)
+        for start in range(first, stop, most):
+            count = (min(most, stop - start) - 1) * substeps + 1
+            position = (start + np.arange(count) / substeps) * motion.fps / fps - source
+            poses = sample_motion(part, position.clip(0, part.frame_count - 1))
+            spans.append(MotionSpan(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))
+        first, source = stop, source + part.frame_count
+    return spans
+
+
+def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
+    """Return the motion of a shot from its spans, one pose per frame."""
+    fps, substeps = spans[0].motion.fps / spans[0].substeps, spans[0].substeps
+    parts = [span.motion for span in spans]
+    rotations = np.concatenate([part.rotations[::substeps] for part in parts])
+    translations = np.concatenate([part.translations[::substeps] for part in parts])
+    return Motion(motion.path, fps, rotations, translations, motion.start * fps / motion.fps)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedCharacters:
+    """Posed characters, each relative to its own root.
+
+    Attributes:
+        root: position of the first joint [m], float64, shape (3, N).
+        body: relative to the root.
+        lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
+    """
+
+    root: Tensor
+    body: PosedBody
+    lbs: Tensor
+
+
+class CharacterPoser:
+    """Poses the character of a scene, and its garment under linear blend skinning."""
+
+    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
+        self.skeleton, self.dtype = scene.character.skeleton, dtype
+        joints = self.skeleton.joint_count
+        self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limb_axes(scene), device=device)
+        self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
+        self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
+
+    def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
+        """Return the poses of all spans at a step."""
+        rotations = np.stack([span.motion.rotations[step] for span in spans])
+        return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
+
+    def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
+        """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""
+        world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
+        root = world[:, 0, :3, 3].copy()
+        world[:, :, :3, 3] -= root[:, None]
+        matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
+        character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)
+        lbs = transform_points(blend_matrices(self.weights, character), self.rest)
+        return PosedCharacters(
+            torch.as_tensor(root.T.copy(), device=self.rest.device),
+            self.body.pose(character.float(), exact=True),
+            lbs,
+        )

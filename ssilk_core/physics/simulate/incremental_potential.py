@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The incremental potential that a frame minimises: the training energy, with its gradient and Hessian.
+
+Implicit Euler with time step dt is the minimum of
+
+    stretch + bending + gravity + collision + tether + stitches
+    + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
+
+(`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
+whole surface that a vertex can touch. In training tight cloth has only the triangles around the nearest vertex. It is
+smoothed on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...scene.assets import Scene
+from ...scene.fabrics import Fabric
+from ..collision import Contacts, PosedBody, SmoothedDistance
+from ..constants import GRAVITY
+from ..energy import GarmentEnergy
+from .blocks import BlockMatrix, BlockPattern
+from .hessian import Hessian
+from .membrane import outer
+from .stitches import stitch_gradient
+
+
+@dataclass(frozen=True, eq=False)
+class StepInputs:
+    """Inputs of the energy of N frames, besides the positions.
+
+    Attributes:
+        body: in the coordinates of the positions, float32.
+        gravity: acceleration [m/s2], shape (3, N).
+        predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
+        advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
+        dt: time step [s]. For a quasi-static state it only damps the solver's steps.
+        skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
+    """
+
+    body: PosedBody | None
+    gravity: Tensor
+    predicted: Tensor | None = None
+    advected: Tensor | None = None
+    dt: float = 0.1
+    skinned: Tensor | None = None
+
+    def select(self, frames: Tensor) -> StepInputs:
+        """Return the inputs of the frames with indices (M,)."""
+        body = self.body and self.body.select(frames)
+        predicted, advected, skinned = (
+            v if v is None else v[..., frames] for v in (self.predicted, self.advected, self.skinned)
+        )
+        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned)
+
+
+class IncrementalPotential:
+    """The incremental potential of one garment; positions are (V, 3, N).
+
+    Attributes:
+        free: indices of the free vertices: not pinned, with mass, shape (U,).
+        size: diagonal of the garment's bounding box at rest [m].
+
+    Args:
+        dtype: of positions, energies and gradients; Hessians are float32.
+    """
+
+    def __init__(
+        self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
+    ) -> None:
+        mesh = scene.garment.mesh
+        energy = GarmentEnergy(mesh, fabric, scene.classes, device=device, dtype=dtype)
+        self.fabric, self.dtype = fabric, dtype
+        self.mass: Tensor = energy.mass[:, None]
+        self.tether = torch.zeros_like(self.mass)
+        self.tether[energy.tethered, 0] = energy.tether_stiffness
+        self.size = mesh.diagonal
+        self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
+        self.contacts = Contacts(scene, self.cloth.samples, device=device)
+        self._hessian = Hessian.of(scene, energy)
+        self.membrane, self.hinges, self.free = self._hessian.membrane, self._hessian.hinges, self._hessian.free
+
+    @property
+    def block_pattern(self) -> BlockPattern:
+        """The sparsity pattern of its Hessian."""
+        return self._hessian.pattern
+
+    def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
+        """Return the distances of the samples of x to the body, to second order."""
+        return None if inputs.body is None else self.contacts.smoothed(self.cloth.positions(x), inputs.body)
+
+    def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""
+        if body_distance is None:
+            return x.new_zeros(x.shape[-1])
+        return (body_distance.distance(self.cloth.positions(x))[: len(x)] < 0).to(x.dtype).mean(0)
+
+    def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
+        total = self.membrane.energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
+        if self.hinges:
+            total = total + self.hinges.energy(x)
+        if self.stitching:
+            total = total + self.stitching.energy(x)
+        for weight, target in self._anchors(inputs):
+            total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
+        return total + self.collision(x, body_distance).sum(0)
+
+    def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the collision energy of each sample [J], shape (S, N)."""
+        if body_distance is None:
+            return torch.zeros_like(x[:, 0])
+        return self.collision_at(body_distance.distance(self.cloth.positions(x)))
+
+    def collision_at(self, distance: Tensor) -> Tensor:
+        """Return the collision energy of samples at given distances [J], shape (S, N)."""
+        return self.cloth.area * self.law.energy(distance)
+
+    def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
+        """Return the gradient [N] at all vertices, shape (V, 3, N)."""
+        total = self.membrane.gradient(x) - self.mass[:, None] * inputs.gravity
+        if self.hinges:
+            total += self.hinges.gradient(x)
+        if self.stitching:
+            total += stitch_gradient(self.stitching, x)
+        for weight, target in self._anchors(inputs):
+            total += weight[:, None] * (x - target)
+        if body_distance:
+            total -= self.cloth.to_vertices(self._push(x, body_distance)[:, None] * body_distance.normal)
+        return total
+
+    def hessian(
+        self,
+        x: Tensor,
+        inputs: StepInputs,
+        body_distance: SmoothedDistance | None,
+        fixed: Tensor | None = None,
+        exact_hessian: Tensor | None = None,
+    ) -> BlockMatrix:
+        """Return the Hessian over the free vertices, in float32, with each part projected to be semi-definite.
+
+        Args:
+            fixed: vertices that must not move, shape (V, N); none by default.
+            exact_hessian: frames that use the membrane's exact Hessian, which compression may make indefinite, shape
+                (N,); none by default.
+        """
+        still = [] if inputs.predicted is not None else [(self.mass / inputs.dt**2, None)]
+        weight = sum((weight for weight, _ in [*self._anchors(inputs), *still]), torch.zeros_like(self.mass))
+        contact = None
+        if body_distance:
+            distance, normal = body_distance.distance(self.cloth.positions(x)), body_distance.normal
+            push, stiffness = (
+                self.cloth.area * part for part in (self.law.pressure(distance), self.law.curvature(distance))
+            )
+            contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
+        fixed = None if fixed is None else fixed[self.free]
+        return self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
+
+    def residual(self, gradient: Tensor) -> Tensor:
+        """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
+        force, mass = gradient[self.free], self.mass[self.free]
+        return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
+
+    def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
+        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of the tether, inertia and drag, where present."""
+        found = []
+        if inputs.skinned is not None and self.fabric.tether:
+            found.append((self.tether, inputs.skinned))
+        if inputs.predicted is not None:
+            found.append((self.mass / inputs.dt**2, inputs.predicted))
+        if inputs.advected is not None and self.fabric.drag:
+            found.append((self.fabric.drag / self.fabric.density * self.mass / inputs.dt, inputs.advected))
+        return found
+
+    def _push(self, x: Tensor, body_distance: SmoothedDistance) -> Tensor:
+        """Return the force along the gradient of the distance on each sample [N], shape (S, N)."""
+        return self.cloth.area * self.law.pressure(body_distance.distance(self.cloth.positions(x)))

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference simulator: implicit Euler on the training energy, several shots at once.
+
+A shot starts with the quasi-static state of its first pose and the velocity of linear blend skinning, so that a
+character that starts walking does not leave its garment behind. Each step is solved relative to the character's root,
+where single precision is finest; between steps positions are kept in world space, in float64.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...errors import fail
+from ...events import Countdown, Message, Reporter, silent
+from ...scene.assets import Floats, Motion, Scene
+from ...scene.fabrics import Fabric
+from ..constants import GRAVITY
+from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
+from .incremental_potential import IncrementalPotential, StepInputs
+from .newton import Solution, SolverOptions, minimise_from
+
+PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
+MAX_SUBSTEPS = 1000
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """Settings of a simulation.
+
+    Attributes:
+        fps: frames per second; the default is the rate of training.
+        substeps: steps in each frame.
+        batch: number of shots simulated in parallel.
+        sequence: number of frames after which a shot restarts, for evaluation; sequences are simulated in parallel.
+            None for whole shots.
+        precision: "float64" or "float32", of positions, energies and forces; linear systems are always float32.
+        gravity: acceleration [m/s2].
+        solver: settings for every step.
+        quasi_static_solver: settings for quasi-static states, which converge more slowly without inertia.
+    """
+
+    fps: float = 30.0
+    substeps: int = 1
+    batch: int = 64
+    sequence: int | None = None
+    precision: str = "float64"
+    gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
+    solver: SolverOptions = field(default_factory=SolverOptions)
+    quasi_static_solver: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fps <= 10_000:
+            fail("simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
+        if not 0 < self.substeps <= MAX_SUBSTEPS:
+            fail("simulation", f"substeps = {self.substeps}", f"1 to {MAX_SUBSTEPS} are allowed")
+        if not self.batch > 0:
+            fail("simulation", f"batch = {self.batch}", "at least 1 is needed")
+        if not (self.sequence is None or self.sequence >= 1):
+            fail("simulation", f"sequences of {self.sequence} frames", "one at least is needed")
+        if self.precision not in PRECISIONS:
+            fail("simulation", f"precision '{self.precision}'", "it is float64 or float32")
+        if not np.isfinite(self.gravity).all():
+            fail("simulation", f"gravity {self.gravity}", "it must be finite")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedFrame:
+    """One frame of one shot.
+
+    Attributes:
+        shot, number: index of the shot, and of the frame in it.
+        points: garment vertices in world space [m], float64, shape (V, 3).
+        energy: the incremental potential [J], with heights relative to the character's root.
+        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame.
+    """
+
+    shot: int
+    number: int
+    points: Floats
+    energy: float
+    residual: float
+    iterations: int
+    fixed: int
+
+
+@dataclass(frozen=True, eq=False)
+class StepHistory:
+    """The previous states of N shots.
+
+    Attributes:
+        last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
+            in the second step.
+        root: the character's root one step ago [m], float64, shape (3, N).
+        lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
+    """
+
+    last: Tensor
+    before: Tensor | None
+    root: Tensor
+    lbs: Tensor
+
+    def first(self, count: int) -> StepHistory:
+        """Return the history of the first `count` shots."""
+        before = None if self.before is None else self.before[..., :count]
+        return StepHistory(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count])
+
+    @property
+    def local(self) -> Tensor:
+        """The last positions relative to the root at that time, shape (V, 3, N)."""
+        return (self.last - self.root).to(self.lbs.dtype)
+
+    def follow_lbs(self, poses: PosedCharacters) -> Tensor:
+        """Return the last positions moved along with linear blend skinning, relative to the roots of `poses`."""
+        return self.local - self.lbs + poses.lbs
+
+
+class Simulator:
+    """Simulates one garment for any motions of its character."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        fabric: Fabric,
+        options: SimulationOptions | None = None,
+        *,
+        device: torch.device | str = "cpu",
+        report: Reporter = silent,
+    ) -> None:
+        """Prepare the energies of a garment; `report` hears when shots start, with their quasi-static states."""
+        self.report = report
+        self.options, device = options or SimulationOptions(), torch.device(device)
+        dtype = PRECISIONS[self.options.precision]
+        self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
+        self.poser = CharacterPoser(scene, device, dtype)
+        self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
+        self.dt = 1 / (self.options.fps * self.options.substeps)
+
+    def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
+        """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel."""
+        options = self.options
+        cut = (options.fps, options.substeps, options.sequence)
+        spans = [span for shot, motion in enumerate(motions) for span in split_into_spans(motion, shot, *cut)]
+        spans.sort(key=lambda span: -span.motion.frame_count)
+        for start in range(0, len(spans), options.batch):
+            yield from self._simulate_spans(spans[start : start + options.batch])
+
+    def _simulate_spans(self, spans: Sequence[MotionSpan]) -> Iterator[SimulatedFrame]:
+        """Yield the frames of spans, which are sorted by decreasing length."""
+        past: StepHistory | None = None
+        for step in range(spans[0].motion.frame_count):
+            running = [span for span in spans if span.motion.frame_count > step]
+            poses = self.poser.poses_at(running, step)
+            past = past and past.first(len(running))
+            solution = self.step(poses, past) if past else self._first(poses)
+            past = _advanced(past, poses, solution)
+            if step % self.options.substeps == 0:
+                yield from _frames(running, step // self.options.substeps, past.last, solution)
+
+    def carry_on(self, past: StepHistory, characters: Iterable[PosedCharacters]) -> Iterator[StepHistory]:
+        """Yield the states after each step that follows `past`, however it came about.
+
+        Args:
+            characters: poses of each step, of as many shots as the step before, or of the first of these.
+        """
+        for poses in characters:
+            past = past.first(poses.root.shape[-1])
+            past = _advanced(past, poses, self.step(poses, past))
+            yield past
+
+    def _first(self, poses: PosedCharacters) -> Solution:
+        """Return the states that spans start with, and report: on a processor they can take minutes."""
+        solver = self.options.quasi_static_solver
+        self.report(Message(f"cloth comes to rest in the first pose, in {solver.iterations} iterations at most"))
+        start, told = poses.lbs, Countdown(solver.iterations, self.report)
+        return minimise_from(self.potential, start, self.inputs(poses, None), solver, advanced=told)
+
+    def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
+        """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
+        return minimise_from(self.potential, start, self.inputs(poses, None), self.options.quasi_static_solver)
+
+    def inputs(self, poses: PosedCharacters, past: StepHistory | None) -> StepInputs:
+        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
+        gravity = self.gravity.expand(3, poses.root.shape[-1])
+        if past is None:
+            return StepInputs(poses.body, gravity, skinned=poses.lbs)
+        shift = poses.root - past.root
+        predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
+        return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs)
+
+    def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
+        """Return the states one step after `past`, relative to the roots."""
+        inputs = self.inputs(poses, past)
+        return self.solve(self.best_start(self.starts(poses, past, inputs), inputs), inputs)
+
+    def starts(self, poses: PosedCharacters, past: StepHistory, inputs: StepInputs) -> list[Tensor]:
+        """Return states (V, 3, N) that a step after `past` may start from: predicted, still, and with the body."""
+        assert inputs.predicted is not None
+        return [self.apply_pins(x, poses) for x in (inputs.predicted, past.local, past.follow_lbs(poses))]
+
+    def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
+        """Return the minima of one step, from `start` (V, 3, N)."""
+        return minimise_from(self.potential, start, inputs, self.options.solver)
+
+    def apply_pins(self, x: Tensor, poses: PosedCharacters) -> Tensor:
+        """Return positions (V, 3, N) with all vertices but the free ones set to linear blend skinning."""
+        free = self.potential.free
+        return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
+
+    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
+        """Return for each frame the start with the least energy."""
+        potential = self.potential
+        energies = [potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in starts]
+        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
+        best = starts[0]
+        for number, start in enumerate(starts[1:], start=1):
+            best = torch.where(chosen == number, start, best)
+        return best
+
+
+def _advanced(past: StepHistory | None, poses: PosedCharacters, solution: Solution) -> StepHistory:
+    """Return the previous states for the step after a solution."""
+    world = solution.x.double() + poses.root
+    return StepHistory(world, past.last if past else None, poses.root, poses.lbs)
+
+
+def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
+    points = world.permute(2, 0, 1).cpu().numpy()
+    figures = [
+        values.tolist() for values in (solution.energy, solution.residual, solution.iterations, solution.fixed)
+    ]
+    for span, x, *found in zip(spans, points, *figures):
+        yield SimulatedFrame(span.shot, span.first + frame, x, *found)
+
+
+def simulate(
+    scene: Scene,
+    fabric: Fabric,
+    motions: Sequence[Motion],
+    options: SimulationOptions | None = None,
+    *,
+    device: torch.device | str = "cpu",
+    report: Reporter = silent,
+) -> list[Floats]:
+    """Return the garment's vertices over each motion, at `options.fps`, in world space [m], each (frames, V, 3).
+
+    Raises:
+        SsilkError: no motion, no body, or a state whose energy is not finite.
+    """
+    if not motions:
+        fail("simulation", "no motion given", "at least one is needed")
+    simulator = Simulator(scene, fabric, options, device=device, report=report)
+    counts = [shot.frame_count for shot in shots_of(motions, simulator.options)]
+    points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]
+    told = Countdown(sum(counts), report)
+    for frame in simulator.frames(motions):
+        points[frame.shot][frame.number] = frame.points
+        told()
+    return points
+
+
+def shots_of(motions: Sequence[Motion], options: SimulationOptions) -> list[Motion]:
+    """Return the motions sampled at the frames of their simulated shots."""
+    spans = [split_into_spans(motion, 0, options.fps, options.substeps) for motion in motions]
+    return [join_spans(motion, parts) for motion, parts in zip(motions, spans)]
+
+
+def quasi_static_states(
+    scene: Scene,
+    fabric: Fabric,
+    motion: Motion,
+    options: SimulationOptions | None = None,
+    *,
+    device: torch.device | str = "cpu",
+) -> Floats:
+    """Return the quasi-static garment of each pose of a motion, in world space [m], shape (F, V, 3)."""
+    simulator = Simulator(scene, fabric, options, device=device)
+    poses = simulator.poser.pose(motion.rotations, motion.translations)
+    solution = simulator.quasi_static(poses, poses.lbs)
+    return (solution.x.double() + poses.root).permute(2, 0, 1).cpu().numpy()

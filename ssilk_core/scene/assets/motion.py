@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Animations of a character's joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...errors import fail
+from .arrays import Floats, assign, frozen, need_finite
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """An animation of the character's joints at a constant rate.
+
+    Attributes:
+        path: source of the motion, for messages.
+        fps: frames per second [1/s].
+        rotations: local joint rotations, unit quaternions (w, x, y, z), shape (F, J, 4).
+        translations: local joint translations [m], shape (F, J, 3); roots are in world space.
+        start: index of the first frame, counted from time zero at `fps`; it begins at `start / fps` seconds.
+    """
+
+    path: str
+    fps: float
+    rotations: Floats
+    translations: Floats
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        rotations, translations = frozen(self.rotations, np.float64), frozen(self.translations, np.float64)
+        if not (np.isfinite(self.fps) and self.fps > 0):
+            fail(self.path, f"a rate of {self.fps} frames per second", "the rate must be positive")
+        if not (rotations.ndim == 3 and rotations.shape[-1] == 4 and translations.shape == (*rotations.shape[:2], 3)):
+            fail(
+                self.path,
+                f"rotations of shape {rotations.shape} and translations of shape {translations.shape}",
+                "(frames, joints, 4) and (frames, joints, 3) are needed",
+            )
+        if not len(rotations) > 0:
+            fail(self.path, "the motion has no frames", "at least one is needed")
+        need_finite(rotations, self.path, "frames of rotations")
+        need_finite(translations, self.path, "frames of translations")
+        norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
+        if not norms.min() > 1e-6:
+            fail(self.path, "a rotation is the zero quaternion", "rotations are unit quaternions")
+        assign(self, rotations=frozen(rotations / norms, np.float64), translations=translations)
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.rotations)
+
+    def clip(self, start: int, stop: int) -> Motion:
+        """Return frames `start` (inclusive) to `stop` (exclusive) as a separate motion."""
+        return replace(
+            self,
+            rotations=self.rotations[start:stop],
+            translations=self.translations[start:stop],
+            start=self.start + start,
+        )

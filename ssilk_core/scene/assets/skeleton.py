@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints of a character."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import fail
+from .arrays import Floats, Ints, assign, frozen, need_finite
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """Joints of a character, parents before children.
+
+    Attributes:
+        path: source of the skeleton, for messages.
+        joint_names: UsdSkel joint paths ("Hips/Spine"), length J.
+        parents: index of each joint's parent, -1 for roots, shape (J,).
+        bind_transforms: joint to world at the bind pose, rigid, shape (J, 4, 4).
+        rest_transforms: joint to parent at rest (world for roots), rigid, shape (J, 4, 4).
+    """
+
+    path: str
+    joint_names: tuple[str, ...]
+    parents: Ints
+    bind_transforms: Floats
+    rest_transforms: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.joint_names)
+        if not count > 0:
+            fail(self.path, "the skeleton has no joints", "at least one is needed")
+        if len(set(self.joint_names)) != count:
+            fail(self.path, "joint names repeat", "each joint needs its own name")
+        assign(
+            self,
+            joint_names=tuple(self.joint_names),
+            parents=frozen(self.parents, np.int32),
+            bind_transforms=frozen(self.bind_transforms, np.float64),
+            rest_transforms=frozen(self.rest_transforms, np.float64),
+        )
+        if self.parents.shape != (count,):
+            fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
+        bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
+        if bad.size != 0:
+            fail(
+                self.path,
+                f"joint '{self.joint_names[bad[0]] if bad.size else ''}' precedes its parent",
+                "parents must come first, and a joint must not be its own ancestor",
+                "reorder the joints",
+            )
+        check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
+        check_rigid(self.rest_transforms, self.path, "rest transform", self.joint_names)
+
+    @property
+    def joint_count(self) -> int:
+        return len(self.joint_names)
+
+
+def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:
+    """Raise `SsilkError` unless every (4, 4) matrix is a proper rotation and a translation (to 1e-3)."""
+    if transforms.shape != (len(names), 4, 4):
+        fail(
+            where,
+            f"{what}s of shape {transforms.shape}",
+            f"({len(names)}, 4, 4) is needed, one matrix for each joint",
+        )
+    need_finite(transforms, where, f"{what}s")
+    linear = transforms[:, :3, :3]
+    error = np.abs(linear @ linear.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    bad = np.flatnonzero((error > 1e-3) | (np.linalg.det(linear) < 0))
+    if bad.size != 0:
+        fail(
+            where,
+            f"the {what} of joint '{names[bad[0]] if bad.size else ''}' scales, shears or mirrors",
+            "joints may only rotate and move",
+            "apply the scale to the rig and export again",
+        )

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motions of a training run or evaluation as tensors on one device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..errors import fail
+from ..network.descriptors import pose_features
+from ..network.model.descriptors import gravity_features
+from ..scene.assets import Motion, Skeleton
+from ..scene.kinematics import centred_matrices, resample, split_at_cuts
+
+
+@dataclass(frozen=True, eq=False)
+class MotionBank:
+    """Concatenated motions at the model's rate.
+
+    Attributes:
+        matrices: skinning matrices of every frame, shape (F, J * 12), translated so that each clip's root starts at
+            the origin, where single precision is finest.
+        root: position of the first joint in the same coordinates [m], shape (F, 3).
+        static, dynamic, down: see `descriptors.PoseFeatures`.
+        starts, stops: first frame and end of each clip, shape (clips,).
+    """
+
+    matrices: Tensor
+    root: Tensor
+    static: Tensor
+    dynamic: Tensor
+    down: Tensor
+    starts: Tensor
+    stops: Tensor
+
+    @property
+    def frame_count(self) -> int:
+        return len(self.static)
+
+    @property
+    def joint_count(self) -> int:
+        return self.matrices.shape[1] // 12
+
+    def character(self, frames: Tensor) -> Tensor:
+        """Return skinning matrices (J, 3, 4, N) of frame indices (N,)."""
+        return self.matrices[frames].T.reshape(-1, 3, 4, len(frames))
+
+    def static_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,) under unit gravity directions (N, 3)."""
+        return torch.cat([self.static[frames], gravity_features(self.down[frames], direction)], dim=1)
+
+    def dynamic_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
+        """Return dynamic descriptors (N, D) of frames (N,) under unit gravity directions (N, 3)."""
+        return torch.cat([self.static_descriptor(frames, direction), self.dynamic[frames]], dim=1)
+
+
+def build_bank(
+    motions: Sequence[Motion],
+    skeleton: Skeleton,
+    joints: np.ndarray,
+    fps: float,
+    device: torch.device,
+    *,
+    max_joint_speed: float = np.inf,
+) -> MotionBank:
+    """Resample the spans of `usable_spans` to `fps` and copy them to a device.
+
+    Raises:
+        SsilkError: there is no motion.
+    """
+    if not motions:
+        fail("motions", "none given", "at least one is needed", "name motion files with --motions")
+    spans = usable_spans(motions, fps, max_joint_speed)
+    if not spans:
+        fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
+    # In single precision clip by clip: a large bank in double precision does not fit a host.
+    parts = [_arrays(resample(span, fps), skeleton, joints) for span in spans]
+    ends = np.cumsum([len(part["root"]) for part in parts])
+    starts = np.concatenate([[0], ends[:-1]])
+
+    def joined(name: str) -> Tensor:
+        return torch.as_tensor(np.concatenate([part.pop(name) for part in parts]), device=device)
+
+    return MotionBank(
+        **{name: joined(name) for name in [*parts[0]]},
+        starts=torch.as_tensor(starts, device=device),
+        stops=torch.as_tensor(ends, device=device),
+    )
+
+
+def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
+    features, matrices = pose_features(clip, skeleton, joints), centred_matrices(clip, skeleton)[0]
+    root = matrices[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + matrices[:, 0, :3, 3]
+    values = {
+        "matrices": matrices[:, :, :3].reshape(len(matrices), -1),
+        "root": root,
+        "static": features.static,
+        "dynamic": features.dynamic,
+        "down": features.down,
+    }
+    return {name: value.astype(np.float32) for name, value in values.items()}
+
+
+def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float = np.inf) -> list[Motion]:
+    """Return the clips of a bank: spans between cuts with at least four frames at `fps`.
+
+    Motions are cut where the root jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
+    """
+    spans = [span for motion in motions for span in split_at_cuts(motion, max_joint_speed=max_joint_speed)]
+    return [span for span in spans if (span.frame_count - 1) * fps >= 3 * span.fps]
+
+
+class LatentModel(Protocol):
+    """A model that can be scored: `GarmentModel`, or another with states of shape (N, S) and these methods."""
+
+    def initial(self, static: Tensor) -> Tensor: ...
+
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]: ...
+
+    def vertices(self, z: Tensor, character: Tensor, /) -> Tensor: ...
+
+
+@torch.no_grad()
+def roll_states(model: LatentModel, bank: MotionBank, clips: Sequence[range], down: Tensor) -> list[Tensor]:
+    """Roll out a model over ranges of a bank in parallel, each from its quasi-static start.
+
+    Returns:
+        For each range its states, shape (frames, latent).
+    """
+    offset = torch.arange(max(map(len, clips)), device=down.device)[:, None]
+    first, last = (torch.tensor([clip[end] for clip in clips], device=down.device) for end in (0, -1))
+    frames = torch.minimum(first + offset, last)  # shorter ranges repeat their last frame
+    direction = down.expand(frames.numel(), 3)
+    static = bank.static_descriptor(frames.reshape(-1), direction)
+    pose = bank.dynamic_descriptor(frames.reshape(-1), direction)
+    rest, pose = (values.reshape(*frames.shape, -1) for values in (model.initial(static), pose))
+    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:]))
+    return [states[: len(clip), index] for index, clip in enumerate(clips)]

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read wardrobe lists: TOML files with defaults and one table for each garment to train."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...errors import fail
+from ...scene.fabrics import FABRICS
+from ..settings import PRESETS
+
+DEFAULTS = "defaults"  # the table whose keys every garment inherits
+TABLES = ("material", "set")  # keys whose values are merged with those of the defaults
+
+
+@dataclass(frozen=True)
+class WardrobeEntry:
+    """A garment of a list: its name, and its arguments for 'ssilk train'."""
+
+    name: str
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Key:
+    """Allowed values of a key, and its option of 'ssilk train'; "" for a positional argument."""
+
+    option: str
+    fits: Callable[[Any], bool]
+    allowed: str
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value != ""
+
+
+def _is_texts(value: Any) -> bool:
+    return _is_text(value) or (isinstance(value, list) and value != [] and all(map(_is_text, value)))
+
+
+def _is_scalars(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(item, str | int | float | list) for item in value.values())
+
+
+KEYS = {
+    "stage": Key("", _is_text, "the path of a stage"),
+    "garment": Key("--garment", _is_text, "a path, a path:/prim or a prim"),
+    "motions": Key("--motions", _is_texts, "a path or a list of paths"),
+    "valid": Key("--valid", _is_texts, "a path or a list of paths"),
+    "preset": Key("--preset", lambda value: value in [*PRESETS], f"one of {', '.join(PRESETS)}"),
+    "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
+    "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
+    "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
+}
+NEEDED = ("stage", "motions")
+
+
+def read_list(path: Path) -> list[WardrobeEntry]:
+    """Read the garments of a list, in order; paths in it are relative to its folder.
+
+    Raises:
+        SsilkError: the file is missing or not TOML, or an entry is wrong.
+    """
+    if not path.is_file():
+        fail(str(path), "there is no such file", "a TOML file with one table for each garment is needed")
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        fail(str(path), f"not a TOML file ({error})", "a list holds one table for each garment")
+    for name, table in tables.items():
+        _need_table(path, name, table)
+    defaults = tables.pop(DEFAULTS, {})
+    if not tables:
+        fail(str(path), "no garment in it", "a list holds one table for each garment", "add [name]")
+    return [WardrobeEntry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
+
+
+def _need_table(path: Path, name: str, table: Any) -> None:
+    """Raise `SsilkError` unless a name is a valid file name and its table has known keys with valid values."""
+    if not isinstance(table, dict):
+        fail(
+            f"{path}: key '{name}'",
+            "it belongs to no table",
+            f"each key belongs to [{DEFAULTS}] or to the table of a garment",
+        )
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        fail(
+            f"{path}: table '{name}'",
+            "its name would be the name of files",
+            "letters, digits, '_', '-' and '.' are allowed",
+        )
+    for key, value in table.items():
+        where = f"{path}: table '{name}', key '{key}'"
+        if key not in KEYS:
+            fail(where, "no such key", f"keys are {', '.join(KEYS)}")
+        if not KEYS[key].fits(value):
+            fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed")
+
+
+def _joined(defaults: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:
+    both = {key: {**defaults.get(key, {}), **table.get(key, {})} for key in TABLES}
+    return {**defaults, **table, **both}
+
+
+def _words(path: Path, name: str, table: dict[str, Any]) -> tuple[str, ...]:
+    for key in NEEDED:
+        if key not in table:
+            fail(f"{path}: table '{name}', key '{key}'", "missing", f"it is needed here or in [{DEFAULTS}]")
+    said = [(key.option, table[name]) for name, key in KEYS.items() if name in table]
+    return tuple(word for option, value in said for word in _option(option, value))
+
+
+def _option(option: str, value: Any) -> list[str]:
+    """Return an option and its value as command-line arguments."""
+    if isinstance(value, dict):
+        return [word for name, item in value.items() for word in (option, f"{name}={_text(item)}")]
+    return [*filter(None, [option]), *(value if isinstance(value, list) else [str(value)])]
+
+
+def _text(value: Any) -> str:
+    """Format a value for "name=value"."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)

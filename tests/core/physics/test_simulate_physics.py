@@ -1,0 +1,305 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The reference simulator against closed forms: what falls, hangs, stretches, swings and is braked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.errors import SsilkError
+from ssilk_core.events import Progress
+from ssilk_core.physics.simulate import SimulationOptions, Simulator, quasi_static_states, shots_of, simulate
+from ssilk_core.physics.simulate.characters import split_into_spans
+from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
+from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Garment, Mesh, Motion, ProxyRig, Scene, SkinWeights
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
+
+CPU = torch.device("cpu")
+G = 9.81
+EXACT = SolverOptions(tolerance=1e-7, iterations=200)
+CALM = Fabric("calm", drag=0.0, bending=0.0)
+
+
+def dressed(scene: Scene, points: np.ndarray, faces: np.ndarray, pinned: np.ndarray) -> Scene:
+    """The character of a scene in another garment, which hangs from its first joint."""
+    skin = SkinWeights("/cloth", np.zeros((len(points), 1), dtype=int), np.ones((len(points), 1)))
+    garment = Garment(Mesh("/cloth", points, faces), skin, np.where(pinned, PINNED, LOOSE))
+    rig = ProxyRig("/cloth", (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), skin)
+    return replace(scene, garment=garment, rig=rig)
+
+
+def advance(
+    potential: IncrementalPotential,
+    x0: torch.Tensor,
+    velocity: torch.Tensor,
+    dt: float,
+    steps: int,
+    gravity: float = G,
+) -> torch.Tensor:
+    """Positions (V, 3, steps + 1) of implicit Euler without a body, in still air."""
+    path = [x0 - dt * velocity, x0]
+    down = torch.tensor([[0.0], [-gravity], [0.0]], dtype=torch.float64)
+    for _ in range(steps):
+        inputs = StepInputs(None, down, 2 * path[-1] - path[-2], path[-1], dt)
+        path.append(minimise_from(potential, path[-1], inputs, EXACT).x)
+    return torch.cat(path[1:], dim=-1)
+
+
+def tensor(points: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(np.array(points))[:, :, None]
+
+
+def test_what_is_free_falls_along_the_parabola_of_implicit_euler(scene, toy_grid) -> None:
+    points, faces = toy_grid(5, 3)
+    potential = IncrementalPotential(dressed(scene, points, faces, np.zeros(15, dtype=bool)), CALM, device=CPU)
+    x0, velocity, dt = tensor(points), torch.tensor([0.3, 2.0, -0.1], dtype=torch.float64)[:, None], 1 / 30
+    path = advance(potential, x0, velocity, dt, 10)
+    n = torch.arange(11, dtype=torch.float64)
+    fall = torch.tensor([0.0, -G, 0.0], dtype=torch.float64)[:, None] * dt**2 * n * (n + 1) / 2
+    torch.testing.assert_close(path, x0 + velocity * n * dt + fall, rtol=0, atol=1e-6)
+
+
+def test_a_strip_hangs_as_a_column_under_its_own_weight(scene, toy_grid) -> None:
+    # Without lateral coupling (lambda = 0) the tension at s from the lower end is
+    # rho g s = l mu (l^2 - 1) with the stretch l: its integral is the length.
+    length, mu, density = 0.6, 20.0, 1.0
+    points, faces = toy_grid(25, 3, height=length, width=0.06)
+    cloth = dressed(scene, points, faces, points[:, 1] > -1e-9)
+    fabric = replace(CALM, density=density, lame_mu=mu, lame_lambda=0.0)
+    potential = IncrementalPotential(cloth, fabric, device=CPU)
+    down = torch.tensor([[0.0], [-G], [0.0]], dtype=torch.float64)
+    found = minimise_from(potential, tensor(points), StepInputs(None, down), SolverOptions(tolerance=1e-5))
+    assert found.residual < 1e-5
+    s = (np.arange(4000) + 0.5) / 4000 * length
+    stretch = np.array([max(np.roots([mu, 0, -mu, -density * G * t]).real) for t in s])
+    assert stretch.max() > 1.1
+    lowest = -float(found.x[:, 1].min())
+    assert lowest == pytest.approx(stretch.mean() * length, rel=3e-3)
+
+
+def test_tethered_cloth_sags_by_its_weight_over_the_stiffness(scene: Scene, toy_grid) -> None:
+    points, faces = toy_grid(7, 7, height=0.3, width=0.3)
+    cloth = dressed(scene, points, faces, np.zeros(len(points), dtype=bool))
+    tight = replace(cloth, garment=replace(cloth.garment, classes=np.full(len(points), TIGHT)))
+    potential = IncrementalPotential(tight, replace(CALM, tether=500.0), device=CPU)
+    down = torch.tensor([[0.0], [-G], [0.0]], dtype=torch.float64)
+    inputs = StepInputs(None, down, skinned=tensor(points))
+    found = minimise_from(potential, tensor(points), inputs, EXACT)
+    sag = CALM.density * G / 500.0
+    torch.testing.assert_close(found.x, tensor(points - [0, sag, 0]), rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("model", ["stvk", "baraff_witkin"])
+def test_a_sheet_stretched_at_its_border_is_stretched_evenly(scene, toy_grid, model) -> None:
+    points, faces = toy_grid(7, 7, height=0.3, width=0.3)
+    border = (np.abs(points[:, 0]) > 0.1499) | (points[:, 1] > -1e-9) | (points[:, 1] < -0.2999)
+    potential = IncrementalPotential(
+        dressed(scene, points, faces, border), replace(CALM, stretch_model=model), device=CPU
+    )
+    stretched = points * [1.2, 1.1, 1.0]
+    start = tensor(np.where(border[:, None], stretched, points))
+    found = minimise_from(potential, start, StepInputs(None, torch.zeros(3, 1).double()), EXACT)
+    torch.testing.assert_close(found.x, tensor(stretched), rtol=0, atol=1e-6)
+
+
+def swing(scene: Scene, dt: float, seconds: float, angle: float = 0.02) -> tuple[np.ndarray, float]:
+    """The angles [rad] of one weight on a triangle hung by its upper edge, at rest first, and its frequency [1/s]."""
+    length = 0.5
+    points = np.array([[-0.2, 0, 0], [0.2, 0, 0], [0, -length, 0]])
+    cloth = dressed(scene, points, np.array([[0, 2, 1]]), np.array([True, True, False]))
+    potential = IncrementalPotential(cloth, replace(CALM, lame_mu=1e5, lame_lambda=0.0), device=CPU)
+    x0 = tensor(points).clone()
+    x0[2, :, 0] = torch.tensor([0, -length * np.cos(angle), length * np.sin(angle)])
+    path = advance(potential, x0, torch.zeros(3, 1), dt, round(seconds / dt))[2].numpy()
+    return np.arctan2(path[2], -path[1]), np.sqrt(G / length)
+
+
+def test_a_pendulum_swings_with_the_period_and_damping_of_implicit_euler(scene) -> None:
+    # x'' = -w^2 x under implicit Euler: a step multiplies by 1 / (1 - i w dt), turning by atan(w dt).
+    dt = 1 / 120
+    angles, frequency = swing(scene, dt, 1.9)
+    crossings = np.flatnonzero(np.diff(np.sign(angles)))
+    at = crossings + angles[crossings] / (angles[crossings] - angles[crossings + 1])
+    half = np.pi / np.arctan(frequency * dt)
+    assert np.diff(at) == pytest.approx(half, rel=2e-3)
+    decay = (1 + (frequency * dt) ** 2) ** -0.5
+    peaks = [np.abs(angles[a:b]).max() for a, b in pairwise(crossings)]
+    assert peaks[1] / peaks[0] == pytest.approx(decay**half, rel=1e-2)
+
+
+def test_the_error_in_time_is_of_first_order(scene) -> None:
+    errors = []
+    for dt in (1 / 60, 1 / 120, 1 / 240):
+        angles, frequency = swing(scene, dt, 0.5)
+        errors.append(abs(angles[-1] - 0.02 * np.cos(frequency * 0.5)))
+    assert errors[0] / errors[1] == pytest.approx(2, abs=0.25)
+    assert errors[1] / errors[2] == pytest.approx(2, abs=0.15)
+
+
+def bounced(scene: Scene, toy_grid, dt: float, seconds: float) -> np.ndarray:
+    """Kinetic and elastic energy [J] of a strip that was drawn out by a twentieth and let go, step by step."""
+    points, faces = toy_grid(5, 2)
+    potential = IncrementalPotential(dressed(scene, points, faces, points[:, 1] > -1e-9), CALM, device=CPU)
+    x0 = tensor(points * [1.0, 1.05, 1.0])
+    path = advance(potential, x0, torch.zeros(3, 1), dt, round(seconds / dt), gravity=0.0)
+    speed = path.diff(dim=-1) / dt
+    kinetic = (0.5 * potential.mass * (speed * speed).sum(1)).sum(0)
+    return (kinetic + potential.membrane.energy(path[..., 1:])).numpy()
+
+
+def test_energy_never_grows_and_less_is_lost_with_shorter_steps(scene, toy_grid) -> None:
+    start = None
+    left = []
+    for dt in (1 / 120, 1 / 360, 1 / 1080):
+        energy = bounced(scene, toy_grid, dt, 0.05)
+        start = energy[0] if start is None else start
+        assert (np.diff(energy) <= 1e-9 * energy[0]).all() and energy[-1] > 0
+        left.append(energy[-1] / start)
+    assert left[0] < left[1] < left[2] and left[0] < 0.5 < left[2]
+
+
+def test_drag_only_decays_motion(scene, toy_grid) -> None:
+    points, faces = toy_grid(5, 3)
+    fabric = replace(CALM, drag=0.6)
+    potential = IncrementalPotential(dressed(scene, points, faces, np.zeros(15, dtype=bool)), fabric, device=CPU)
+    velocity, dt = torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64)[:, None], 1 / 30
+    path = advance(potential, tensor(points), velocity, dt, 12, gravity=0.0)
+    speeds = path.diff(dim=-1).mean(0) / dt
+    n = torch.arange(1, 13, dtype=torch.float64)
+    torch.testing.assert_close(speeds, velocity / (1 + fabric.drag / fabric.density * dt) ** n, rtol=1e-5, atol=1e-7)
+
+
+# --- whole shots of the toy character ---------------------------------------------------------------------------
+
+SHORT = SimulationOptions(
+    solver=SolverOptions(tolerance=1e-5), quasi_static_solver=SolverOptions(tolerance=1e-4, iterations=200)
+)
+CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
+
+
+def test_a_batch_of_shots_equals_one_by_one(scene, toy_motion) -> None:
+    motions = [toy_motion(scene, 4), toy_motion(scene, 2, speed=1.5), toy_motion(scene, 6, fps=60.0)]
+    together = simulate(scene, CLOTH, motions, SHORT)
+    assert [len(points) for points in together] == [4, 2, 3]
+    for motion, points in zip(motions, together):
+        (alone,) = simulate(scene, CLOTH, [motion], SHORT)
+        np.testing.assert_allclose(points, alone, atol=2e-5)
+
+
+def test_more_substeps_approach_a_limit_at_first_order(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 4)
+    quiet = replace(CLOTH, bending=0.05, drag=2.0)  # stiff and slow enough not to buckle one way or the other
+    found = [simulate(scene, quiet, [motion], replace(SHORT, substeps=n))[0][-1] for n in (1, 2, 4)]
+    steps = [float(np.sqrt(((a - b) ** 2).sum(-1).mean())) for a, b in pairwise(found)]
+    assert steps[1] > 1e-4 and steps[0] / steps[1] > 1.5
+
+
+def test_progress_counts_every_frame_of_every_shot(scene, toy_motion) -> None:
+    told: list = []
+    simulate(scene, CLOTH, [toy_motion(scene, 3), toy_motion(scene, 2)], SHORT, report=told.append)
+    counts = [(event.done, event.total) for event in told if isinstance(event, Progress)]
+    assert counts[-5:] == [(n, 5) for n in range(1, 6)]
+    assert {total for _, total in counts[:-5]} == {200}  # of the search for the rest state
+
+
+def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 3, fps=60.0)
+    options = replace(SHORT, substeps=2)
+    (points,) = simulate(scene, CLOTH, [motion], options)
+    (shot,) = shots_of([motion], options)
+    skeleton = scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(shot, skeleton.parents), skeleton.bind_transforms)
+    lbs = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)
+    pinned = scene.classes == PINNED
+    np.testing.assert_allclose(points[:, pinned], lbs[:, pinned], atol=1e-9)
+    assert np.abs(points - lbs)[:, ~pinned].max() > 0.01
+
+
+def test_a_shot_has_the_frames_of_its_motion(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 40, fps=120.0)
+    for fps, substeps in ((30.0, 1), (24.0, 3), (120.0, 2)):
+        expected = resample(motion, fps)
+        (shot,) = shots_of([motion], SimulationOptions(fps=fps, substeps=substeps))
+        assert shot.fps == fps and shot.frame_count == expected.frame_count
+        np.testing.assert_allclose(shot.translations, expected.translations, atol=1e-12)
+        np.testing.assert_allclose(np.abs((shot.rotations * expected.rotations).sum(-1)), 1, atol=1e-12)
+
+
+def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 5)
+    moved = motion.translations.copy()
+    moved[3:, 0] += [20.0, 0.0, 0.0]
+    cut = replace(motion, translations=moved)
+    first, second = split_into_spans(cut, 0, 30.0, 1)
+    assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 3, 3, 2)
+    (points,) = simulate(scene, CLOTH, [cut], SHORT)
+    (alone,) = simulate(scene, CLOTH, [cut.clip(3, 5)], SHORT)
+    np.testing.assert_allclose(points[3:], alone, atol=1e-3)  # what the tolerance leaves a quasi-static state
+
+
+def test_sequences_are_simulated_as_shots_of_their_own(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 5)
+    (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=3))
+    (second,) = simulate(scene, CLOTH, [motion.clip(3, 5)], SHORT)
+    np.testing.assert_allclose(points[3:], second, atol=1e-3)
+    (whole,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=50))
+    np.testing.assert_allclose(points[:3], whole[:3], atol=1e-3)
+    assert np.abs(points[3:] - whole[3:]).max() > 5e-3  # it comes swinging there
+
+
+def test_a_garment_comes_to_rest_with_its_character(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 8, speed=2.0)
+    held = np.r_[np.arange(8), np.full(22, 7)]
+    stopped = Motion("/stop", 30.0, motion.rotations[held], motion.translations[held])
+    options = SimulationOptions(solver=SolverOptions(tolerance=1e-3))
+    (points,) = simulate(scene, replace(CLOTH, drag=2.0), [stopped], options)
+    speed = np.linalg.norm(np.diff(points, axis=0), axis=2).mean(1) * 30
+    assert speed[5:8].max() > 0.5 and speed[-1] < 0.02
+
+
+def test_a_quasi_static_pose_hangs_lower_than_plain_skinning(scene, toy_motion) -> None:
+    poses = toy_motion(scene, 3)
+    points = quasi_static_states(scene, CLOTH, poses, SHORT)
+    simulator = Simulator(scene, CLOTH, SHORT)
+    at = simulator.poser.pose(poses.rotations, poses.translations)
+    inputs = StepInputs(at.body, simulator.gravity.expand(3, 3))
+    x = torch.as_tensor(points.transpose(1, 2, 0)) - at.root
+    energies = [
+        simulator.potential.energy(y, inputs, simulator.potential.body_distance(y, inputs)) for y in (x, at.lbs)
+    ]
+    assert (energies[0] < energies[1]).all()
+
+
+def test_single_precision_stays_close(scene, toy_motion) -> None:
+    motion = toy_motion(scene, 3)
+    (double,) = simulate(scene, CLOTH, [motion], SHORT)
+    held = SolverOptions(tolerance=1e-3)  # rounding lets a state without inertia come no nearer
+    options = replace(SHORT, precision="float32", solver=SolverOptions(tolerance=1e-2), quasi_static_solver=held)
+    (single,) = simulate(scene, CLOTH, [motion], options)
+    assert np.abs(single - double).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"fps": 0.0}, "positive rate"),
+        ({"substeps": 0}, "1 to 1000"),
+        ({"precision": "float16"}, "float64 or float32"),
+        ({"gravity": (0.0, np.nan, 0.0)}, "finite"),
+        ({"batch": 0}, "at least 1"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(change, words) -> None:
+    with pytest.raises(SsilkError, match=words):
+        SimulationOptions(**change)
+
+
+def test_no_motion_is_refused(scene) -> None:
+    with pytest.raises(SsilkError, match="no motion given"):
+        simulate(scene, CLOTH, [])

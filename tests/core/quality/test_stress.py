@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The instrument for extremes: every case on a toy model, and each of its parts against closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import ModelFile
+from ssilk_core.quality.stress import drives, measures, meter, worlds
+from ssilk_core.quality.stress.cases import CASES, Case
+from ssilk_core.quality.stress.outcome import CaseMeasurement, markdown
+from ssilk_core.quality.stress.subject import Effort, StressSubject
+from ssilk_core.quality.stress.trials import gradient_error, train_trial
+from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import motion_transforms, split_at_cuts
+
+TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=20)
+FABRIC = Fabric("toy", bending=1e-4)
+
+
+@pytest.fixture(scope="module")
+def subject(scene, toy_model) -> StressSubject:
+    model = toy_model(scene, scale=0.1)
+    parameters = {name: value.detach().numpy() for name, value in model.named_parameters()}
+    return StressSubject(ModelFile(scene, model.config, FABRIC, model.joints, parameters), scene, None, TINY)
+
+
+@pytest.fixture(scope="module")
+def base(scene) -> drives.ProceduralMotion:
+    return drives.sway(scene.character.skeleton, 30.0).with_loops(1.0)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.group}: {case.name}")
+def test_the_product_does_what_it_may(subject, case):
+    outcome = case.run(subject)
+    assert outcome.verdict in case.allowed, outcome.said
+    if outcome.verdict == "refuses":
+        assert outcome.said.endswith(".") and "\n" not in outcome.said
+    else:
+        found = outcome.measured.extent
+        assert found.finite and 0 <= found.distance <= found.allowed and found.latent <= 4.001
+        assert len(outcome.row()) == markdown([outcome]).splitlines()[0].count("|") - 1
+
+
+def test_names_are_unique_and_match():
+    names = [f"{case.group}: {case.name}" for case in CASES]
+    assert len(set(names)) == len(names)
+    assert [case.name for case in CASES if case.matches(["size:"])] == ["0.001 m", "100 m"]
+
+
+@pytest.mark.parametrize("points", [np.nan, 1e3])
+def test_what_leaves_all_bounds_is_a_fault(subject, monkeypatch, points):
+    monkeypatch.setattr(meter, "decode", lambda model, motion, pose: np.full((pose.frame_count, 60, 3), points))
+    outcome = Case("motion", "none", measures.roll_out_motion(lambda subject, base: base)).run(subject)
+    assert outcome.verdict == "breaks" and not outcome.measured.extent.bounded
+
+
+def test_what_raises_is_a_fault_and_what_is_refused_is_none(subject):
+    def stumbles(subject: StressSubject) -> CaseMeasurement:
+        raise RuntimeError("numbers ran out\nmore")
+
+    assert Case("", "", stumbles).run(subject).said == "RuntimeError: numbers ran out"
+    nan = next(case for case in CASES if "NaN" in case.name).run(subject)
+    assert nan.verdict == "refuses" and "first number 7" in nan.said
+
+
+def test_a_lost_rollout_falls_back(subject):
+    lost = replace(
+        subject,
+        file=replace(subject.file, config=replace(subject.file.config, latent_bound=0.0, max_latent_step=0.0)),
+    )
+    lost.file.parameters["integrator.beta"] = np.full(lost.file.config.latent, -3.0, dtype=np.float32)
+    outcome = Case("motion", "none", measures.roll_out_motion(lambda subject, base: base), ("falls back",)).run(lost)
+    assert outcome.verdict == "falls back" and outcome.measured.extent.recovered > 10
+
+
+# Motions
+
+
+def test_drives_are_the_same_in_blocks_and_repeat(base):
+    whole = base.motion()
+    parts = list(base.blocks(7))
+    np.testing.assert_array_equal(whole.rotations, np.concatenate([part.rotations for part in parts]))
+    length = round(base.loop * base.fps)
+    np.testing.assert_allclose(whole.rotations[:length], whole.rotations[length : 2 * length], atol=1e-12)
+    assert whole.frame_count == 3 * length + 1
+
+
+def test_a_clip_loops_there_and_back_at_its_own_speed(scene, toy_motion):
+    clip = toy_motion(scene, 61, 30.0)
+    loop = drives.loop_clip(clip, 30.0)
+    length = round(loop.loop * 30)
+    motion = replace(loop, frames=2 * length + 1).motion()
+    assert length == round(np.pi * 60)
+    np.testing.assert_allclose(motion.translations[length], clip.translations[0], atol=1e-9)
+    np.testing.assert_allclose(motion.translations[length // 2], clip.translations[60], atol=1e-3)
+    np.testing.assert_allclose(motion.translations[1:length], motion.translations[1:length][::-1], atol=1e-9)
+
+
+def test_a_turn_turns_everything_about_the_first_joint(scene, base):
+    skeleton = scene.character.skeleton
+    spun = drives.rotate_character(base, skeleton, drives.about((0, 1, 0), speed=30.0)).motion(0, 5)
+    before, after = (motion_transforms(motion, skeleton.parents) for motion in (base.motion(0, 5), spun))
+    angle = 30.0 * np.arange(5) / 30
+    turn = np.zeros((5, 1, 3, 3))
+    turn[:, 0, 1, 1], turn[:, 0, 0, 0], turn[:, 0, 2, 2] = 1, np.cos(angle), np.cos(angle)
+    turn[:, 0, 0, 2], turn[:, 0, 2, 0] = np.sin(angle), -np.sin(angle)
+    np.testing.assert_allclose(after[..., :3, :3], turn @ before[..., :3, :3], atol=1e-12)
+    arms = before[..., :3, 3] - before[:, :1, :3, 3]
+    moved = before[:, :1, :3, 3] + (turn @ arms[..., None])[..., 0]
+    np.testing.assert_allclose(after[..., :3, 3], moved, atol=1e-12)
+
+
+def test_rides_are_no_cuts_and_teleports_are(scene, base):
+    skeleton = scene.character.skeleton
+    ride = drives.translate_character(base, measures.ride, skeleton).motion()
+    steps = np.diff(ride.translations[:, 0, 0] - base.motion().translations[:, 0, 0])
+    np.testing.assert_allclose(steps * 30, 50.0)
+    assert len(split_at_cuts(ride)) == 1
+    assert (
+        len(split_at_cuts(drives.translate_character(base, measures.jumps, skeleton).motion())) == 13
+    )  # after each of 12 s
+
+
+def test_stopped_contorted_and_broken_motions_are_what_they_say(scene, base):
+    skeleton = scene.character.skeleton
+    held = drives.freeze_after(base, 0.5).motion().rotations
+    assert np.ptp(held[15:], axis=0).max() == 0 < np.ptp(held[:15], axis=0).max()
+    wild = drives.randomize_rotations(base, skeleton, 0.5).motion()
+    roots = skeleton.parents < 0
+    np.testing.assert_array_equal(wild.rotations[:, roots], base.motion().rotations[:, roots])
+    assert np.abs((wild.rotations[0] * wild.rotations[15]).sum(-1))[~roots].min() < 0.9
+    with pytest.raises(SsilkError, match="1 of 361 frames of rotations hold NaN or infinity, first number 7;"):
+        drives.insert_nan(base, 7).motion()
+
+
+# What is measured
+
+
+def test_a_garment_on_linear_blend_skinning_is_nowhere_else_and_moves_as_it_does(scene, base):
+    """Pinned to a root that spins, a vertex at a distance r from the axis moves at r w."""
+    held = drives.rotate_character(
+        drives.freeze_after(base, 0.0), scene.character.skeleton, drives.about((0, 1, 0), speed=6.0)
+    )
+    motion = held.motion(0, 20)
+    matrices, origin = meter.matrices_about_root(motion, scene)
+    tool = meter.ExtentMeter(scene, FABRIC, 30.0, [range(1, 5), range(10, 20)])
+    lbs = tool.skin(tool.rest, None, tool.skin.weights, matrices).permute(2, 0, 1).numpy() + origin
+    tool.add(motion, lbs)
+    radius = np.linalg.norm((lbs - origin)[0][:, [0, 2]], axis=1).max()
+    assert tool.distance < 1e-9 and tool.growth == pytest.approx(1.0, abs=1e-9)
+    assert tool.speed == pytest.approx(2 * radius * np.sin(0.1) * 30, rel=1e-6)
+    tool.add(motion, lbs + [0, 0, 0.25])
+    assert tool.distance == pytest.approx(0.25)
+
+
+def test_growth_compares_the_second_loop_with_the_last(base):
+    assert meter.compared_loops(base) == (range(120, 240), range(240, 360))
+    assert meter.compared_loops(replace(base, frames=100)) == ()
+
+
+def test_streaming_gives_what_a_bake_gives(subject, monkeypatch):
+    baked = meter.positions(subject.model, subject.base)
+    monkeypatch.setattr(meter, "STREAMING_FRAMES", 100)
+    streamed = meter.positions(subject.model, subject.base)
+    np.testing.assert_allclose(streamed, baked, atol=1e-5)
+
+
+def test_a_model_of_another_rate_is_measured_at_its_own(subject):
+    odd = replace(subject, file=replace(subject.file, config=replace(subject.file.config, fps=23.976)))
+    outcome = next(case for case in CASES if case.matches(["rate: 60"])).run(odd)
+    assert outcome.verdict == "works" and outcome.measured.error is None
+
+
+def test_a_clip_of_one_frame_is_a_pose_that_is_held(subject, toy_motion):
+    still = replace(subject, clip=toy_motion(subject.scene, 1))
+    found = next(case for case in CASES if case.matches(["upside down"])).run(still).measured.extent
+    assert found.finite and found.speed < 1e-3 and found.growth == pytest.approx(1.0, abs=1e-3)
+
+
+def test_double_precision_is_its_own_truth_and_half_is_not(subject):
+    exact = subject.in_precision(torch.float64)
+    assert meter.precision_errors(exact, exact, subject.base) == (0, 0)
+    single, half = (
+        meter.precision_errors(subject.in_precision(dtype), exact, subject.base)[1]
+        for dtype in (torch.float32, torch.bfloat16)
+    )
+    assert 0 < 100 * single < half
+
+
+# Scenes
+
+
+@pytest.mark.parametrize("scale", [1e-3, 100.0])
+def test_a_larger_scene_is_the_same_but_larger(scene, base, scale):
+    large = worlds.scale_scene(scene, scale)
+    assert worlds.garment_size(large) == pytest.approx(scale * worlds.garment_size(scene))
+    pair = []
+    for world, drive in ((scene, base), (large, drives.scale_motion(base, scale))):
+        tool = meter.ExtentMeter(world, FABRIC, 30.0)
+        pair.append(
+            tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(drive.motion(0, 3), world)[0])
+        )
+    torch.testing.assert_close(pair[1], scale * pair[0])
+
+
+@pytest.mark.parametrize("count", [30, 60, 500, 2000])
+def test_a_garment_of_any_number_of_vertices(scene, count):
+    found = worlds.resize_garment(scene, count)
+    mesh = found.garment.mesh
+    assert count - 3 <= mesh.vertex_count <= count
+    assert len(np.unique(mesh.faces)) == mesh.vertex_count and set(found.classes) <= set(scene.classes)
+    whole = scene.garment.mesh.points
+    assert (mesh.points.min(0) >= whole.min(0) - 1e-9).all() and (mesh.points.max(0) <= whole.max(0) + 1e-9).all()
+
+
+@pytest.mark.parametrize("height", [1e-2, 1e-5])
+def test_slivers_are_as_high_as_asked(scene, height):
+    mesh = worlds.add_slivers(scene, height, every=20).garment.mesh
+    a, b, c = mesh.points[mesh.faces[::20]].swapaxes(0, 1)
+    base = np.linalg.norm(b - a, axis=1)
+    ratio = np.linalg.norm(np.cross(b - a, c - a), axis=1) / base**2
+    assert np.isclose(ratio, height, rtol=1e-6).sum() >= 3
+
+
+def stretched(world: Scene, motion: Motion) -> float:
+    """Stretch energy of linear blend skinning whose points are moved at random by a millimetre."""
+    tool = meter.ExtentMeter(world, FABRIC, 30.0)
+    x = tool.skin(tool.rest, None, tool.skin.weights, meter.matrices_about_root(motion, world)[0])
+    noise = torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    return float(tool.energy.stretch(x + 1e-3 * noise))
+
+
+def test_slivers_do_not_outweigh_the_garment(scene, base):
+    found = [
+        stretched(worlds.add_slivers(scene, height, every=20), base.motion(0, 1)) for height in (1e-2, 1e-3, 1e-5)
+    ]
+    assert max(found) < 3 * min(found)
+
+
+def test_single_precision_costs_what_rounding_costs(scene, base):
+    assert 1e-8 < gradient_error(scene, FABRIC, base.motion(0, 1)) < 1e-3
+
+
+def test_a_trial_trains_what_it_says(scene, base):
+    trial = train_trial(scene, FABRIC, replace(base, frames=30), 2)
+    assert (trial.steps, trial.undone, trial.extent.frames) == (2, 0, 30) and trial.extent.bounded
+
+
+def test_a_training_that_never_moves_is_a_fault(subject):
+    def measure(subject: StressSubject) -> CaseMeasurement:
+        trial = train_trial(subject.scene, FABRIC, replace(subject.base, frames=30), 2)
+        return measures.trial_measurement(replace(trial, undone=2))
+
+    assert Case("", "", measure).run(subject).said == "ArithmeticError: 2 of 2 steps undone"
