@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-from .errors import fail
+from .errors import fail, fail_unknown
 from .schemes import need_scheme
 
 CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("adam", "muon")
@@ -181,9 +181,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.closest_point not in CLOSEST_POINTS:
-            fail("training", f"closest_point '{self.closest_point}'", f"it is one of {', '.join(CLOSEST_POINTS)}")
+            fail_unknown("training", f"closest_point '{self.closest_point}'", self.closest_point, CLOSEST_POINTS)
         if self.optimiser not in OPTIMISERS:
-            fail("training", f"optimiser '{self.optimiser}'", f"it is one of {', '.join(OPTIMISERS)}")
+            fail_unknown("training", f"optimiser '{self.optimiser}'", self.optimiser, OPTIMISERS)
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
         _need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
@@ -298,7 +298,7 @@ PRESETS = {
 def preset_named(name: str) -> Preset:
     """Return a preset; raise `SsilkError` for an unknown name."""
     if name not in PRESETS:
-        fail(f"preset '{name}'", "no such preset", f"it is one of {', '.join(PRESETS)}")
+        fail_unknown(f"preset '{name}'", "no such preset", name, PRESETS)
     return PRESETS[name]
 
 
@@ -322,7 +322,7 @@ def apply_overrides(config: Config, assignments: list[str]) -> Config:
     for assignment in assignments:
         name, _, text = assignment.partition("=")
         if name not in types:
-            fail(f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
+            fail_unknown(f"option '{assignment}'", "no such setting", name, types)
         try:
             changes[name] = (
                 tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)

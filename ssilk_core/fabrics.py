@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NoReturn
 
 from .assets import PLATE_THICKNESS, SurfaceMaterial
-from .errors import fail
+from .errors import fail, fail_unknown
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
@@ -149,7 +149,7 @@ FABRICS: dict[str, Fabric] = {
 def fabric_named(name: str) -> Fabric:
     """Return a preset; raise `SsilkError` for an unknown name."""
     if name not in FABRICS:
-        fail(f"fabric '{name}'", "no such preset", f"it is one of {', '.join(FABRICS)}")
+        fail_unknown(f"fabric '{name}'", "no such preset", name, FABRICS)
     return FABRICS[name]
 
 

@@ -6,17 +6,19 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from types import ModuleType
 
 from .. import __version__
-from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
+from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError
 from ..events import Failed, JsonReporter, Reporter, TextReporter
 from . import (
     bake,
+    completion,
     demo,
     evaluate,
     export,
     farm,
+    help,
     inspect,
     reduce,
     remove,
@@ -32,6 +34,7 @@ from . import (
     view,
     wardrobe,
 )
+from .parsing import Parser
 
 VERBS = (
     inspect,
@@ -53,6 +56,8 @@ VERBS = (
     farm,
     task,
     demo,
+    completion,
+    help,
 )
 
 # The extra of the distribution that installs everything a verb needs.
@@ -81,12 +86,9 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
             "onnxscript")  # fmt: skip
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one sentence, as all others are."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise `SsilkError`."""
-        fail(self.prog, message, f"'{self.prog} --help' lists what is allowed")
+def name_of(module: ModuleType) -> str:
+    """Return the verb that a module is about."""
+    return module.__name__.rpartition(".")[2]
 
 
 def parser() -> Parser:
@@ -96,11 +98,10 @@ def parser() -> Parser:
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
     for module in VERBS:
         verb = verbs.add_parser(
-            module.__name__.rpartition(".")[2],
+            name_of(module),
             help=(module.__doc__ or "").splitlines()[0],
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
         )
         verb.add_argument(
             "--json", action="store_true", help="events as JSON, one object per line, on standard output"

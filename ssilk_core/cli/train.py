@@ -15,7 +15,7 @@ from pathlib import Path
 
 from ..config import PRESETS, ModelConfig, TrainConfig, apply_overrides, preset_named
 from ..devices import default_preset, select_device
-from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
+from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, silent
 from ..wardrobe.training import WORSE_FIGURE
 from . import options as shared
@@ -159,7 +159,7 @@ def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tu
     for setting in settings:
         name, where = setting.partition("=")[0], f"--set {setting}"
         if name not in known:
-            fail(where, "no such setting", f"settings are {', '.join(known)}")
+            fail_unknown(where, "no such setting", name, known)
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
     return apply_overrides(model, own), apply_overrides(train, others)

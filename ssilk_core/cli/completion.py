@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the script with which a shell completes verbs, options and names by the tab key.
+
+One line sets it up; new shells then complete:
+
+    ssilk completion bash > ~/.local/share/bash-completion/completions/ssilk
+    ssilk completion zsh > ~/.zfunc/_ssilk
+    ssilk completion fish > ~/.config/fish/completions/ssilk.fish
+
+The folder must be there. zsh reads those in its $fpath: 'fpath+=~/.zfunc' stands in ~/.zshrc before 'compinit'.
+bash needs its package bash-completion. Write the script again after an update. The shell completes from the script
+alone and starts no Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from ..config import ModelConfig, TrainConfig
+from ..errors import EXIT_OK
+from ..events import Reporter
+from ..fabrics import Fabric
+
+SHELLS = ("bash", "zsh", "fish")
+ASSIGNED = {
+    "settings": [field.name for config in (ModelConfig, TrainConfig) for field in fields(config)],
+    "material": [field.name for field in fields(Fabric)],
+}
+"""What stands before the = of an option's value, by the name under which the option is parsed."""
+
+
+def add_arguments(verb: argparse.ArgumentParser) -> None:
+    """Add the options of this verb."""
+    verb.add_argument("shell", choices=SHELLS, help="the shell that reads the script")
+
+
+def run(options: argparse.Namespace, report: Reporter) -> int:
+    """Print the script; return 0."""
+    import shtab
+
+    from . import parser
+
+    top = parser()
+    for action in _actions(top):
+        if names := ASSIGNED.get(action.dest):
+            _complete(action, shtab.cmd("printf '%s=\\n' " + " ".join(names)))
+        elif _takes_files(action):
+            _complete(action, shtab.FILE)
+    print(shtab.complete(top, options.shell))
+    return EXIT_OK
+
+
+def _complete(action: argparse.Action, how: dict[str, Any]) -> None:
+    action.complete = how  # type: ignore[attr-defined]  # shtab reads it
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """Yield the arguments of a parser and of its verbs."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for verb in action.choices.values():
+                yield from _actions(verb)
+
+
+def _takes_files(action: argparse.Action) -> bool:
+    """Return whether an argument takes the path of a file, with or without a prim behind it."""
+    return action.type is Path or ":/" in str(action.metavar)
