@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the script with which a shell completes verbs, options and names by the tab key.
+"""Write the script that lets a shell complete verbs, options and names with the tab key.
 
-One line sets it up; new shells then complete:
+Type the line of your shell once; new shells then complete:
 
     ssilk completion bash > ~/.local/share/bash-completion/completions/ssilk
     ssilk completion zsh > ~/.zfunc/_ssilk
     ssilk completion fish > ~/.config/fish/completions/ssilk.fish
 
-The folder must be there. zsh reads those in its $fpath: 'fpath+=~/.zfunc' stands in ~/.zshrc before 'compinit'.
-bash needs its package bash-completion. Write the script again after an update. The shell completes from the script
-alone and starts no Python.
+Make the folder first if it is missing. bash needs its package bash-completion. zsh searches the folders of $fpath:
+write 'fpath+=~/.zfunc' before 'compinit' in ~/.zshrc. Completing starts no Python. After an update of ssilk, type the
+line again.
 """
 
 from __future__ import annotations

@@ -333,6 +333,8 @@ QUOTED: dict[str, Callable[[], Text]] = {
     "docs/farm.md": farm,
     "docs/pipeline.md": pipeline,
     "docs/architecture.md": lambda: iter(()),
+    "docs/index.md": lambda: iter(()),
+    "docs/reference.md": lambda: iter(()),
     "docs/artist_guide.md": lambda: iter((fitted(),)),
 }
 """Text with figures, by document."""
