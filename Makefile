@@ -2,6 +2,7 @@
 # Both create the environment they need in .venv; only Python 3.11 (or later) and make must be there.
 # `make extension` packs the Blender extension, with ssilk in it, into dist/; `make test-blender` tests it
 # in Blender's Python module. Both need Python 3.11 and download some 370 MB into .venv-blender.
+# `make docs` writes the documents as a site into build/site.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,7 +11,7 @@ BLENDER_VENV := .venv-blender
 BLENDER_STAMP := $(BLENDER_VENV)/.installed
 BLENDER_TOOL = $(wildcard $(BLENDER_VENV)/lib/python3.11/site-packages/bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py)
 
-.PHONY: demo test lint extension test-blender clean
+.PHONY: demo test lint docs extension test-blender clean
 
 demo: $(STAMP)
 	$(BIN)/ssilk demo --output demo_out
@@ -22,6 +23,11 @@ test: $(STAMP) lint
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# -W: a broken link, or a document that the contents do not name, is an error.
+docs: $(STAMP)
+	$(BIN)/python -m sphinx -W -q -c docs -d build/doctrees . build/site
+	@echo "open build/site/docs/index.html"
 
 extension: $(BLENDER_STAMP)
 	mkdir -p dist

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import NoReturn
 
 EXIT_OK = 0
@@ -28,4 +30,17 @@ class VerificationError(SsilkError):
 
 def fail(where: str, found: str, allowed: str, todo: str = "") -> NoReturn:
     """Raise `SsilkError` as one sentence: where, what was found, what is allowed, what to do."""
-    raise SsilkError(f"{where}: {found}; {allowed}" + (f"; {todo}" if todo else "") + ".")
+    text = f"{where}: {found}; {allowed}" + (f"; {todo}" if todo else "")
+    raise SsilkError(text if text.endswith("?") else f"{text}.")
+
+
+def fail_unknown(where: str, found: str, name: str, allowed: Iterable[str]) -> NoReturn:
+    """Raise `SsilkError` for a name that is none of the allowed ones, and suggest the one that it resembles."""
+    names = list(allowed)
+    fail(where, found, f"it is one of {', '.join(names)}", did_you_mean(name, names))
+
+
+def did_you_mean(name: str, allowed: Iterable[str]) -> str:
+    """Return a question that suggests the allowed name which `name` resembles most; "" where it resembles none."""
+    near = get_close_matches(name, list(allowed), n=1)
+    return f"did you mean '{near[0]}'?" if near else ""

@@ -1,22 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line: one module per verb, loaded cheaply; the only place that joins the core and USD."""
+"""The command line: one module for each verb, loaded cheaply; with `delivery.bake` it alone joins the core and USD.
+
+In: words. Out: files, events for people or as JSON, an exit code.
+Open `train.py` first, as an example: `add_arguments` declares the options of a verb and `run` carries it out. To add
+a verb, add its module to `VERBS`. `options.py` holds what several verbs share, `parsing.py` how words are read.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
+from types import ModuleType
 
 from .. import __version__
-from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError, fail
+from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError
 from ..events import Failed, JsonReporter, Reporter, TextReporter
 from . import (
     bake,
+    completion,
     demo,
     evaluate,
     export,
     farm,
+    help,
     inspect,
     reduce,
     remove,
@@ -32,6 +39,7 @@ from . import (
     view,
     wardrobe,
 )
+from .parsing import Parser
 
 VERBS = (
     inspect,
@@ -53,6 +61,8 @@ VERBS = (
     farm,
     task,
     demo,
+    completion,
+    help,
 )
 
 # The extra of the distribution that installs everything a verb needs.
@@ -81,12 +91,9 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
             "onnxscript")  # fmt: skip
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one sentence, as all others are."""
-
-    def error(self, message: str) -> NoReturn:
-        """Raise `SsilkError`."""
-        fail(self.prog, message, f"'{self.prog} --help' lists what is allowed")
+def name_of(module: ModuleType) -> str:
+    """Return the verb that a module is about."""
+    return module.__name__.rpartition(".")[2]
 
 
 def parser() -> Parser:
@@ -96,16 +103,16 @@ def parser() -> Parser:
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
     for module in VERBS:
         verb = verbs.add_parser(
-            module.__name__.rpartition(".")[2],
+            name_of(module),
             help=(module.__doc__ or "").splitlines()[0],
             description=module.__doc__,
             formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
         )
         verb.add_argument(
             "--json", action="store_true", help="events as JSON, one object per line, on standard output"
         )
-        verb.set_defaults(run=module.run)
+        # A verb that runs or explains others gets both: importing them from here would be a circle.
+        verb.set_defaults(run=module.run, main=main, parser=top)
         module.add_arguments(verb)
     return top
 

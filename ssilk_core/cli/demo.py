@@ -38,7 +38,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
     from ..demo.shipped import open_shipped, origin
-    from . import main
 
     wardrobe = _make_inputs(options.output, report)
     shipped = open_shipped(options.garment, wardrobe[options.garment])
@@ -46,7 +45,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     commands = _shipped(options) + ([] if options.pretrained else _trained(options))
     for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
-        code = main([*command, "--json"] if options.json else command)
+        code = options.main([*command, "--json"] if options.json else command)
         if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
     shown = ["shipped"] if options.pretrained else ["shipped", PRESET]

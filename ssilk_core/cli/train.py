@@ -14,7 +14,7 @@ import argparse
 from pathlib import Path
 
 from ..devices import default_preset, select_device
-from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail
+from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, silent
 from ..network.settings import ModelConfig, apply_overrides
 from ..training.settings import PRESETS, TrainConfig, preset_named
@@ -160,7 +160,7 @@ def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tu
     for setting in settings:
         name, where = setting.partition("=")[0], f"--set {setting}"
         if name not in known:
-            fail(where, "no such setting", f"settings are {', '.join(known)}")
+            fail_unknown(where, "no such setting", name, known)
     own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
     others = [setting for setting in settings if setting not in own]
     return apply_overrides(model, own), apply_overrides(train, others)

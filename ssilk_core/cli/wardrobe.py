@@ -59,7 +59,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
-    trainings = [GarmentTraining(entry, options.output, _request(entry, options.list, device)) for entry in entries]
+    requests = [_request(options.parser, entry, options.list, device) for entry in entries]
+    trainings = [GarmentTraining(entry, options.output, request) for entry, request in zip(entries, requests)]
     options.output.mkdir(parents=True, exist_ok=True)
     show = report if options.json else ProgressTable([entry.name for entry in entries])
     show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
@@ -118,17 +119,15 @@ def _visible_gpus() -> list[str]:
     return [name.strip() for name in visible.split(",")][:count] if visible else [str(n) for n in range(count)]
 
 
-def _request(entry: WardrobeEntry, path: Path, device: str) -> str:
+def _request(parser: argparse.ArgumentParser, entry: WardrobeEntry, path: Path, device: str) -> str:
     """Return a hash of what is asked for a garment of the list at `path`, with the preset that a device stands for.
 
     Raises:
         SsilkError: there is no such file, or 'ssilk train' would not take it.
     """
-    from . import parser
-
     where = f"{path}: table '{entry.name}'"
     try:
-        options = parser().parse_args(["train", *entry.words, "-o", f"{entry.name}.safetensors"])
+        options = parser.parse_args(["train", *entry.words, "-o", f"{entry.name}.safetensors"])
         train.configured(options)
         files = _inputs(options, path.parent)
     except SsilkError as error:

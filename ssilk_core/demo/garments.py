@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import fail
+from ..errors import fail_unknown
 from ..scene.assets import Character, Floats, Garment, Ints, Mesh
 from .garments_dress import hooded_dress
 from .garments_fit import BodyFit, fit, outline, relax, through
@@ -22,7 +22,7 @@ def build_garment(name: str, character: Character) -> Garment:
         SsilkError: there is no garment of that name.
     """
     if name not in CUTS:
-        fail(f"garment '{name}'", "no such garment in the wardrobe", f"it is one of {', '.join(GARMENTS)}")
+        fail_unknown(f"garment '{name}'", "no such garment in the wardrobe", name, GARMENTS)
     points, faces = CUTS[name](fit(character))
     return Garment(Mesh(f"/{''.join(word.title() for word in name.split('_'))}", points, faces))
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import fail
+from ..errors import fail_unknown
 from ..scene.assets import Floats, Motion, Skeleton
 from ..scene.kinematics import (
     invert_rigid,
@@ -38,7 +38,7 @@ def build_motion(name: str, skeleton: Skeleton, *, seed: int = 0) -> Motion:
         SsilkError: there is no motion of that name, or the skeleton lacks the joints of a biped.
     """
     if name not in MAKERS:
-        fail(f"motion '{name}'", "no such motion is made in code", f"it is one of {', '.join(MOTIONS)}")
+        fail_unknown(f"motion '{name}'", "no such motion is made in code", name, MOTIONS)
     biped = Biped(skeleton)
     dice = np.random.default_rng(seed)
     track = MAKERS[name](biped, dice if seed else None)

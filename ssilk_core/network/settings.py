@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
-from ..errors import fail
+from ..errors import fail, fail_unknown
 from .schemes import need_scheme
 
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
@@ -103,7 +103,7 @@ def apply_overrides(config: Config, assignments: list[str]) -> Config:
     for assignment in assignments:
         name, _, text = assignment.partition("=")
         if name not in types:
-            fail(f"option '{assignment}'", "no such setting", f"settings are {', '.join(types)}")
+            fail_unknown(f"option '{assignment}'", "no such setting", name, types)
         try:
             changes[name] = (
                 tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
 
-from ..errors import fail
+from ..errors import fail, fail_unknown
 from ..events import Message, Reporter
 from ..network.checkpoint import ModelFile
 from ..network.runtime import Player
@@ -63,7 +63,7 @@ QUALITIES = {
 def quality_named(name: str) -> Quality:
     """Return a level; raise `SsilkError` for an unknown name."""
     if name not in QUALITIES:
-        fail(f"quality '{name}'", "no such level", f"it is one of {', '.join(QUALITIES)}")
+        fail_unknown(f"quality '{name}'", "no such level", name, QUALITIES)
     return QUALITIES[name]
 
 

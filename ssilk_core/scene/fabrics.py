@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, NoReturn
 
-from ..errors import fail
+from ..errors import fail, fail_unknown
 from .assets import PLATE_THICKNESS, SurfaceMaterial
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
@@ -149,7 +149,7 @@ FABRICS: dict[str, Fabric] = {
 def fabric_named(name: str) -> Fabric:
     """Return a preset; raise `SsilkError` for an unknown name."""
     if name not in FABRICS:
-        fail(f"fabric '{name}'", "no such preset", f"it is one of {', '.join(FABRICS)}")
+        fail_unknown(f"fabric '{name}'", "no such preset", name, FABRICS)
     return FABRICS[name]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..errors import fail
+from ..errors import fail, fail_unknown
 from ..network.settings import NO_BOUND, ModelConfig, need_between
 
 CLOSEST_POINTS, OPTIMISERS = ("triangles", "vertices"), ("adam", "muon")
@@ -108,9 +108,9 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         if self.closest_point not in CLOSEST_POINTS:
-            fail("training", f"closest_point '{self.closest_point}'", f"it is one of {', '.join(CLOSEST_POINTS)}")
+            fail_unknown("training", f"closest_point '{self.closest_point}'", self.closest_point, CLOSEST_POINTS)
         if self.optimiser not in OPTIMISERS:
-            fail("training", f"optimiser '{self.optimiser}'", f"it is one of {', '.join(OPTIMISERS)}")
+            fail_unknown("training", f"optimiser '{self.optimiser}'", self.optimiser, OPTIMISERS)
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
         need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
@@ -225,5 +225,5 @@ PRESETS = {
 def preset_named(name: str) -> Preset:
     """Return a preset; raise `SsilkError` for an unknown name."""
     if name not in PRESETS:
-        fail(f"preset '{name}'", "no such preset", f"it is one of {', '.join(PRESETS)}")
+        fail_unknown(f"preset '{name}'", "no such preset", name, PRESETS)
     return PRESETS[name]

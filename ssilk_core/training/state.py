@@ -29,8 +29,7 @@ from .validation import Score
 
 Tensors = dict[str, Tensor]
 
-# Of training states; 1: other names, 2 to 4, 9, 10: other contact, 5, 6: other groups, 7, 8, 11: other settings.
-FORMAT = 12
+FORMAT = 1  # of training states
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
@@ -80,7 +79,7 @@ class RunState:
         best: the best model so far. The state is written before its model file, so that a run that was killed in
             between can still write the model.
         lowered: reduced settings, in order; the last apply.
-        skipped: number of skipped steps; "undone" in the file.
+        skipped: number of skipped steps.
         seconds: as in `CurvePoint`.
         planned: iterations that fit into the job's minutes; zero for those of its schedule.
         static: those of them that were static training, once that is over.
@@ -185,13 +184,11 @@ def _group(tensors: Tensors, prefix: str) -> Tensors:
 
 
 def _document(state: RunState) -> dict[str, Any]:
-    document = asdict(state)
-    document["undone"] = document.pop("skipped")
-    return {"format": FORMAT, **document}
+    return {"format": FORMAT, **asdict(state)}
 
 
 def _state_of(path: Path, document: dict[str, Any]) -> RunState:
-    if (found := document.pop("format", 1 if "undone" in document else FORMAT)) != FORMAT:
+    if (found := document.pop("format", FORMAT)) != FORMAT:
         fail(
             str(path),
             f"a training state of format {found}",
@@ -200,7 +197,6 @@ def _state_of(path: Path, document: dict[str, Any]) -> RunState:
         )
     best, lowered, curve = document.pop("best"), document.pop("lowered"), document.pop("curve")
     return RunState(
-        skipped=document.pop("undone"),
         best=None if best is None else Best(best["iteration"], Score.of(best["score"])),
         lowered=[ReducedSettings(**item) for item in lowered],
         curve=[CurvePoint(**{**item, "score": Score.of(item["score"])}) for item in curve],
@@ -227,7 +223,7 @@ def _need_possible(state: RunState) -> None:
     _need_counts("planned", 0, inf, [state.planned, state.validations])
     _need_counts("static", 0, last, [state.static])
     _need_counts("iteration", 0, last, [state.iteration])
-    _need_counts("undone", 0, 2 * last, [state.skipped])  # a run that diverges goes back once
+    _need_counts("skipped", 0, 2 * last, [state.skipped])  # a run that diverges goes back once
     _need_counts("an earlier iteration", 0, state.iteration, [each.iteration for each in (*scored, *state.lowered)])
     for name in ("batch", "pretraining_batch"):
         _need_counts(name, 1, asked[name], [getattr(each, name) for each in state.lowered])

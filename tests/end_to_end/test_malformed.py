@@ -487,7 +487,7 @@ MODELS = [
     Case("truncated state", RESUME, ("model.resume", "damaged"), truncated("model.resume.safetensors")),
     Case("foreign state", RESUME, ("model.resume", "damaged"), state_header("{}")),
     Case("damaged state", RESUME, ("model.resume", "damaged"), state_header("{")),
-    Case("state of an earlier version", RESUME, ("format 1", "without --resume"), state_header('{"undone": 0}')),
+    Case("state of another version", RESUME, ("format 9", "without --resume"), state_header('{"format": 9}')),
     Case("no such model", BAKE.replace("model.", "no."), ("no.safetensors", "no such model")),
     Case(
         "model is a folder",

@@ -79,7 +79,7 @@ WRONG = {
     "nothing": ("", "list.toml: no garment in it"),
     "loose key": ('fabric = "silk"\n[cape]', "key 'fabric': it belongs to no table; each key belongs to"),
     "name": ('["../cape"]', "table '../cape': its name would be the name of files; letters"),
-    "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; keys are stage, garment, motions"),
+    "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; it is one of stage, garment, motions"),
     "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, light, final is needed"),
@@ -96,7 +96,7 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
 
 
 BAD = {
-    "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; settings are latent"),
+    "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; it is one of latent"),
     "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it must lie between 1 and"),
     "file": ('[cape]\nmotions = "none.usda"', "there is no such file or folder; motions are"),
     "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),

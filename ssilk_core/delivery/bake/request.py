@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import inf
 
-from ...errors import fail
+from ...errors import fail, fail_unknown
 from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MIN_FPS
 from ..targets import TARGETS, Target
@@ -82,7 +82,7 @@ class BakeRequest:
         for name in INPUTS:  # a pathlib.Path is as good, but USD's metadata stores text
             object.__setattr__(self, name, os.fspath(getattr(self, name)))
         if self.target not in TARGETS:
-            fail("--target", f"'{self.target}'", f"it is one of {', '.join(TARGETS)}")
+            fail_unknown("--target", f"'{self.target}'", self.target, TARGETS)
         if not 1 <= self.samples_per_frame <= MAX_SAMPLES_PER_FRAME:
             found = f"{self.samples_per_frame} samples in each frame"
             fail("--samples-per-frame", found, f"1 to {MAX_SAMPLES_PER_FRAME} are allowed")
@@ -100,7 +100,7 @@ class BakeRequest:
             found, allowed = "no --refine", "it says what refined frames look back on"
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
-            fail("--refined-output", f"'{self.refined_output}'", f"it is one of {', '.join(REFINED_OUTPUTS)}")
+            fail_unknown("--refined-output", f"'{self.refined_output}'", self.refined_output, REFINED_OUTPUTS)
         if self.lbs and self.keep:
             fail("--lbs", "linear blend skinning with a size to keep", "only the network has one", "leave keep out")
 

@@ -21,13 +21,7 @@ from torch import Tensor
 from ...scene.assets import PINNED, TIGHT, Ints, Scene
 from ...scene.mesh import topology
 from ...scene.mesh.blocks import compact_blocks
-from .distance import (
-    Patches,
-    PosedBody,
-    nearest_planes,
-    signed_distance_to_planes,
-    smoothed_planes,
-)
+from .distance import Patches, PosedBody, nearest_planes, signed_distance_to_planes, smoothed_planes
 from .limb_axes import loose_faces
 from .nearest_vertex import GARMENT_BLOCK
 from .patches import faces_around, patches_beneath

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ...errors import fail
+from ...errors import fail, fail_unknown
 from ...scene.fabrics import FABRICS
 from ..settings import PRESETS
 
@@ -97,7 +97,7 @@ def _need_table(path: Path, name: str, table: Any) -> None:
     for key, value in table.items():
         where = f"{path}: table '{name}', key '{key}'"
         if key not in KEYS:
-            fail(where, "no such key", f"keys are {', '.join(KEYS)}")
+            fail_unknown(where, "no such key", key, KEYS)
         if not KEYS[key].fits(value):
             fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed")
 

@@ -265,7 +265,7 @@ def test_a_byte_that_changed_anywhere_in_a_state_is_found(job, uninterrupted):
         ({"iteration": -5}, "iteration is -5"),
         ({"iteration": 2.5}, "iteration is 2.5"),
         ({"planned": -1}, "planned is -1"),
-        ({"undone": 10**30}, "undone is 1000"),
+        ({"skipped": 10**30}, "skipped is 1000"),
         ({"seconds": math.nan}, "a duration"),
         ({"best": None, "lowered": [{"iteration": 3, "batch": 10**6, "pretraining_batch": 1}]}, "batch is 1000000"),
         ({"lowered": 3}, "not iterable"),

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A parser whose errors are one sentence, which names what was mistyped and suggests what was meant."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from ..errors import did_you_mean, fail, fail_unknown
+
+
+class Parser(argparse.ArgumentParser):
+    """An `argparse.ArgumentParser` that takes no abbreviations and raises `SsilkError`."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options, allow_abbrev=False)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise `SsilkError`."""
+        fail(self.prog, message, self._help())
+
+    def parse_known_args(  # type: ignore[override]  # typeshed's overloads say the same
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Parse, but name an unknown option before argparse misses the one that was meant."""
+        words = sys.argv[1:] if args is None else list(args)
+        known = self._option_string_actions
+        for word in words:
+            if word == "--" or (self._subparsers and not word.startswith("-")):
+                break  # what follows is no option, or belongs to the verb's own parser
+            name = word.partition("=")[0]
+            if re.fullmatch(r"--?[A-Za-z][\w-]*", name) and not {name, name[:2]} & known.keys():
+                fail(self.prog, f"no such option '{name}'", self._help(), did_you_mean(name, known))
+        return super().parse_known_args(words, namespace)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            name = action.option_strings[-1] if action.option_strings else action.metavar or action.dest
+            fail_unknown(f"{self.prog} {name}", f"'{value}'", str(value), action.choices)
+
+    def _help(self) -> str:
+        return f"'{self.prog} --help' lists what is allowed"
