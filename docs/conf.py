@@ -19,6 +19,7 @@ root_doc = "docs/index"
 include_patterns = ["docs/*.md", "CHANGELOG.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
+highlight_language = "none"
 html_copy_source = html_show_copyright = False
 
 myst_heading_anchors = 4
