@@ -27,7 +27,7 @@ lint: $(STAMP)
 # -W: a broken link, or a document that the contents do not name, is an error.
 docs: $(STAMP)
 	$(BIN)/python -m sphinx -W -q -c docs -d build/doctrees . build/site
-	@echo "open build/site/docs/index.html"
+	@echo "open build/site/index.html"
 
 extension: $(BLENDER_STAMP)
 	mkdir -p dist

@@ -19,6 +19,7 @@ root_doc = "docs/index"
 include_patterns = ["docs/*.md", "CHANGELOG.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
+highlight_language = "none"
 html_copy_source = html_show_copyright = False
 
 myst_heading_anchors = 4
@@ -93,8 +94,15 @@ def _player(address: str, poster: str = "") -> str:
     return f'<video controls preload="metadata" style="max-width: 100%"{poster} src="{address}"></video>'
 
 
+def add_entrance(app: Any, error: Exception | None) -> None:
+    """Let the site's own address lead to the start page."""
+    leads = f'<meta http-equiv="refresh" content="0; url={root_doc}.html">\n'
+    (Path(app.outdir) / "index.html").write_text(leads, encoding="utf-8")
+
+
 def setup(app: Any) -> None:
     """Connect the functions above to Sphinx's events."""
     app.connect("source-read", add_directives)
     app.connect("autodoc-process-docstring", escape_bars)
     app.connect("html-page-context", add_players)
+    app.connect("build-finished", add_entrance)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import get_close_matches
 from typing import NoReturn
 
 EXIT_OK = 0
@@ -42,5 +41,7 @@ def fail_unknown(where: str, found: str, name: str, allowed: Iterable[str]) -> N
 
 def did_you_mean(name: str, allowed: Iterable[str]) -> str:
     """Return a question that suggests the allowed name which `name` resembles most; "" where it resembles none."""
+    from difflib import get_close_matches  # only failures need it
+
     near = get_close_matches(name, list(allowed), n=1)
     return f"did you mean '{near[0]}'?" if near else ""

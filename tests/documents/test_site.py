@@ -32,6 +32,7 @@ def page(site: Path, document: Path) -> str:
 
 
 def test_the_start_page_leads_to_every_document(site):
+    assert "url=docs/index.html" in (site / "index.html").read_text(encoding="utf-8")
     start = page(site, ROOT / "docs" / "index.md")
     for document in DOCUMENTS[:-1]:
         if document.stem != "index":
