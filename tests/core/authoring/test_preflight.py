@@ -30,6 +30,7 @@ from ssilk_core.scene.assets import (
     SkinWeights,
 )
 from ssilk_core.scene.kinematics import MAX_JOINT_SPEED, multiply_quaternions, split_at_cuts
+from ssilk_core.training.prediction import SECONDS_PER_SAMPLE, training_seconds
 from ssilk_core.training.settings import PRESETS
 
 METRES = FileUnits("hero.usda", 1.0, "Y", True, True)
@@ -476,10 +477,10 @@ def test_memory_says_when_the_batch_is_lowered(monkeypatch):
 
 def test_time_grows_with_samples_and_frames_and_is_not_guessed():
     train = replace(PRESETS["draft"].train, iterations=10, static_fraction=0.0, batch=4, window=16)
-    assert cost.training_seconds(2700, train, "cpu") == pytest.approx(10 * 64 * 2700 * cost.SECONDS_PER_SAMPLE["cpu"])
+    assert training_seconds(2700, train, "cpu") == pytest.approx(10 * 64 * 2700 * SECONDS_PER_SAMPLE["cpu"])
     warm = replace(train, static_fraction=0.5, pretraining_batch=128)
-    assert cost.training_seconds(2700, warm, "cpu") == pytest.approx(1.5 * cost.training_seconds(2700, train, "cpu"))
-    assert cost.training_seconds(2700, train, "abacus") is None
+    assert training_seconds(2700, warm, "cpu") == pytest.approx(1.5 * training_seconds(2700, train, "cpu"))
+    assert training_seconds(2700, train, "abacus") is None
 
 
 # Repair
