@@ -31,7 +31,7 @@ from precision import (
     means,
     packed_subject,
 )
-from ssilk_usd.read_stage import split_location
+from ssilk_usd.opening.stage import split_location
 
 from ssilk_core.assets import Motion, Scene
 from ssilk_core.checkpoint import ModelFile, save_model

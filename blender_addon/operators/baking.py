@@ -73,7 +73,7 @@ class TimelineOperator(tasks.OutsideOperator):
 
     def closing(self) -> Iterator[float]:
         """Read what was baked, before `finish` writes it: each takes time."""
-        from ssilk_usd.read_shot import read_baked
+        from ssilk_usd.shots.read import read_baked
 
         self.joints = self.bakeable_joints()
         self.baked = read_baked(self.shot)
@@ -178,7 +178,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
         yield from loading_usd()
-        from ssilk_usd.write import write_motion
+        from ssilk_usd.writing.files import write_motion
 
         write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
 

@@ -40,8 +40,8 @@ class StageOperator(ReportingOperator):
         if not path.is_file():
             raise SetupError(f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
         expose_usd()
-        from ssilk_usd.facts import playback_rate
-        from ssilk_usd.read_scene import read_rigged
+        from ssilk_usd.reading.facts import playback_rate
+        from ssilk_usd.reading.scene import read_rigged
 
         rigged = read_rigged(path)
         if not rigged:

@@ -74,7 +74,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
         for part in sample_vertices(garment, self.take.frames, self.points):
             yield 0.5 + part / 2
         yield from loading_usd()
-        from ssilk_usd.write import write_cache, write_motion
+        from ssilk_usd.writing.files import write_cache, write_motion
 
         folder, mesh = self.work.folder, self.scene.garment.mesh
         write_motion(folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import bpy
 import numpy as np
-from ssilk_usd.skinned import BakedGarment, SkinnedGarment
+from ssilk_usd.shots.skinned import BakedGarment, SkinnedGarment
 
 from ssilk_core.kinematics import (
     local_transforms,

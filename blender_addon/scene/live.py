@@ -13,7 +13,7 @@ from pathlib import Path
 
 import bpy
 import numpy as np
-from ssilk_usd.skinned import SkinnedGarment
+from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ssilk_core.assets import Motion
 from ssilk_core.runtime import Playback

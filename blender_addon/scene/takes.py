@@ -62,7 +62,7 @@ class ChosenMotions:
         """
         yield from sample(armature, joints, self.takes)
         yield from loading_usd()
-        from ssilk_usd.write import write_motion
+        from ssilk_usd.writing.files import write_motion
 
         folder.mkdir()
         for done, (name, take) in enumerate(zip(self.names, self.takes)):

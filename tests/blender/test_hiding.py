@@ -135,9 +135,9 @@ def test_blender_imports_a_body_without_its_hidden_faces(bpy, tmp_path, variants
 
     expose_usd()
     from pxr import Usd, UsdGeom
-    from ssilk_usd.author import define_mesh
-    from ssilk_usd.body_faces import BODY, FULL, HiddenPolygons, hide_polygons
     from ssilk_usd.units import StageUnits
+    from ssilk_usd.writing.author import define_mesh
+    from ssilk_usd.writing.body_faces import BODY, FULL, HiddenPolygons, hide_polygons
 
     from ssilk_core.assets import Mesh
 

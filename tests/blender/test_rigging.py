@@ -18,7 +18,7 @@ from .scenes import proxies_of, weights_of
 
 READ = """
 import json, sys
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.reading.scene import read_scene
 character, garment, rig = read_scene(sys.argv[1])
 print(json.dumps({
     "joints": character.skeleton.joint_names, "binds": character.skeleton.bind_transforms[:, :3, 3].tolist(),
@@ -109,7 +109,7 @@ def evaluated(bpy, thing) -> np.ndarray:
 
 def contract_of(thing, python: str, path: Path) -> dict:
     """What ssilk reads of a garment that Blender hands over."""
-    from ssilk_usd.write import write_scene
+    from ssilk_usd.writing.files import write_scene
 
     from blender_addon.scene.gather import gather
 
@@ -348,7 +348,7 @@ def test_what_ssilk_has_is_in_metres_with_y_up(bpy, skirt):
 
 
 def test_faces_of_a_mirrored_object_are_turned_over(bpy, skirt):
-    from ssilk_usd.read_polygons import triangulate
+    from ssilk_usd.reading.polygons import triangulate
 
     from blender_addon.scene.gather import gather
 

@@ -22,8 +22,8 @@ FRAMES = range(1, 25)
 WARDROBE = """
 import sys
 from pathlib import Path
-from ssilk_usd.read_character import read_character
-from ssilk_usd.write import write_garment, write_motion
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.writing.files import write_garment, write_motion
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import training_motions
 body, out = Path(sys.argv[1]), Path(sys.argv[2])

@@ -21,10 +21,10 @@ from .scenes import ended, rig_and_animate
 READ = """
 import json, sys
 from ssilk_core.kinematics import motion_transforms
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.units import StageUnits
-from ssilk_usd.read_stage import open_stage
+from ssilk_usd.opening.stage import open_stage
 skeleton = read_character(sys.argv[1]).skeleton
 motion = read_motion(sys.argv[2], skeleton)
 units = StageUnits.of(open_stage(sys.argv[1]))

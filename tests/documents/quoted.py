@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ssilk_usd import memory, trial
+from ssilk_usd.opening import memory, trial
 
 from ssilk_core import checkpoint
 from ssilk_core.collision.distance import MAX_DEPTH, MAX_QUERY_DISTANCE, TIGHT_REACH

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.assets import PINNED
 from ssilk_core.checkpoint import load_model, save_model
