@@ -38,7 +38,8 @@ from ssilk_core.events import silent
 from ssilk_core.farm.job import FarmJob, read_job, submitted, write_job
 
 CALLS = "openat,newfstatat,statx,access,faccessat2,readlink,rename,unlink,mkdir,chmod,getdents64,fsync"
-READY = "import os, signal, sys, torch, ssilk_usd.shots.layers, ssilk_usd.checking.shot, ssilk_usd.reading.motion, ssilk_core.cli; "
+READY = "import os, signal, sys, torch, ssilk_core.cli; "
+READY += "import ssilk_usd.shots.layers, ssilk_usd.checking.shot, ssilk_usd.reading.motion; "
 WORK = READY + "os.kill(os.getpid(), signal.SIGSTOP); sys.exit(ssilk_core.cli.main(sys.argv[1:]))"
 JOB_TASKS = 50_000  # of a large job, whose file is written to see how large it is
 
