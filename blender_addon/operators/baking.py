@@ -18,27 +18,25 @@ from ssilk_core.checkpoint import load_model
 from ssilk_core.errors import SsilkError
 from ssilk_core.quality import QUALITIES
 
+from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
-from ..joints import Joints, joint_order
+from ..motions.keys import has_keys, need_tracks
+from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
+from ..motions.sources import TIMELINE, Source
 from ..outside.wording import recall, reworded
 from ..outside.work import Work
+from ..playback import playing
+from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.models import model_of, no_model
 from ..preferences import interpreter, preferences, unready
-from ..scene import playing
 from ..scene.armature import read_joints
-from ..scene.attributes import current_classes
-from ..scene.baked import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..scene.classes import current_classes
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
-from ..scene.keys import has_keys, need_tracks
-from ..scene.models import model_of
-from ..scene.motions import TIMELINE, Source
-from ..scene.objects import Pair
-from ..scene.progress import no_model
-from ..scene.sampling import SampledTake, need_company, prepare_takes, sample
-from ..scene.trained_weights import has_trained_weights
-from ..scene.units import scene_rate
-from ..training_properties import RELATIVE
+from ..scene.objects import Pair, scene_rate
+from ..scene.weights import has_trained_weights
+from ..settings.training import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
 

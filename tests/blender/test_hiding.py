@@ -124,7 +124,7 @@ def test_what_cannot_be_compared_is_refused_and_nothing_changes(bpy, skirt, pill
 
 
 def test_the_panel_offers_both(bpy, skirt, pillar):
-    from blender_addon.panels.baking import BakingPanel
+    from blender_addon.panels.playback import BakingPanel
 
     assert {"ssilk.hide_covered", "ssilk.show_covered"} <= set(drawn(BakingPanel, bpy.context))
 

@@ -32,7 +32,7 @@ print(json.dumps({
 
 
 def test_hem_is_loose_and_waist_is_not(classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     heights = np.array([vertex.co.z for vertex in classified.data.vertices])
     values = read_classes(classified.data)
@@ -41,7 +41,7 @@ def test_hem_is_loose_and_waist_is_not(classified):
 
 
 def test_tightness_slides_from_what_is_pinned_to_all(ready, classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     found = read_classes(classified.data)
     tight = []
@@ -60,7 +60,7 @@ def test_tightness_slides_from_what_is_pinned_to_all(ready, classified):
 
 
 def test_pins_come_from_a_vertex_group(ready, classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     ring = [vertex.index for vertex in classified.data.vertices if vertex.co.z < 0.62]
     classified.vertex_groups.new(name="Hem").add(ring, 0.6, "REPLACE")
