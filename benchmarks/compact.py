@@ -21,9 +21,9 @@ import numpy as np
 import torch
 from helpers.reports import table, write_results
 from pxr import Sdf
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.write import write_motion
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder

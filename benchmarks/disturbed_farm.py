@@ -33,9 +33,9 @@ import torch
 from helpers.processes import raylets, workers
 from helpers.reports import table, write_results
 from pxr import Usd, UsdSkel
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
-from ssilk_usd.write import write_motion
+from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder, plan_layers, verify
 from ssilk_core.delivery.bake.inputs import InputHashes

@@ -29,9 +29,9 @@ import numpy as np
 import torch
 from helpers.processes import resident, workers
 from helpers.reports import table, write_results
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.write import write_motion
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.delivery.bake import BakeRequest, BakeTask, LayerFolder, plan_layers
 from ssilk_core.delivery.farm.cluster import bake_here, run_on_cluster
@@ -180,7 +180,7 @@ def _cores(tasks: Sequence[BakeTask], folder: Path, cores: Sequence[int]) -> dic
 
 def _start(task: BakeTask, folder: Path) -> dict[str, Any]:
     """Return what a process takes before its first shot, and for a shot then [s]."""
-    words = "import torch, ssilk_usd.shot, ssilk_usd.check, ssilk_core.delivery.bake"
+    words = "import torch, ssilk_usd.shots.shot, ssilk_usd.checking.shot, ssilk_core.delivery.bake"
     layers, taken = LayerFolder(folder / "first"), [time.perf_counter()]
     for work in (
         lambda: subprocess.run([sys.executable, "-c", words], check=True),

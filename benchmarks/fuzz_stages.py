@@ -20,10 +20,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from helpers.reports import table, write_results
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_scene
-from ssilk_usd.trial import stop
+from ssilk_usd.opening.trial import stop
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.scene import read_scene
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model

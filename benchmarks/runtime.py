@@ -29,7 +29,7 @@ from helpers import synthetic
 from helpers.playing import BLOCK, PARTS, SKINNING, TOTALS, Times, measured, spread, ways, with_numpy
 from helpers.reports import table, write_results
 from helpers.subjects import arguments, open_subject, parsed
-from ssilk_usd.read_motion import read_motion
+from ssilk_usd.reading.motion import read_motion
 
 from ssilk_core.errors import fail
 from ssilk_core.network.checkpoint import ModelFile, model_file

@@ -25,7 +25,7 @@ import torch
 from helpers import synthetic
 from helpers.peak import Peak
 from helpers.reports import table, write_results
-from ssilk_usd.shot import write_shot
+from ssilk_usd.shots.shot import write_shot
 from ssilk_usd.units import StageUnits
 
 from ssilk_core.network.checkpoint import ModelFile, save_model

@@ -26,9 +26,9 @@ from typing import Any
 
 import torch
 from helpers.reports import table, write_results
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
-from ssilk_usd.write import write_motion
+from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.delivery.bake import BakeRequest, BakeTask, plan_layers
 from ssilk_core.delivery.bake.inputs import InputContents
@@ -38,7 +38,8 @@ from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.events import silent
 
 CALLS = "openat,newfstatat,statx,access,faccessat2,readlink,rename,unlink,mkdir,chmod,getdents64,fsync"
-READY = "import os, signal, sys, torch, ssilk_usd.layers, ssilk_usd.check, ssilk_usd.read_motion, ssilk_core.cli; "
+READY = "import os, signal, sys, torch, ssilk_core.cli; "
+READY += "import ssilk_usd.shots.layers, ssilk_usd.checking.shot, ssilk_usd.reading.motion; "
 WORK = READY + "os.kill(os.getpid(), signal.SIGSTOP); sys.exit(ssilk_core.cli.main(sys.argv[1:]))"
 JOB_TASKS = 50_000  # of a large job, whose file is written to see how large it is
 

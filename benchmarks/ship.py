@@ -31,7 +31,7 @@ from precision import (
     means,
     packed_subject,
 )
-from ssilk_usd.read_stage import split_location
+from ssilk_usd.opening.stage import split_location
 
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import demo_shot

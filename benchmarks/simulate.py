@@ -20,8 +20,8 @@ import torch
 from helpers.clock import now
 from helpers.reports import table, write_results
 from helpers.subjects import parsed
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.scene import read_scene
 from torch import Tensor
 
 from ssilk_core.authoring.setup.prepare import prepare_scene

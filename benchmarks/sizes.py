@@ -17,7 +17,7 @@ from typing import Any
 from curves import read_run
 from helpers.playing import SKINNING, measured, with_numpy
 from helpers.reports import table, write_results
-from ssilk_usd.read_motion import read_motion
+from ssilk_usd.reading.motion import read_motion
 
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.network.runtime import Player

@@ -38,7 +38,7 @@ from helpers.seeds import Cell, cells, evaluated, measured
 from helpers.single_frames import frame_times
 from helpers.subjects import dressed_in
 from helpers.sweeps import ablations
-from ssilk_usd.read_motion import read_motion
+from ssilk_usd.reading.motion import read_motion
 
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.network.checkpoint import ModelFile

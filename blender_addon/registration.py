@@ -5,43 +5,40 @@ from __future__ import annotations
 
 import bpy
 
-from . import overlay, panels, preferences, preflight_properties, properties, translations
+from . import panels, preferences, translations
 from .operators import (
     baking,
     classes,
     demo_motions,
     environment,
-    fill,
     garments,
     gltf_export,
     help,
-    hiding,
     make_it_move,
     playback,
     preflight,
-    quality_view,
+    quality,
     rig,
-    stages,
     tasks,
     to_bones,
     training,
 )
-from .operators import overlay as overlay_switch
 from .panels import plot
-from .scene import heat_updates, playing, saving
+from .playback import playing, saving
+from .quality import heat_updates
+from .scene import overlay
+from .settings import garment as garment_settings
+from .settings import preflight as preflight_settings
 
 CLASSES = (
-    *properties.CLASSES,
-    *preflight_properties.CLASSES,
+    *garment_settings.CLASSES,
+    *preflight_settings.CLASSES,
     *preferences.CLASSES,
     *tasks.CLASSES,
     *environment.CLASSES,
     *classes.CLASSES,
-    *fill.CLASSES,
     *garments.CLASSES,
-    *overlay_switch.CLASSES,
     *rig.CLASSES,
-    *stages.CLASSES,
     *preflight.CLASSES,
     *training.CLASSES,
     *demo_motions.CLASSES,
@@ -51,8 +48,7 @@ CLASSES = (
     *to_bones.CLASSES,
     *gltf_export.CLASSES,
     *playback.CLASSES,
-    *quality_view.CLASSES,
-    *hiding.CLASSES,
+    *quality.CLASSES,
     *panels.CLASSES,
 )
 
@@ -61,14 +57,14 @@ def register() -> None:
     """Register all classes, then the properties that use them."""
     for kind in CLASSES:
         bpy.utils.register_class(kind)
-    properties.attach()
-    preflight_properties.attach()
+    garment_settings.attach()
+    preflight_settings.attach()
     translations.register()
     training.start_watching()
     playing.start_listening()
     saving.start_listening()
     heat_updates.start_listening()
-    quality_view.add_key()
+    quality.add_key()
 
 
 def unregister() -> None:
@@ -76,14 +72,14 @@ def unregister() -> None:
     tasks.stop()
     make_it_move.stop()
     overlay.hide()
-    quality_view.remove_key()
+    quality.remove_key()
     heat_updates.stop_listening()
     saving.stop_listening()
     playing.stop_listening()
     training.stop_watching(bpy.context)
     plot.forget()
     translations.unregister()
-    preflight_properties.detach()
-    properties.detach()
+    preflight_settings.detach()
+    garment_settings.detach()
     for kind in reversed(CLASSES):
         bpy.utils.unregister_class(kind)

@@ -83,7 +83,7 @@ def main(model: Path, result: Path) -> None:
     garment = build(model)
     animate(bpy.data.objects["Rig"], FRAMES)
     garment.ssilk.model = str(model.absolute())
-    from blender_addon.scene import playing
+    from blender_addon.playback import playing
 
     assert bpy.ops.ssilk.play_live() == {"FINISHED"}
     played, taken = playing.live(garment), []

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_stage import open_stage
+from ssilk_usd.opening.stage import open_stage
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.motion import read_motion
 from torch import Tensor
 
 from helpers.reports import table, write_results

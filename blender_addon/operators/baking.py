@@ -18,27 +18,25 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
 
+from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
-from ..joints import Joints, joint_order
+from ..motions.keys import has_keys, need_tracks
+from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
+from ..motions.sources import TIMELINE, Source
 from ..outside.wording import recall, reworded
 from ..outside.work import Work
+from ..playback import playing
+from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.models import model_of, no_model
 from ..preferences import interpreter, preferences, unready
-from ..scene import playing
 from ..scene.armature import read_joints
-from ..scene.attributes import current_classes
-from ..scene.baked import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..scene.classes import current_classes
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
-from ..scene.keys import has_keys, need_tracks
-from ..scene.models import model_of
-from ..scene.motions import TIMELINE, Source
-from ..scene.objects import Pair
-from ..scene.progress import no_model
-from ..scene.sampling import SampledTake, need_company, prepare_takes, sample
-from ..scene.trained_weights import has_trained_weights
-from ..scene.units import scene_rate
-from ..training_properties import RELATIVE
+from ..scene.objects import Pair, scene_rate
+from ..scene.weights import has_trained_weights
+from ..settings.training import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -73,7 +71,7 @@ class TimelineOperator(tasks.OutsideOperator):
 
     def closing(self) -> Iterator[float]:
         """Read what was baked, before `finish` writes it: each takes time."""
-        from ssilk_usd.read_shot import read_baked
+        from ssilk_usd.shots.read import read_baked
 
         self.joints = self.bakeable_joints()
         self.baked = read_baked(self.shot)
@@ -178,7 +176,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
         yield from loading_usd()
-        from ssilk_usd.write import write_motion
+        from ssilk_usd.writing.files import write_motion
 
         write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
 

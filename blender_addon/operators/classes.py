@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Painting vertex classes with Blender's own brushes, and reading the painting back."""
+"""Painting vertex classes, filling a selection with one, and showing them over the garment."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from bpy.props import EnumProperty, FloatProperty
 
 from ssilk_core.scene.assets import CLASS_NAMES
 
-from .. import classes as palette
+from ..arrays import classes as palette
 from ..errors import SetupError
-from ..scene import attributes
+from ..scene import classes as stored
+from ..scene import overlay
+from ..scene.classes import choose_color, fill_selected, offer_palette
 from ..scene.garment import unusable
-from ..scene.painting import choose_color, offer_palette
-from ..scene.symmetry import partners_across
-from .reporting import ReportingOperator
+from ..scene.meshes import partners_across
+from .reporting import RefusingOperator, ReportingOperator
+from .tasks import redraw
 
 ABOUT = {
     "pinned": "Rigidly follows the skeleton, black: belts, collars, what is sewn on",
@@ -44,8 +46,8 @@ class PaintClasses(ClassOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         mesh = context.object.data
-        attributes.take_up_painting(mesh)
-        attributes.show_classes(mesh)
+        stored.take_up_painting(mesh)
+        stored.show_classes(mesh)
         if context.mode != "PAINT_VERTEX":
             bpy.ops.object.mode_set(mode="VERTEX_PAINT")
         offer_palette(context)
@@ -78,7 +80,7 @@ class TakeUpPainting(ClassOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
-        return f"{attributes.take_up_painting(thing.data)} vertices of '{thing.name}' changed class."
+        return f"{stored.take_up_painting(thing.data)} vertices of '{thing.name}' changed class."
 
 
 class ShowClasses(ClassifiedOperator, bpy.types.Operator):
@@ -88,7 +90,7 @@ class ShowClasses(ClassifiedOperator, bpy.types.Operator):
     bl_label = "Show Classes"
 
     def apply(self, context: bpy.types.Context) -> str:
-        attributes.show_classes(context.object.data)
+        stored.show_classes(context.object.data)
         if context.space_data and context.space_data.type == "VIEW_3D":
             context.space_data.shading.color_type = "VERTEX"
         return ""
@@ -133,15 +135,55 @@ class MirrorClasses(ClassifiedOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         thing = context.object
-        values = attributes.current_classes(thing.data)
+        values = stored.current_classes(thing.data)
         if values is None:
             raise SetupError(f"'{thing.name}' has no classes; paint it first.")
         points, partners = partners_across(thing.data, self.distance)
         mirrored = palette.mirrored(values, points, partners, from_left=self.source == "LEFT")
-        attributes.write_classes(thing.data, mirrored)
+        stored.write_classes(thing.data, mirrored)
         alone = int((partners < 0).sum())
         told = f"; {alone} have none across and stay as they are" if alone else ""
         return f"{int((mirrored != values).sum())} vertices of '{thing.name}' changed class{told}."
 
 
-CLASSES = (PaintClasses, TakeUpPainting, ShowClasses, BrushClass, MirrorClasses)
+class FillClass(ReportingOperator, bpy.types.Operator):
+    """Give the selected vertices this class"""
+
+    bl_idname = "ssilk.fill_class"
+    bl_label = "Fill Selection"
+    bl_options = {"REGISTER", "UNDO"}
+
+    value: EnumProperty(name="Class", items=CHOICES)
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return unusable(context.object) or ("" if context.mode == "EDIT_MESH" else "Select vertices in Edit Mode")
+
+    def apply(self, context: bpy.types.Context) -> str:
+        thing = context.object
+        filled = fill_selected(thing.data, VALUES[self.value])
+        if not filled:
+            raise SetupError(f"No vertex of '{thing.name}' is selected.")
+        return f"{filled} vertices of '{thing.name}' are {self.value.lower()}."
+
+
+class ToggleOverlay(RefusingOperator, bpy.types.Operator):
+    """Show the classes of all garments over them in 3D views, in any mode; the file is not touched"""
+
+    bl_idname = "ssilk.toggle_overlay"
+    bl_label = "Class Overlay"
+
+    @classmethod
+    def refusal(cls, _: bpy.types.Context) -> str:
+        return "There is no window to draw in" if bpy.app.background else ""
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        if overlay.shown():
+            overlay.hide()
+        else:
+            overlay.show()
+        redraw(context, views=True)
+        return {"FINISHED"}
+
+
+CLASSES = (PaintClasses, TakeUpPainting, ShowClasses, BrushClass, MirrorClasses, FillClass, ToggleOverlay)

@@ -11,14 +11,13 @@ import bpy
 from ssilk_core.scene.assets import Motion
 
 from ..errors import SetupError
+from ..motions.demo import add_action, channels_of, hand_over_joints, read_motions
+from ..motions.keys import Channel
+from ..motions.sources import ACTION, TIMELINE, Source, assign, is_still
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..scene.armature import read_joints
-from ..scene.demo_motions import add_action, channels_of, hand_over_joints, read_motions
-from ..scene.follower import leader_of
+from ..scene.armature import leader_of, read_joints
 from ..scene.garment import armature_of, unusable_here
-from ..scene.keys import Channel
-from ..scene.motions import ACTION, TIMELINE, Source, assign, is_still
 from ..scene.objects import Pair
 from . import tasks
 from .training import add_motion

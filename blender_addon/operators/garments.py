@@ -7,7 +7,7 @@ import bpy
 from bpy.props import StringProperty
 
 from ..errors import SetupError
-from ..scene.selecting import select_object
+from ..scene.objects import select_object
 from .reporting import ReportingOperator
 
 

@@ -11,11 +11,11 @@ from bpy.props import StringProperty
 from ssilk_core.files import replacing
 
 from ..errors import SetupError
-from ..scene import playing
-from ..scene.exporting import MOST_LOST, export_glb, largest_loss, visible
+from ..motions.keys import has_keys
+from ..motions.simulated import simulating
+from ..playback import playing
+from ..playback.gltf import MOST_LOST, export_glb, largest_loss, visible
 from ..scene.garment import armature_of, unusable_here
-from ..scene.keys import has_keys
-from ..scene.simulated import simulating
 from .reporting import ReportingOperator
 
 SUFFIX = ".glb"

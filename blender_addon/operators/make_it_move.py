@@ -13,17 +13,15 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import LOOSE
 
 from ..errors import SetupError
+from ..motions.sources import TIMELINE, is_still
 from ..outside.jobs import read_state
+from ..playback import playing
+from ..playback.models import job_of
 from ..preferences import handshake, interpreter, preferences
-from ..scene import playing
-from ..scene.armature import proxy_names
-from ..scene.attributes import current_classes
-from ..scene.follower import leader_of
+from ..scene.armature import leader_of, proxy_names
+from ..scene.classes import current_classes
 from ..scene.garment import armature_of, unusable_here
-from ..scene.models import job_of
-from ..scene.motions import TIMELINE, is_still
-from ..scene.objects import found_again
-from ..scene.selecting import select_object
+from ..scene.objects import found_again, select_object
 from . import tasks
 from .reporting import RefusingOperator, ReportingOperator
 

@@ -6,10 +6,9 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
-from ..scene import playing
+from ..playback import playing
+from ..playback.models import model_of, no_model
 from ..scene.garment import unusable, unusable_here
-from ..scene.models import model_of
-from ..scene.progress import no_model
 from .reporting import ReportingOperator
 
 

@@ -11,21 +11,19 @@ import numpy as np
 
 from ssilk_core.events import format_count
 
+from ..arrays.findings import PUSHED, Clip, read_findings
 from ..errors import SetupError
-from ..findings import PUSHED, Clip, read_findings
+from ..motions.sampling import ChosenMotions
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..preflight_properties import FindingItem, keep_findings, shown_finding, size_of
+from ..quality.checks import SCALE, look_again, scene_findings
+from ..quality.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.armature import read_joints
-from ..scene.checks import SCALE, scene_findings
 from ..scene.garment import armature_of, unusable
 from ..scene.gather import gather
 from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
-from ..scene.mended import look_again
-from ..scene.objects import Pair
-from ..scene.repairs import REPAIRS, apply_scale, move_points, repair_mesh
-from ..scene.selecting import select_bones, select_elements
-from ..scene.takes import ChosenMotions
+from ..scene.objects import Pair, select_bones, select_elements
+from ..settings.preflight import FindingItem, keep_findings, shown_finding, size_of
 from . import tasks
 from .reporting import ReportingOperator
 from .rig import RigOperator

@@ -1,27 +1,28 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Automatic classes and proxy rigs, made outside by `ssilk rig`."""
+"""Automatic classes and proxy rigs, made outside by `ssilk rig`, and the import of stages that it wrote."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import bpy
-from bpy.props import BoolProperty, IntProperty
+from bpy.props import BoolProperty, IntProperty, StringProperty
 
-from .. import overlay
 from ..errors import SetupError
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..scene.apply import apply_classes, apply_rig
-from ..scene.armature import need_editable, proxy_names
-from ..scene.attributes import current_classes
-from ..scene.edit_tracking import find_edits
-from ..scene.follower import is_linked, make_follower
-from ..scene.garment import armature_of, unusable_here
+from ..rigging.adopt import adopt
+from ..rigging.apply import apply_classes, apply_rig
+from ..rigging.edit_tracking import find_edits
+from ..scene import overlay
+from ..scene.armature import is_linked, make_follower, need_editable, proxy_names
+from ..scene.classes import current_classes
+from ..scene.garment import armature_of, not_in_object_mode, unusable_here
 from ..scene.gather import gather
-from ..scene.handover import Handover, hand_over, loading_usd, rig_command
+from ..scene.handover import Handover, expose_usd, hand_over, loading_usd, rig_command
 from ..scene.objects import Pair
 from . import tasks
+from .reporting import ReportingOperator
 
 
 class RigOperator(tasks.OutsideOperator):
@@ -138,4 +139,68 @@ def edits_line(garment: bpy.types.Object) -> str:
     return f"By hand: {find_edits(armature, garment).summary or 'nothing'}"
 
 
-CLASSES = (Classify, GenerateRig)
+class StageOperator(ReportingOperator):
+    """Base of operators on a stage that an artist chooses."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    filepath: StringProperty(name="File", description="USD file that ssilk wrote", subtype="FILE_PATH")
+    filter_glob: StringProperty(
+        description="Which files are offered", default="*.usd;*.usdc;*.usda;*.usdz", options={"HIDDEN"}
+    )
+
+    @classmethod
+    def refusal(cls, context: bpy.types.Context) -> str:
+        return not_in_object_mode(context)
+
+    def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
+        """Ask for the file."""
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def adopted(self) -> tuple[str, float | None]:
+        """Mark the proxies of all garments in the file; return what to tell, and its frames per second."""
+        path = Path(bpy.path.abspath(self.filepath))
+        if not path.is_file():
+            raise SetupError(f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
+        expose_usd()
+        from ssilk_usd.reading.facts import playback_rate
+        from ssilk_usd.reading.scene import read_rigged
+
+        rigged = read_rigged(path)
+        if not rigged:
+            raise SetupError(f"No mesh of '{path.name}' has proxies; rig a garment, here or with `ssilk rig`.")
+        names = ", ".join(f"{rig.proxy_count} proxies of '{adopt(*of, rig).name}'" for *of, rig in rigged)
+        return f"{names} were recognised.", playback_rate(path)
+
+
+class AdoptRig(StageOperator, bpy.types.Operator):
+    """Recognise the proxies of garments that were imported from a stage of `ssilk rig`"""
+
+    bl_idname = "ssilk.adopt_rig"
+    bl_label = "Adopt Rig"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        return self.adopted()[0]
+
+
+class ImportStage(StageOperator, bpy.types.Operator):
+    """Import a dressed character that `ssilk rig` wrote, with its proxies and its frame rate"""
+
+    bl_idname = "ssilk.import_stage"
+    bl_label = "Import Rigged Stage"
+
+    def apply(self, context: bpy.types.Context) -> str:
+        path = bpy.path.abspath(self.filepath)
+        if not Path(path).is_file():
+            raise SetupError(f"There is no file '{path}'; choose a stage that `ssilk rig` wrote.")
+        if not hasattr(bpy.ops.wm, "usd_import"):
+            raise SetupError("This Blender was built without USD; take one from blender.org.")
+        bpy.ops.wm.usd_import(filepath=path)
+        told, rate = self.adopted()
+        if rate:
+            context.scene.render.fps, context.scene.render.fps_base = round(rate), round(rate) / rate
+        return told
+
+
+CLASSES = (Classify, GenerateRig, AdoptRig, ImportStage)

@@ -10,19 +10,18 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
+from ..motions.keys import need_tracks
+from ..motions.sampling import need_company, prepare_takes, sample
+from ..motions.simulated import need_simulated, sample_vertices, switch_off
+from ..motions.sources import TIMELINE, Source
 from ..outside.work import Work
+from ..playback.bake import animated, need_bakeable, need_movable
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
-from ..scene.baked import animated, need_bakeable, need_movable
 from ..scene.garment import armature_of, unusable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
-from ..scene.keys import need_tracks
-from ..scene.motions import TIMELINE, Source
-from ..scene.objects import Pair
-from ..scene.sampling import need_company, prepare_takes, sample
-from ..scene.simulated import need_simulated, sample_vertices, switch_off
-from ..scene.units import scene_rate
+from ..scene.objects import Pair, scene_rate
 from . import tasks
 from .baking import MOTION, SHOT, TimelineOperator, lost
 
@@ -74,7 +73,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
         for part in sample_vertices(garment, self.take.frames, self.points):
             yield 0.5 + part / 2
         yield from loading_usd()
-        from ssilk_usd.write import write_cache, write_motion
+        from ssilk_usd.writing.files import write_cache, write_motion
 
         folder, mesh = self.work.folder, self.scene.garment.mesh
         write_motion(folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))

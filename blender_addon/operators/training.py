@@ -13,25 +13,24 @@ from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntPropert
 
 from ssilk_core.scene.assets import LOOSE
 
+from ..arrays.joints import identifiers
 from ..errors import SetupError
-from ..fabric_properties import fabric_options
-from ..names import identifiers
+from ..motions.sampling import ChosenMotions
+from ..motions.sources import FILE, TIMELINE, Source, sources
 from ..outside import jobs
 from ..outside.wording import remember
 from ..outside.work import Work
+from ..playback import models, playing
+from ..playback.bake import need_bakeable
+from ..playback.models import job_of, orphans, progress_of, relative, trainings, trainings_folder
 from ..preferences import interpreter, preferences, unready
-from ..scene import models, playing, progress
-from ..scene.baked import need_bakeable
-from ..scene.follower import leader_of
+from ..quality.checks import look_again
+from ..scene.armature import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
-from ..scene.mended import look_again
-from ..scene.models import job_of, orphans, relative, trainings, trainings_folder
-from ..scene.motions import FILE, TIMELINE, Source, sources
 from ..scene.objects import Pair
-from ..scene.progress import progress_of
-from ..scene.takes import ChosenMotions
+from ..settings.fabric import fabric_options
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -190,7 +189,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         jobs.own(folder, garment.name, Path(bpy.data.filepath).name)
         jobs.begin(interpreter(preferences(context)), folder, command, improves=self.improves)
         begun.add(folder)
-        progress.forget()
+        models.forget()
         garment.ssilk.training.folder = relative(folder)
         return f"The training of '{name}' began; it lies in {folder}."
 
@@ -227,7 +226,7 @@ class CancelTraining(JobOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         jobs.cancel(job_of(context.object))
-        progress.forget()
+        models.forget()
         return f"The training of '{context.object.name}' ends after its current step."
 
 
@@ -264,7 +263,7 @@ class ResumeTraining(JobOperator, bpy.types.Operator):
         folder = job_of(context.object)
         jobs.resume(interpreter(preferences(context)), folder)
         begun.add(folder)
-        progress.forget()
+        models.forget()
         return f"The training of '{context.object.name}' goes on."
 
 
@@ -317,7 +316,7 @@ def beside(path: Path, folder: Path) -> str:
 def watch() -> float:
     """Redraw panels when a training has progressed, and play its new model; return when to be called again [s]."""
     known = trainings()
-    fresh = [models.look_for_orphans(known), progress.read_all(known)]  # both are asked, so that none is drawn twice
+    fresh = [models.look_for_orphans(known), models.read_all(known)]  # both are asked, so that none is drawn twice
     if any(fresh):
         tasks.redraw(bpy.context)
     preflight = bpy.context.window_manager.ssilk_preflight

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Panels in the sidebar of 3D views, one module each; they only draw what other modules find."""
+"""Panels in the sidebar of 3D views; they only draw what other modules find.
+
+Open `base.py` first: what all panels share. `CLASSES` is the order of the sidebar.
+"""
 
 from __future__ import annotations
 
-from .baking import BakingPanel
 from .classes import ClassesPanel
-from .fabric import FabricPanel
-from .garment import GarmentPanel
-from .playback import PlaybackPanel
-from .preflight import FindingList, PreflightPanel
-from .quality import QualityPanel
+from .garment import FabricPanel, GarmentPanel
+from .playback import BakingPanel, PlaybackPanel
+from .quality import FindingList, PreflightPanel, QualityPanel
 from .rig import RigPanel
 from .training import EnergiesPanel, MotionList, TrainingPanel
 

@@ -9,15 +9,13 @@ import numpy as np
 from ssilk_core.events import format_count
 from ssilk_core.scene.mesh.topology import components
 
-from ..classes import COLORS, LEVELS, adrift, counts
+from ..arrays.classes import COLORS, LEVELS, adrift, counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
-from ..overlay import shown
-from ..scene.attributes import current_classes
+from ..scene.classes import current_classes, is_chosen
 from ..scene.garment import unusable
-from ..scene.meshes import triangles_of
-from ..scene.painting import is_chosen
-from ..scene.shapes import rest_points
+from ..scene.meshes import rest_points, triangles_of
+from ..scene.overlay import shown
 from ..scene.stitched import unstitched
 from .base import SidebarPanel, draw_text, saying_errors
 

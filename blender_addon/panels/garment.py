@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The garment: what it belongs to, and whether it can be worked on."""
+"""The garment: what it belongs to, what it is made of, and whether it can be worked on."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import bpy
 from ..errors import SetupError
 from ..operators import make_it_move, tasks
 from ..outside.report import improvement
+from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
 from ..scene.garment import armature_of, garments_of, unusable
-from ..scene.models import orphans
-from ..scene.progress import progress_of
 from .base import SidebarPanel, draw_text, draw_work, saying_errors
 from .training import draw_bar
 
@@ -82,3 +81,29 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             row.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = ROOT
         draw_work(layout)
         draw_orphans(layout)
+
+
+MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "shear")}  # values of each model
+CONTACT = {"surface": ("contact", "loose_contact"), "vertex": ("collision",)}  # likewise
+
+
+class FabricPanel(SidebarPanel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_fabric"
+    bl_label = "Fabric"
+    section = "2-garment"
+    bl_parent_id = "SSILK_PT_garment"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)
+
+    @saying_errors
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, fabric = self.layout, context.object.ssilk.fabric
+        layout.use_property_split, layout.use_property_decorate = True, False  # a fabric is not animated
+        for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
+            layout.prop(fabric, name)
+        contact = CONTACT[fabric.contact_model]
+        for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether", "stitch"):
+            layout.prop(fabric, name)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import bpy.utils.previews
 import numpy as np
 
-from ..curves import COLORS, picture
+from ..arrays.curves import COLORS, picture
 
 SIZE = 192  # pixels
 SWATCH = 16

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 import bpy
 
-from ..classes import counts
+from ..arrays.classes import counts
 from ..errors import SetupError
 from ..scene.armature import proxy_names
-from ..scene.attributes import current_classes
+from ..scene.classes import current_classes
 from ..scene.garment import armature_of, unusable
 from .base import SidebarPanel, draw_text, saying_errors
 

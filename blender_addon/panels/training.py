@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import bpy
 
-from ..curves import series
+from ..arrays.curves import series
 from ..errors import SetupError
+from ..motions.sources import FILE
 from ..outside.jobs import JobState
 from ..outside.report import findings, progress
+from ..playback.models import TrainingProgress, progress_of
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable
-from ..scene.motions import FILE
-from ..scene.progress import TrainingProgress, progress_of
 from .base import SidebarPanel, draw_text, saying_errors
 from .plot import plot, swatch
 

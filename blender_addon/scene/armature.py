@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Bones as joints, and proxies as bones in a collection of their own.
+"""Bones as joints, proxies as bones in a collection of their own, and armatures that follow a linked one.
 
 The collection names its garment by a custom property, so that both may be renamed. A bone is a proxy of the garment
 if it is in the collection or descends from one that is; artists add, move, reparent and delete them like any other.
+A linked or overridden character cannot take proxies. Its garment gets an armature of its own, whose bones are copies
+of the character's and follow them by constraints.
 """
 
 from __future__ import annotations
@@ -14,9 +16,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ..arrays.joints import Joints
 from ..errors import SetupError
-from ..joints import Joints
-from .units import scene_units
+from .objects import scene_units
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
 MADE = "ssilk_made"  # custom property of a generated bone: its key; of the collection: the proxies by key
@@ -150,3 +152,52 @@ def editing(armature: bpy.types.Object) -> Iterator[None]:
         bpy.ops.object.mode_set(mode="OBJECT")
         armature.select_set(selected)
         layer.objects.active = before
+
+
+LEADER = "ssilk_follows"  # custom property of such an armature: the character's
+
+
+def leader_of(armature: bpy.types.Object) -> bpy.types.Object:
+    """Return the armature that an armature follows, itself where it follows none."""
+    return armature.get(LEADER) or armature
+
+
+def is_linked(armature: bpy.types.Object) -> bool:
+    """Return whether an armature comes from another file, overridden or not."""
+    return bool(
+        armature.library or armature.data.library or armature.override_library or armature.data.override_library
+    )
+
+
+def make_follower(garment: bpy.types.Object, leader: bpy.types.Object) -> bpy.types.Object:
+    """Give a garment an armature of its own that follows a linked one. In object mode."""
+    follower = bpy.data.objects.new(f"{garment.name} rig", bpy.data.armatures.new(f"{garment.name} rig"))
+    garment.users_collection[0].objects.link(follower)
+    follower.parent = leader  # the same place and scale, also where the character's object is animated
+    follower[LEADER] = leader
+    bpy.context.view_layer.update()
+    _copy_bones(follower, leader)
+    for bone in follower.pose.bones:
+        _follow(bone, leader)
+    for modifier in garment.modifiers:
+        if modifier.type == "ARMATURE" and modifier.object == leader:
+            modifier.object = follower
+    garment.ssilk.armature = follower
+    return follower
+
+
+def _copy_bones(follower: bpy.types.Object, leader: bpy.types.Object) -> None:
+    with editing(follower):
+        bones = follower.data.edit_bones
+        for source in leader.data.bones:
+            bone = bones.new(source.name)
+            bone.tail = (0.0, source.length, 0.0)  # a bone without length takes no matrix
+            bone.matrix, bone.length = source.matrix_local, source.length
+            bone.use_deform = source.use_deform
+            bone.parent = bones[source.parent.name] if source.parent else None
+
+
+def _follow(bone: bpy.types.PoseBone, leader: bpy.types.Object) -> None:
+    constraint = bone.constraints.new("COPY_TRANSFORMS")
+    constraint.target, constraint.subtarget = leader, bone.name
+    constraint.owner_space = constraint.target_space = "POSE"

@@ -13,19 +13,15 @@ from ssilk_usd.units import StageUnits
 
 from ssilk_core.scene.assets import Body, Character, Garment, Mesh, ProxyRig, SkinWeights
 
+from ..arrays.joints import Joints, identifiers
 from ..errors import SetupError
-from ..joints import Joints
-from ..names import identifiers
-from .armature import read_joints
-from .attributes import current_classes
-from .carrying import carried_weights, is_carried, rest_world
-from .follower import leader_of
-from .garment import armature_of, bodies_of
+from .armature import leader_of, read_joints
+from .classes import current_classes
+from .garment import armature_of, bodies_of, carried_weights, is_carried, rest_world
 from .masks import unmasked
 from .modifiers import need_plain_modifiers, reshapes
-from .trained_weights import own_groups
-from .units import scene_units
-from .weights import PLAIN, read_groups, read_kept
+from .objects import scene_units
+from .weights import PLAIN, own_groups, read_groups, read_kept
 
 HALF = 0.5  # weight from which on a vertex is in a group
 ROOT, SKELETON = "/Character", "Skeleton"  # prims of the stage that is handed over

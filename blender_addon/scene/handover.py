@@ -22,8 +22,8 @@ from .objects import Pair
 STAGE, RIGGED, REPAIRED = "dressed.usdc", "rigged.usdc", "repaired.usdc"
 MOTIONS = "motions"  # folder of the sampled motions beside them
 # Modules that are imported one after another, those that others need first.
-USD = ("pxr.Tf", "pxr.Ar", "pxr.Sdf", "pxr.Usd", "pxr.UsdGeom", "pxr.UsdSkel", "pxr.UsdUtils", "ssilk_usd.write",
-       "ssilk_usd.read_shot")  # fmt: skip
+USD = ("pxr.Tf", "pxr.Ar", "pxr.Sdf", "pxr.Usd", "pxr.UsdGeom", "pxr.UsdSkel", "pxr.UsdUtils",
+       "ssilk_usd.writing.files", "ssilk_usd.shots.read")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -46,8 +46,8 @@ class Handover:
 
     def rig(self, folder: Path) -> tuple[Garment, ProxyRig]:
         """Return the garment with classes, and the rig, that were made of it."""
-        from ssilk_usd.read_garment import read_garment
-        from ssilk_usd.rig_io import read_proxy_rig
+        from ssilk_usd.reading.garment import read_garment
+        from ssilk_usd.reading.rig import read_proxy_rig
 
         path, skeleton = folder / RIGGED, self.scene.character.skeleton
         rig = read_proxy_rig(path, skeleton, garment=self.prim)
@@ -56,7 +56,7 @@ class Handover:
 
     def repaired_points(self, folder: Path) -> np.ndarray:
         """Return the points of the garment, repaired, in Blender's world, shape (V, 3)."""
-        from ssilk_usd.read_garment import read_garment
+        from ssilk_usd.reading.garment import read_garment
 
         repaired = read_garment(folder / REPAIRED, self.scene.character.skeleton, garment=self.prim)
         return self.scene.units.points_from_core(repaired.mesh.points)
@@ -81,7 +81,7 @@ def hand_over(scene: GatheredScene, pair: Pair, folder: Path) -> Handover:
     knows no proxies.
     """
     expose_usd()
-    from ssilk_usd.write import write_scene
+    from ssilk_usd.writing.files import write_scene
 
     write_scene(folder / STAGE, scene.character, scene.garment, scene.rig, units=scene.units)
     return Handover(pair, scene, folder / STAGE)

@@ -13,7 +13,7 @@ from ..errors import fail
 from ..scene.assets import Floats
 
 if TYPE_CHECKING:
-    from ssilk_usd.play import Shot
+    from ssilk_usd.shots.play import Shot
 
 OPEN = 4  # shots at once; clips are read one after the other
 
@@ -31,7 +31,7 @@ class References:
         Raises:
             SsilkError: there is no such folder.
         """
-        from ssilk_usd.read_stage import LAYER_SUFFIXES
+        from ssilk_usd.opening.stage import LAYER_SUFFIXES
 
         if not folder.is_dir():
             fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate --points' is needed")
@@ -65,7 +65,7 @@ class References:
         return points
 
     def _opened(self, clip: str) -> Shot:
-        from ssilk_usd.play import Shot
+        from ssilk_usd.shots.play import Shot
 
         path = self._paths[clip]
         shot = Shot(path)

@@ -110,8 +110,8 @@ def _body() -> Path:
 
 def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
     """Write the wardrobe, the motions to train on, and the shot to bake; return the wardrobe."""
-    from ssilk_usd.read_character import read_character
-    from ssilk_usd.write import write_garment, write_motion
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.writing.files import write_garment, write_motion
 
     from ..demo.garments import GARMENTS, build_garment
     from ..demo.motions import demo_shot, training_motions

@@ -147,7 +147,7 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
 
 def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device, exact: bool) -> EvaluationScene:
     """Put the garment of a model on the character of the stage."""
-    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.opening.stage import open_stage
 
     from ..delivery.bake import on_character
     from ..quality.evaluation.methods import EvaluationScene
@@ -158,7 +158,7 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device,
 
 def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> EvaluationClips:
     """Read the clips that options name, and find the simulator's shots of them."""
-    from ssilk_usd.read_motion import read_motion, read_motions
+    from ssilk_usd.reading.motion import read_motion, read_motions
 
     from ..quality.evaluation.run import EvaluationClips
     from ._reference import References
@@ -181,7 +181,7 @@ def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> Evaluati
 
 def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str, Path], list[Path]]:
     """Return the names of clips by split, their files, and the motions of the training."""
-    from ssilk_usd.read_motion import motion_files
+    from ssilk_usd.reading.motion import motion_files
 
     from ..quality.evaluation.splits import SPLITS, chosen, read_index, splits_of
 

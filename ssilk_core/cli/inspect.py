@@ -66,8 +66,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
-    from ssilk_usd.facts import animated
-    from ssilk_usd.repair import repair_lock
+    from ssilk_usd.reading.facts import animated
+    from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
     from ..authoring.preflight.motion import MotionFile
@@ -89,7 +89,7 @@ def _readable(paths: Sequence[Path], skeleton: Skeleton) -> tuple[list[Motion], 
     Raises:
         SsilkError: a file or a folder is missing.
     """
-    from ssilk_usd.read_motion import motion_sources, read_motion
+    from ssilk_usd.reading.motion import motion_sources, read_motion
 
     found, unread = [], {}
     for source in motion_sources(paths):
@@ -108,7 +108,7 @@ def _default_preset() -> str:
 
 
 def _units(path: Path) -> FileUnits:
-    from ssilk_usd.facts import stage_facts
+    from ssilk_usd.reading.facts import stage_facts
 
     from ..authoring.preflight.units import FileUnits
 
@@ -120,7 +120,7 @@ def _units(path: Path) -> FileUnits:
 
 def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
     """Write the repaired copy; return what was repaired."""
-    from ssilk_usd.repair import write_repaired, write_with_units
+    from ssilk_usd.writing.repair import write_repaired, write_with_units
 
     from ..authoring.preflight.repair import plan_repair
 

@@ -224,7 +224,7 @@ def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) 
 
 def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     """Return a request for each model over each motion, as the options of `add_bake` say."""
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
 
     shots: list[tuple[str | None, naming.ListedShot]]
     if options.shots:
@@ -282,7 +282,7 @@ def is_folder(output: Path) -> bool:
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
     """Return the file that holds the garment, and the prim that was asked for."""
-    from ssilk_usd.read_stage import USD_SUFFIXES, split_location
+    from ssilk_usd.opening.stage import USD_SUFFIXES, split_location
 
     file, prim = split_location(options.garment) if options.garment else ("", None)
     return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)
@@ -300,7 +300,7 @@ def check_output(output: Path, *inputs: Path | str | None) -> None:
 
 def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garment, ProxyRig | None]:
     """Read the character, the garment and its authored rig, as the options of `add_scene` say."""
-    from ssilk_usd.read_scene import read_scene
+    from ssilk_usd.reading.scene import read_scene
 
     if not options.stage.exists():
         fail(str(options.stage), "there is no such file", "a USD stage with a character is needed")

@@ -43,7 +43,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Reduce and write."""
-    from ssilk_usd.read_motion import motion_files
+    from ssilk_usd.reading.motion import motion_files
 
     from ..network.checkpoint import load_model, save_model
     from ..quality.reduction import Reducer
@@ -66,8 +66,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
     """Read the motions that were named, or those of the training whose files are still there."""
-    from ssilk_usd.read_motion import read_motions
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
+    from ssilk_usd.reading.motion import read_motions
 
     known = file.provenance.get("motions", {})
     there = [path for path in known if Path(split_location(path)[0]).is_file()]

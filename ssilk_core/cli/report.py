@@ -22,7 +22,7 @@ from ..scene.fabrics import Fabric, fabric_of_file
 from .options import check_output
 
 if TYPE_CHECKING:
-    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.opening.garment_api import GarmentRecord
 
     from ..delivery.report.page import Section
 
@@ -84,10 +84,10 @@ def _check(options: argparse.Namespace) -> None:
 
 def _shot(path: Path, report: Reporter) -> list[Section]:
     """Return the sections of a shot, its provenance last."""
-    from ssilk_usd.body_faces import open_with_full_bodies
-    from ssilk_usd.play import Shot
-    from ssilk_usd.provenance import read_provenance
-    from ssilk_usd.read_shot import read_parts
+    from ssilk_usd.reading.facts import read_provenance
+    from ssilk_usd.shots.play import Shot
+    from ssilk_usd.shots.read import read_parts
+    from ssilk_usd.writing.body_faces import open_with_full_bodies
 
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
@@ -142,7 +142,7 @@ def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
 
 def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Bake a model and return the sections of the shot without its provenance."""
-    from ssilk_usd.shot import write_shot
+    from ssilk_usd.shots.shot import write_shot
 
     from ..delivery.bake import BakeRequest, load_rollout
 

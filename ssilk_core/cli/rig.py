@@ -50,7 +50,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Prepare the scene and write it."""
     import numpy as np
-    from ssilk_usd.rig_io import write_rigged_stage
+    from ssilk_usd.writing.rig import write_rigged_stage
 
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES

@@ -32,7 +32,7 @@ from . import options as shared
 
 if TYPE_CHECKING:
     import torch
-    from ssilk_usd.points import PointCache
+    from ssilk_usd.shots.points import PointCache
 
     from ..delivery.bake.result import ShotShapes
     from ..physics.simulate import SimulationOptions
@@ -79,8 +79,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
-    from ssilk_usd.frame_range import read_in_range
-    from ssilk_usd.read_motion import motion_files
+    from ssilk_usd.reading.frame_range import read_in_range
+    from ssilk_usd.reading.motion import motion_files
 
     from ..devices import select_device
     from ..physics.simulate import SimulationOptions
@@ -124,7 +124,7 @@ class _Shot:
     @property
     def is_done(self) -> bool:
         """Return whether the file is there and was simulated from the same."""
-        from ssilk_usd.provenance import read_provenance
+        from ssilk_usd.reading.facts import read_provenance
 
         if not self.output.is_file():
             return False
@@ -143,7 +143,7 @@ class _Shot:
 
 def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[Path]:
     """Return the file that each motion's shot is written to."""
-    from ssilk_usd.read_stage import LAYER_SUFFIXES
+    from ssilk_usd.opening.stage import LAYER_SUFFIXES
 
     if output.suffix in LAYER_SUFFIXES:
         if len(motions) != 1:
@@ -208,7 +208,7 @@ class _Caches:
         played: Sequence[Motion],
         report: Reporter,
     ) -> None:
-        from ssilk_usd.read_stage import open_stage
+        from ssilk_usd.opening.stage import open_stage
         from ssilk_usd.units import StageUnits
 
         self.stack, self.options, self.shots, self.scene, self.played = stack, options, shots, scene, played
@@ -249,7 +249,7 @@ class _Caches:
 
     def _skin(self, shot: int) -> None:
         """Turn the points of a shot into joints and blendshapes."""
-        from ssilk_usd.trajectories import MeshTrajectories
+        from ssilk_usd.shots.trajectories import MeshTrajectories
 
         from ..delivery.bake import rig_deformer, skin_trajectories
 
@@ -280,7 +280,7 @@ class _Caches:
         path.unlink()
 
     def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:
-        from ssilk_usd.points import point_cache
+        from ssilk_usd.shots.points import point_cache
 
         asked, own = self.shots[shot], self.stack.enter_context(ExitStack())
         cache = own.enter_context(

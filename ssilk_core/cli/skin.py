@@ -48,10 +48,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Fit, write and verify."""
-    from ssilk_usd.read_motion import read_motion
-    from ssilk_usd.read_stage import open_stage, split_location
-    from ssilk_usd.read_visibility import read_hidden
-    from ssilk_usd.trajectories import MeshTrajectories
+    from ssilk_usd.opening.stage import open_stage, split_location
+    from ssilk_usd.reading.motion import read_motion
+    from ssilk_usd.reading.visibility import read_hidden
+    from ssilk_usd.shots.trajectories import MeshTrajectories
     from ssilk_usd.units import StageUnits
 
     from ..delivery.bake import cache_origin, motion_at, skin_trajectories

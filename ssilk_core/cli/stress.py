@@ -76,8 +76,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _subject(options: argparse.Namespace) -> StressSubject:
     """Load the model, its character and the motion."""
-    from ssilk_usd.read_motion import read_motion
-    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.opening.stage import open_stage
+    from ssilk_usd.reading.motion import read_motion
 
     from ..delivery.bake import on_character
     from ..network.checkpoint import load_model

@@ -181,7 +181,7 @@ class Bench:
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:
         """Put a garment on the character of the stage."""
-        from ssilk_usd.read_stage import open_stage
+        from ssilk_usd.opening.stage import open_stage
 
         from ..delivery.bake import on_character
         from ..quality.evaluation.methods import EvaluationScene
@@ -210,7 +210,7 @@ class Bench:
 
     def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
         """Return the files of the clips to measure on, and the motions to reduce models for: the others, if any."""
-        from ssilk_usd.read_motion import motion_files
+        from ssilk_usd.reading.motion import motion_files
 
         folder: Path = self.options.motions
         if not folder.is_dir():
@@ -228,6 +228,6 @@ class Bench:
         return {name: files[name] for name in names}, [self._read(path, file) for path in others]
 
     def _read(self, path: Path, file: ModelFile) -> Motion:
-        from ssilk_usd.read_motion import read_motion
+        from ssilk_usd.reading.motion import read_motion
 
         return read_motion(path, file.scene.character.skeleton)

@@ -110,7 +110,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
     """Read everything that the options name; return it as a `TrainJob` on a device."""
-    from ssilk_usd.read_motion import motion_files, read_motions
+    from ssilk_usd.reading.motion import motion_files, read_motions
 
     from ..files import sha256
     from ..training.job import TrainJob, split_motions

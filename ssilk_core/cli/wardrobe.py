@@ -141,7 +141,7 @@ def _request(parser: argparse.ArgumentParser, entry: WardrobeEntry, path: Path, 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
     """Return the files that a training reads."""
-    from ssilk_usd.read_motion import motion_files
+    from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
     return [folder / options.stage, folder / shared.wardrobe(options)[0], *motions]

@@ -69,7 +69,7 @@ def rig_and_animate(bpy: ModuleType, garment: Any, frames: int = 40) -> None:
 def ended(garment: Any, *, after: int = 0, until: Any = None, seconds: float = 120) -> Any:
     """Wait until the training of a garment has come so far, is as asked, or has ended; return its state."""
     from blender_addon.outside.jobs import read_state
-    from blender_addon.scene.models import job_of
+    from blender_addon.playback.models import job_of
 
     deadline = time.monotonic() + seconds
     until = until or (lambda state: after and state.done >= after)
@@ -109,14 +109,14 @@ def shown(bpy: ModuleType, garment: Any, frames: range) -> np.ndarray:
 
 def state_file(garment: Any) -> dict[str, Any]:
     """Return what stands in a job's small file."""
-    from blender_addon.scene.models import job_of
+    from blender_addon.playback.models import job_of
 
     return json.loads((job_of(garment) / "state.json").read_text())
 
 
 def train_skirt(bpy: ModuleType, skirt: Any, path: Path, python: str) -> None:
     """Train the skirt for a moment on its pillar, make its model lively, and save the file."""
-    from blender_addon.scene.models import model_of
+    from blender_addon.playback.models import model_of
 
     rig_and_animate(bpy, skirt)
     bpy.ops.wm.save_as_mainfile(filepath=str(path))

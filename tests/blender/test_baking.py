@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from blender_addon.scene.models import model_of
+from blender_addon.playback.models import model_of
 
 from .conftest import activate
 from .scenes import decoded, shown
@@ -34,7 +34,7 @@ def refused(bpy, garment, **options) -> str:
 
 
 def strips(thing, garment) -> list:
-    from blender_addon.scene.keys import is_baked
+    from blender_addon.motions.keys import is_baked
 
     tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
     return [strip for track in tracks for strip in track.strips if is_baked(strip.action, garment)]
@@ -90,7 +90,7 @@ def test_a_reduced_model_leaves_its_proxies_at_rest(ready, trained, tmp_path, ss
 
 def test_levels_are_those_of_ssilk(bpy):
     from blender_addon.operators.baking import QUALITY_ITEMS
-    from blender_addon.training_properties import CHOICES
+    from blender_addon.settings.training import CHOICES
     from ssilk_core.quality.levels import QUALITIES
     from ssilk_core.training.settings import PRESETS
 
@@ -99,7 +99,7 @@ def test_levels_are_those_of_ssilk(bpy):
 
 
 def test_the_bake_is_one_action_beneath_the_artists_own(ready, trained):
-    from blender_addon.scene.keys import SLOTS, curves_of, is_baked
+    from blender_addon.motions.keys import SLOTS, curves_of, is_baked
 
     bake(ready, trained)
     armature, keys = ready.data.objects["Rig"], trained.data.shape_keys
@@ -197,7 +197,7 @@ def test_removing_a_bake_leaves_the_garment_as_it_was(ready, trained):
 
 
 def test_garments_of_one_armature_are_baked_apart(bpy, skirt):
-    from blender_addon.scene.keys import Channel, bake_keys, has_keys, remove_keys
+    from blender_addon.motions.keys import Channel, bake_keys, has_keys, remove_keys
 
     armature, apron = bpy.data.objects["Rig"], bpy.data.objects.new("Apron", skirt.data.copy())
 
@@ -289,7 +289,7 @@ def test_what_does_not_fit_any_more_is_said(ready, trained):
 
 
 def test_a_character_that_a_chosen_model_does_not_know_is_called_by_its_name(ready, trained, tmp_path):
-    from blender_addon.scene.models import model_of
+    from blender_addon.playback.models import model_of
 
     trained.ssilk.model = str(shutil.copy(model_of(trained), tmp_path / "chosen.safetensors"))
     edit_bone(ready, ready.data.objects["Rig"], "Head", lambda bones, bone: bone.translate(bone.vector))

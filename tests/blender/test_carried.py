@@ -69,8 +69,8 @@ def test_its_rig_moves_it_once_and_as_the_bone_did(ready, carried):
 
 def test_what_would_move_twice_is_not_trained(bpy, carried):
     from blender_addon.errors import SetupError
+    from blender_addon.playback.bake import need_bakeable
     from blender_addon.scene.armature import read_joints
-    from blender_addon.scene.baked import need_bakeable
 
     rig = bpy.data.objects["Rig"]
     carried.modifiers.new("Armature", "ARMATURE").object = rig

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blender_addon import classes as palette
+from blender_addon.arrays import classes as palette
 
 
 def test_vertices_of_islands_that_are_all_loose_fall_off():

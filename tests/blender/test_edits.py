@@ -28,7 +28,7 @@ def edit(ready, rigged):
 
 
 def edits_of(bpy, thing):
-    from blender_addon.scene.edit_tracking import find_edits
+    from blender_addon.rigging.edit_tracking import find_edits
 
     return find_edits(bpy.data.objects["Rig"], thing)
 
@@ -193,7 +193,7 @@ def test_fewer_proxies_leave_an_edited_one_its_own(ready, rigged, edit):
 @pytest.fixture
 def dressed_up(ready, rigged):
     """The skirt with weights of chance put on as trained ones, after its vertex 5 was repainted; both weights."""
-    from blender_addon.scene.trained_weights import put_trained_weights
+    from blender_addon.scene.weights import put_trained_weights
 
     armature, names = ready.data.objects["Rig"], [*BONES, *proxies_of(ready)]
     for group in rigged.vertex_groups:
@@ -223,7 +223,7 @@ def test_trained_weights_are_no_repainting_and_repainted_vertices_stay_known(rea
 
 def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, rigged, dressed_up):
     from blender_addon.scene.gather import gather
-    from blender_addon.scene.trained_weights import has_trained_weights, put_trained_weights, restore_own_weights
+    from blender_addon.scene.weights import has_trained_weights, put_trained_weights, restore_own_weights
 
     names, before, learned = dressed_up
     armature = ready.data.objects["Rig"]
@@ -243,12 +243,7 @@ def test_trained_weights_come_off_again_but_for_what_was_painted_on_them(ready, 
 
 
 def test_a_garment_without_weights_of_its_own_has_none_again(ready, skirt):
-    from blender_addon.scene.trained_weights import (
-        has_trained_weights,
-        own_groups,
-        put_trained_weights,
-        restore_own_weights,
-    )
+    from blender_addon.scene.weights import has_trained_weights, own_groups, put_trained_weights, restore_own_weights
 
     armature, weights = ready.data.objects["Rig"], np.full((len(skirt.data.vertices), 3), 1 / 3, dtype=np.float32)
     put_trained_weights(armature, skirt, weights, BONES)

@@ -25,13 +25,13 @@ TERMS = [[1, {"stretch": 1.0, "bending": None}], [2, {"stretch": 0.5, "bending":
 
 
 def classes(garment: Any, values: int | np.ndarray = 2) -> None:
-    from blender_addon.scene.attributes import write_classes
+    from blender_addon.scene.classes import write_classes
 
     write_classes(garment.data, np.broadcast_to(values, len(garment.data.vertices)))
 
 
 def painted(garment: Any) -> None:
-    from blender_addon.scene.attributes import show_classes
+    from blender_addon.scene.classes import show_classes
 
     show_classes(garment.data)
 
@@ -117,7 +117,7 @@ def shown_heat(garment: Any) -> None:
 
 def live(monkeypatch: Any, **fields: Any) -> Callable[[Any], None]:
     def play(garment: Any) -> None:
-        from blender_addon.scene import playing
+        from blender_addon.playback import playing
 
         monkeypatch.setitem(playing._played, garment.session_uid, SimpleNamespace(**fields))
 

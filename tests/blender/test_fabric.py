@@ -7,7 +7,7 @@ import pytest
 
 
 def test_every_fabric_and_model_can_be_chosen(bpy, skirt):
-    from blender_addon.fabric_properties import CHOICES, MODELS, NUMBERS
+    from blender_addon.settings.fabric import CHOICES, MODELS, NUMBERS
     from ssilk_core.scene.fabrics import FABRICS, STRETCH_MODELS
 
     assert [name for name, *_ in CHOICES] == list(FABRICS)
@@ -16,7 +16,7 @@ def test_every_fabric_and_model_can_be_chosen(bpy, skirt):
 
 
 def test_only_what_differs_is_said(bpy, skirt):
-    from blender_addon.fabric_properties import fabric_options
+    from blender_addon.settings.fabric import fabric_options
 
     fabric = skirt.ssilk.fabric
     fabric.preset, fabric.stretch_model, fabric.density = "silk", "baraff_witkin", 0.2
@@ -25,7 +25,7 @@ def test_only_what_differs_is_said(bpy, skirt):
 
 
 def test_a_preset_sets_the_values_and_these_may_be_changed(bpy, skirt):
-    from blender_addon.fabric_properties import CHOICES, fabric_options
+    from blender_addon.settings.fabric import CHOICES, fabric_options
 
     fabric = skirt.ssilk.fabric
     assert fabric_options(fabric) == ["--fabric", "default"]
@@ -44,7 +44,7 @@ def test_each_garment_has_its_own(bpy, skirt):
 
 
 def test_the_margin_is_shown_in_the_scenes_units(bpy, skirt):
-    from blender_addon.fabric_properties import fabric_options
+    from blender_addon.settings.fabric import fabric_options
 
     fabric = skirt.ssilk.fabric
     assert fabric.margin == pytest.approx(0.008)
@@ -57,7 +57,7 @@ def test_the_margin_is_shown_in_the_scenes_units(bpy, skirt):
 def test_ssilk_takes_the_options(ready, skirt, ssilk_python):
     import subprocess
 
-    from blender_addon.fabric_properties import fabric_options
+    from blender_addon.settings.fabric import fabric_options
 
     skirt.ssilk.fabric.preset = "wool"
     skirt.ssilk.fabric.stretch_model = "baraff_witkin"
@@ -73,7 +73,7 @@ def test_ssilk_takes_the_options(ready, skirt, ssilk_python):
 
 
 def test_the_panel_shows_the_values_of_the_model(bpy, skirt):
-    from blender_addon.panels.fabric import FabricPanel
+    from blender_addon.panels.garment import FabricPanel
 
     from .test_panels import drawn
 

@@ -25,7 +25,7 @@ def saved(bpy, skirt, tmp_path):
 def job(bpy, garment: str = "Skirt", file: str = "größe.blend", state: str = "running") -> Path:
     """Return a new job beside the file that trains a garment of some file."""
     from blender_addon.outside import jobs
-    from blender_addon.scene.models import trainings_folder
+    from blender_addon.playback.models import trainings_folder
 
     folder = jobs.create(trainings_folder(), garment)
     jobs.own(folder, garment, file)
@@ -34,7 +34,7 @@ def job(bpy, garment: str = "Skirt", file: str = "größe.blend", state: str = "
 
 
 def job_of(garment):
-    from blender_addon.scene.models import job_of
+    from blender_addon.playback.models import job_of
 
     return job_of(garment)
 
@@ -111,7 +111,7 @@ def test_drawing_reads_no_trainings_without_their_garments(bpy, saved):
 
 
 def test_jobs_that_do_not_say_what_they_train_are_left_out(bpy, saved):
-    from blender_addon.scene.models import trainings
+    from blender_addon.playback.models import trainings
 
     folder = job(bpy)
     for text in ("", "[]", '{"garment": "Skirt", "file": 3, "begun": 1}'):

@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
 from blender_addon.operators.gltf_export import proposed
-from blender_addon.scene import exporting
-from blender_addon.scene.exporting import SETTINGS, largest_loss
+from blender_addon.playback import gltf
+from blender_addon.playback.gltf import SETTINGS, largest_loss
 from ssilk_core.delivery.gltf.container import GlbFile
 from ssilk_core.delivery.gltf.skinned import SkinnedGlb
 from ssilk_core.errors import SsilkError
@@ -97,13 +97,13 @@ def test_a_glb_plays_at_a_rate_that_is_no_integer(ready, baked, tmp_path, monkey
     render.fps, render.fps_base = 24, 1.001
     before = render.fps_base
     if divides:  # as an exporter would that has been mended
-        export = exporting._export
+        export = gltf._export
 
         def mended(path):
-            with exporting._fps_base(1 / render.fps_base):
+            with gltf._fps_base(1 / render.fps_base):
                 export(path)
 
-        monkeypatch.setattr(exporting, "_export", mended)
+        monkeypatch.setattr(gltf, "_export", mended)
     assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
     assert render.fps_base == before
     played = SkinnedGlb(path, "Skirt")

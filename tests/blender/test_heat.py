@@ -11,7 +11,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 from mathutils import Matrix
 from mathutils.bvhtree import BVHTree
 
-from blender_addon import heat
+from blender_addon.arrays import heat
 
 from .conftest import activate, add_mesh, tube
 from .scenes import ended, rig_and_animate
@@ -97,7 +97,7 @@ def dressed(bpy, skirt):
 
 
 def depths(bpy, garment) -> np.ndarray:
-    from blender_addon.scene.heat import PENETRATION, measuring
+    from blender_addon.quality.heat import PENETRATION, measuring
 
     steps = measuring(garment, PENETRATION, bpy.context.evaluated_depsgraph_get())
     while True:
@@ -152,7 +152,7 @@ def colors(garment) -> np.ndarray:
 
 
 def test_heat_is_shown_follows_frames_and_goes(bpy, dressed):
-    from blender_addon.scene import heat_updates
+    from blender_addon.quality import heat_updates
 
     assert bpy.ops.ssilk.show_heat(kind="PENETRATION", deepest=0.02) == {"FINISHED"}
     expected = heat.colors_of(expected_depths(dressed), 0.02)
@@ -229,7 +229,7 @@ def test_skin_that_shows_is_coloured_on_the_body(bpy, dressed):
 
 
 def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch):
-    from blender_addon import overlay
+    from blender_addon.scene import overlay
 
     hidden = []
     monkeypatch.setattr(overlay, "hide", lambda: hidden.append(True))
@@ -328,7 +328,7 @@ def world_points(evaluated, world) -> np.ndarray:
 
 def linearly_skinned(bpy, skirt) -> np.ndarray:
     """Skin by the model's LBS weights and Blender's own pose matrices."""
-    from blender_addon.scene.models import model_of
+    from blender_addon.playback.models import model_of
     from ssilk_core.network.checkpoint import load_model
 
     scene, armature = load_model(model_of(skirt)).scene, bpy.data.objects["Rig"]

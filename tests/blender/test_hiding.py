@@ -124,7 +124,7 @@ def test_what_cannot_be_compared_is_refused_and_nothing_changes(bpy, skirt, pill
 
 
 def test_the_panel_offers_both(bpy, skirt, pillar):
-    from blender_addon.panels.baking import BakingPanel
+    from blender_addon.panels.playback import BakingPanel
 
     assert {"ssilk.hide_covered", "ssilk.show_covered"} <= set(drawn(BakingPanel, bpy.context))
 
@@ -135,9 +135,9 @@ def test_blender_imports_a_body_without_its_hidden_faces(bpy, tmp_path, variants
 
     expose_usd()
     from pxr import Usd, UsdGeom
-    from ssilk_usd.author import define_mesh
-    from ssilk_usd.body_faces import BODY, FULL, HiddenPolygons, hide_polygons
     from ssilk_usd.units import StageUnits
+    from ssilk_usd.writing.author import define_mesh
+    from ssilk_usd.writing.body_faces import BODY, FULL, HiddenPolygons, hide_polygons
 
     from ssilk_core.scene.assets import Mesh
 

@@ -43,7 +43,7 @@ def test_a_rigged_stage_comes_in_with_its_proxies(ready, stage, ssilk_python, tm
     skirt, armature = ready.data.objects["Skirt"], armature_of(ready)
     from blender_addon.panels.rig import rig_line
     from blender_addon.scene.armature import proxy_names
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     assert len(proxy_names(armature, skirt)) == 5
     assert rig_line(skirt) == f"5 proxies on '{armature.name}'"
@@ -55,7 +55,7 @@ def test_a_rigged_stage_comes_in_with_its_proxies(ready, stage, ssilk_python, tm
 
 
 def test_what_was_adopted_is_known_when_it_is_edited(ready, stage):
-    from blender_addon.scene.edit_tracking import find_edits
+    from blender_addon.rigging.edit_tracking import find_edits
 
     ready.ops.wm.usd_import(filepath=str(stage))
     ready.ops.ssilk.adopt_rig(filepath=str(stage))

@@ -6,9 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from blender_addon.arrays.joints import Joints, identifiers, joint_order, joint_paths
 from blender_addon.errors import SetupError
-from blender_addon.joints import Joints, joint_order
-from blender_addon.names import identifiers, joint_paths
 
 
 def test_names_become_unique_identifiers():

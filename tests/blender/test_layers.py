@@ -25,7 +25,7 @@ sys.path.insert(0, sys.argv[1])
 import conftest
 from pathlib import Path
 from ssilk_core.cli import main
-from ssilk_usd.play import Shot
+from ssilk_usd.shots.play import Shot
 
 conftest.write_hero(Path("hero.usda"))
 conftest.write_clip(Path("clip.usda"))

@@ -97,7 +97,7 @@ def test_a_linked_garment_cannot_be_changed_and_says_so(ready, skirt, tmp_path):
 
 
 def test_classes_survive_linking(ready, skirt, tmp_path):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     values = np.arange(len(skirt.data.vertices)) % 3
     skirt.data.attributes.new("ssilk:class", "INT", "POINT").data.foreach_set("value", values)

@@ -18,10 +18,10 @@ BODY = ROOT / "usd" / "ssilk_usd" / "stages" / "demo_body.usdc"
 
 
 def test_a_character_that_nothing_moves_gets_the_motions_of_the_demo(ready, monkeypatch):
+    from blender_addon.motions.sources import sources
     from blender_addon.operators import demo_motions
     from blender_addon.scene.armature import read_joints
-    from blender_addon.scene.motions import sources
-    from blender_addon.scene.units import scene_units
+    from blender_addon.scene.objects import scene_units
     from ssilk_core.scene.kinematics import motion_transforms
 
     bpy, made = ready, []
@@ -61,7 +61,7 @@ def test_what_is_no_biped_is_told_to_bring_its_motions(ready, skirt):
 def lines_up(bpy, garment) -> tuple[list[str], object]:
     """Press Make It Move; return the operators that it called, and the garment's training."""
     from blender_addon.operators import make_it_move
-    from blender_addon.scene.models import job_of
+    from blender_addon.playback.models import job_of
 
     called, call = [], make_it_move._call
     try:
@@ -75,7 +75,7 @@ def lines_up(bpy, garment) -> tuple[list[str], object]:
 def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path, monkeypatch):
     from blender_addon.operators.training import watch
     from blender_addon.panels import GarmentPanel
-    from blender_addon.scene import live, playing
+    from blender_addon.playback import live, playing
 
     bpy, settings = ready, skirt.ssilk.training
     animate(bpy, bpy.data.objects["Rig"], "Walk", 0.3, 37)
@@ -115,7 +115,7 @@ def test_it_gets_better_until_it_is_finished(ready, skirt, tmp_path, monkeypatch
     from blender_addon.operators.training import watch
     from blender_addon.outside.jobs import read_curve
     from blender_addon.panels import GarmentPanel
-    from blender_addon.scene import playing
+    from blender_addon.playback import playing
 
     bpy, command = ready, training.train_command
     tiny = ["--set", "iterations=4", "--set", "batch=2", "--set", "pretraining_batch=2", "--set", "valid_frames=8"]

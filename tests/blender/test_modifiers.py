@@ -78,8 +78,8 @@ def test_what_is_off_or_deforms_nothing_is_passed_over(bpy, skirt):
 
 def test_training_baking_and_playing_say_the_same(bpy, skirt):
     from blender_addon.errors import SetupError
+    from blender_addon.playback.bake import need_bakeable
     from blender_addon.scene.armature import read_joints
-    from blender_addon.scene.baked import need_bakeable
     from blender_addon.scene.gather import gather
 
     rig = bpy.data.objects["Rig"]
@@ -95,8 +95,8 @@ def test_training_baking_and_playing_say_the_same(bpy, skirt):
 
 def test_what_bones_may_be_made_of_is_seen_to_move_what_bones_moved(bpy, skirt):
     from blender_addon.errors import SetupError
+    from blender_addon.playback.bake import need_bakeable
     from blender_addon.scene.armature import read_joints
-    from blender_addon.scene.baked import need_bakeable
     from blender_addon.scene.gather import gather
     from blender_addon.scene.modifiers import need_plain_modifiers
 
@@ -116,7 +116,7 @@ def test_what_bones_may_be_made_of_is_seen_to_move_what_bones_moved(bpy, skirt):
 
 @pytest.mark.parametrize("kinds", [["SUBSURF"], ["SOLIDIFY", "SUBSURF"], ["DECIMATE"], ["SMOOTH"]])
 def test_the_mesh_beneath_what_refines_it_is_where_bones_move_it(bpy, skirt, kinds):
-    from blender_addon.scene.cage import cage_points
+    from blender_addon.scene.modifiers import cage_points
 
     rig, pillar = bpy.data.objects["Rig"], bpy.data.objects["Pillar"]
     rig.location, rig.scale = (0.3, -0.2, 0.1), (1.1,) * 3
@@ -140,7 +140,7 @@ def test_the_mesh_beneath_what_refines_it_is_where_bones_move_it(bpy, skirt, kin
 
 @pytest.mark.parametrize("kind", ["PENETRATION", "STRETCH", "SKIN"])
 def test_heat_maps_measure_the_mesh_that_is_refined(bpy, skirt, kind):
-    from blender_addon.scene import heat
+    from blender_addon.quality import heat
 
     def values() -> np.ndarray:
         steps = heat.measuring(skirt, getattr(heat, kind), bpy.context.evaluated_depsgraph_get())

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from blender_addon.classes import COLORS
+from blender_addon.arrays.classes import COLORS
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def painted(bpy, skirt):
 
 
 def surface(bpy, thing):
-    from blender_addon.scene.surface import class_surface
+    from blender_addon.scene.overlay import class_surface
 
     bpy.context.view_layer.update()
     return class_surface(thing, bpy.context.evaluated_depsgraph_get())
@@ -74,7 +74,7 @@ def test_nothing_is_drawn_without_classes_or_with_broken_ones(bpy, skirt, mode):
 
 
 def test_there_is_none_in_background(bpy, skirt):
-    from blender_addon import overlay
+    from blender_addon.scene import overlay
 
     with pytest.raises(RuntimeError, match="no window to draw in"):
         bpy.ops.ssilk.toggle_overlay()
@@ -85,7 +85,7 @@ def test_there_is_none_in_background(bpy, skirt):
 def test_disabling_takes_it_away(bpy, skirt, monkeypatch):
     import addon_utils
 
-    from blender_addon import overlay
+    from blender_addon.scene import overlay
 
     handlers: list[object] = []
     views = SimpleNamespace(
@@ -104,7 +104,7 @@ def test_disabling_takes_it_away(bpy, skirt, monkeypatch):
 def test_the_projection_comes_nearer_by_the_same_depth_everywhere(bpy):
     from mathutils import Matrix, Vector
 
-    from blender_addon.overlay import NEARER, _nearer
+    from blender_addon.scene.overlay import NEARER, _nearer
 
     lens = Matrix(((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, -1.02, -0.2), (0, 0, -1, 0)))
     for point in (Vector((0, 0, -1, 1)), Vector((2, 1, -9, 1))):

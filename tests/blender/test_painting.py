@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from blender_addon import classes as palette
+from blender_addon.arrays import classes as palette
 
 from .conftest import activate, add_mesh
 
@@ -54,7 +54,7 @@ def test_painting_starts_tight_with_a_palette(bpy, quad):
 def test_blenders_brush_paints_the_chosen_class(bpy, quad, value, number):
     bpy.ops.ssilk.paint_classes()
     assert bpy.ops.ssilk.brush_class(value=value) == {"FINISHED"}
-    from blender_addon.scene.painting import is_chosen
+    from blender_addon.scene.classes import is_chosen
 
     assert [is_chosen(bpy.context, color) for color in palette.COLORS] == [number == each for each in range(3)]
     bpy.ops.paint.vertex_color_set()

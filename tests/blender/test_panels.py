@@ -87,7 +87,7 @@ def test_classes_are_counted_and_buttons_follow_the_mode(bpy, skirt):
 
 def test_pieces_that_fall_off_are_told_until_they_are_held(bpy, skirt):
     from blender_addon.panels import ClassesPanel
-    from blender_addon.scene.attributes import write_classes
+    from blender_addon.scene.classes import write_classes
 
     skirt.data.vertices.add(1)
     values = np.array([0] * 24 + [2] * 289, dtype=np.int32)
@@ -100,7 +100,7 @@ def test_pieces_that_fall_off_are_told_until_they_are_held(bpy, skirt):
 
 def test_pieces_that_stitches_hold_do_not_fall_off(bpy):
     from blender_addon.panels.classes import adrift_line
-    from blender_addon.scene.attributes import write_classes
+    from blender_addon.scene.classes import write_classes
 
     square, sides = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.array([[0, 1, 2, 3]])
     places = [(1, (0, 0, 0)), (0.05, (0, 0, 0.004)), (0.03, (0, 0, 0.008)), (0.05, (1.053, 0, 0)), (0.05, (0, 0, 2))]
@@ -125,7 +125,7 @@ def test_pieces_that_stitches_hold_do_not_fall_off(bpy):
 
 def test_sides_that_face_each_other_hold_nothing_unless_a_piece_lies_wholly_on_the_other(bpy):
     from blender_addon.panels.classes import adrift_line
-    from blender_addon.scene.attributes import write_classes
+    from blender_addon.scene.classes import write_classes
 
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 
@@ -152,7 +152,7 @@ def test_broken_classes_are_told_and_drawn_around(bpy, skirt):
 
 def test_the_rig_is_told_or_why_there_is_none(bpy, skirt):
     from blender_addon.panels import RigPanel
-    from blender_addon.scene.attributes import write_classes
+    from blender_addon.scene.classes import write_classes
 
     assert drawn(RigPanel, bpy.context)[0] == "No proxies yet on 'Rig'"
     write_classes(skirt.data, np.ones(len(skirt.data.vertices), dtype=np.int32))

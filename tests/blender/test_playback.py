@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from blender_addon.scene.models import model_of
+from blender_addon.playback.models import model_of
 
 from .conftest import activate
 from .scenes import decoded, enliven, shown
@@ -30,7 +30,7 @@ def wanted(ready, trained, folder, ssilk_python) -> np.ndarray:
 
 
 def playing():
-    from blender_addon.scene import playing
+    from blender_addon.playback import playing
 
     return playing
 

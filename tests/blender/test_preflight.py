@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blender_addon.findings import Clip, polygons_of, read_findings
+from blender_addon.arrays.findings import Clip, polygons_of, read_findings
 from ssilk_core.authoring.preflight.motion import unread_motion
 from ssilk_core.scene.assets import Mesh
 
@@ -14,7 +14,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 from mathutils import Matrix
 
-from blender_addon.scene.keys import curves_of
+from blender_addon.motions.keys import curves_of
 
 from .conftest import activate, add_mesh
 from .scenes import animate
@@ -257,7 +257,7 @@ def test_a_modifier_before_the_armature_is_listed(ready, skirt):
 
 
 def test_joints_are_selected_as_bones(ready, skirt):
-    from blender_addon.preflight_properties import keep_findings
+    from blender_addon.settings.preflight import keep_findings
     from ssilk_core.authoring.preflight.finding import Finding
 
     finding = Finding(severity="info", code="still", prim="", found="", elements="joints", indices=(1,))
@@ -296,7 +296,7 @@ def test_a_fix_is_undone(ready, skirt):
 
 def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
     from blender_addon.panels.base import lines
-    from blender_addon.panels.preflight import PreflightPanel, line
+    from blender_addon.panels.quality import PreflightPanel, line
 
     assert drawn(PreflightPanel, ready.context) == ["ssilk.inspect"]
     spoil(ready, skirt, loose_vertex)
@@ -311,7 +311,7 @@ def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
 def told(code: str, elements: str, indices: list[int]) -> str:
     from types import SimpleNamespace
 
-    from blender_addon.panels.preflight import line
+    from blender_addon.panels.quality import line
 
     return line(SimpleNamespace(code=code, elements=elements, indices=indices))
 
@@ -337,7 +337,7 @@ def test_each_body_is_told_its_own_holes():
 
 def test_what_was_mended_by_hand_goes_and_the_rest_says_that_it_is_old(ready, skirt):
     from blender_addon.operators.training import watch
-    from blender_addon.panels.preflight import PreflightPanel
+    from blender_addon.panels.quality import PreflightPanel
 
     spoil(ready, skirt, loose_vertex)
     spoil(ready, skirt, loose_vertex)

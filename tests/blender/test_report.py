@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from blender_addon.curves import COLORS, GROUND, picture, series
+from blender_addon.arrays.curves import COLORS, GROUND, picture, series
 from blender_addon.outside.jobs import JobState
 from blender_addon.outside.report import findings, improvement, progress
 

@@ -18,7 +18,7 @@ from .scenes import proxies_of, weights_of
 
 READ = """
 import json, sys
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.reading.scene import read_scene
 character, garment, rig = read_scene(sys.argv[1])
 print(json.dumps({
     "joints": character.skeleton.joint_names, "binds": character.skeleton.bind_transforms[:, :3, 3].tolist(),
@@ -32,7 +32,7 @@ print(json.dumps({
 
 
 def test_hem_is_loose_and_waist_is_not(classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     heights = np.array([vertex.co.z for vertex in classified.data.vertices])
     values = read_classes(classified.data)
@@ -41,7 +41,7 @@ def test_hem_is_loose_and_waist_is_not(classified):
 
 
 def test_tightness_slides_from_what_is_pinned_to_all(ready, classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     found = read_classes(classified.data)
     tight = []
@@ -60,7 +60,7 @@ def test_tightness_slides_from_what_is_pinned_to_all(ready, classified):
 
 
 def test_pins_come_from_a_vertex_group(ready, classified):
-    from blender_addon.scene.attributes import read_classes
+    from blender_addon.scene.classes import read_classes
 
     ring = [vertex.index for vertex in classified.data.vertices if vertex.co.z < 0.62]
     classified.vertex_groups.new(name="Hem").add(ring, 0.6, "REPLACE")
@@ -109,7 +109,7 @@ def evaluated(bpy, thing) -> np.ndarray:
 
 def contract_of(thing, python: str, path: Path) -> dict:
     """What ssilk reads of a garment that Blender hands over."""
-    from ssilk_usd.write import write_scene
+    from ssilk_usd.writing.files import write_scene
 
     from blender_addon.scene.gather import gather
 
@@ -348,7 +348,7 @@ def test_what_ssilk_has_is_in_metres_with_y_up(bpy, skirt):
 
 
 def test_faces_of_a_mirrored_object_are_turned_over(bpy, skirt):
-    from ssilk_usd.read_polygons import triangulate
+    from ssilk_usd.reading.polygons import triangulate
 
     from blender_addon.scene.gather import gather
 

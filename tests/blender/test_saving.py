@@ -16,8 +16,8 @@ DEEPER = ["//../ssilk/Skirt-001/model.safetensors", "//../ssilk/Skirt-001", "//.
 @pytest.fixture
 def saved(bpy, skirt, tmp_path):
     """The skirt in a saved file, with a model, a training and a file of motion."""
+    from blender_addon.motions.sources import FILE, Source
     from blender_addon.operators.training import add_motion
-    from blender_addon.scene.motions import FILE, Source
 
     folder = tmp_path / "shots ä"
     folder.mkdir()
@@ -55,7 +55,7 @@ def test_a_copy_gets_paths_of_its_own_and_the_file_keeps_its(bpy, saved, tmp_pat
 
 
 def test_a_folder_that_moves_as_a_whole_keeps_its_models(bpy, saved, tmp_path):
-    from blender_addon.scene.models import model_of
+    from blender_addon.playback.models import model_of
 
     model = tmp_path / "shots ä" / "ssilk" / "Skirt-001" / "model.safetensors"
     model.parent.mkdir(parents=True)

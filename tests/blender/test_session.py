@@ -22,8 +22,8 @@ FRAMES = range(1, 25)
 WARDROBE = """
 import sys
 from pathlib import Path
-from ssilk_usd.read_character import read_character
-from ssilk_usd.write import write_garment, write_motion
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.writing.files import write_garment, write_motion
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import training_motions
 body, out = Path(sys.argv[1]), Path(sys.argv[2])
@@ -93,7 +93,7 @@ def move_and_cut(bpy: ModuleType, armature: Any, names: list[str]) -> None:
 
 def train(bpy: ModuleType, garment: Any) -> Path:
     """Train for a moment; return the model."""
-    from blender_addon.scene.models import model_of
+    from blender_addon.playback.models import model_of
 
     activate(bpy, garment)
     assert bpy.ops.ssilk.train() == {"FINISHED"}
@@ -103,8 +103,8 @@ def train(bpy: ModuleType, garment: Any) -> Path:
 
 
 def test_from_files_to_a_timeline_and_again(ready, wardrobe, ssilk_python, tmp_path):
-    from blender_addon.scene.attributes import read_classes
-    from blender_addon.scene.proxies import proxy_names
+    from blender_addon.rigging.proxies import proxy_names
+    from blender_addon.scene.classes import read_classes
 
     bpy, scene = ready, ready.context.scene
     imported(bpy, BODY)

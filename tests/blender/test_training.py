@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from blender_addon.scene.models import job_of
+from blender_addon.playback.models import job_of
 
 from .conftest import BONES, activate
 from .scenes import ended, rig_and_animate
@@ -21,10 +21,10 @@ from .scenes import ended, rig_and_animate
 READ = """
 import json, sys
 from ssilk_core.scene.kinematics import motion_transforms
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.units import StageUnits
-from ssilk_usd.read_stage import open_stage
+from ssilk_usd.opening.stage import open_stage
 skeleton = read_character(sys.argv[1]).skeleton
 motion = read_motion(sys.argv[2], skeleton)
 units = StageUnits.of(open_stage(sys.argv[1]))
@@ -255,12 +255,12 @@ def test_what_a_training_finds_wrong_is_kept_for_the_panel(ready, rigged):
 
 
 def test_panels_draw_a_training(ready, rigged):
-    from blender_addon.curves import picture, series
+    from blender_addon.arrays.curves import picture, series
     from blender_addon.outside.jobs import CURVE
     from blender_addon.panels import plot
     from blender_addon.panels.training import EnergiesPanel, TrainingPanel
-    from blender_addon.scene import progress
-    from blender_addon.scene.models import trainings
+    from blender_addon.playback import models
+    from blender_addon.playback.models import trainings
 
     from .test_panels import drawn
 
@@ -272,10 +272,10 @@ def test_panels_draw_a_training(ready, rigged):
     assert "energy than linear blend skinning" in " ".join(notes)  # in as many lines as it needs
     assert not any(note.endswith(" J") for note in notes)
     assert any(note.startswith("Stretch: ") for note in drawn(EnergiesPanel, ready.context))
-    assert progress.read_all(trainings()) and not progress.read_all(trainings())
+    assert models.read_all(trainings()) and not models.read_all(trainings())
     (job_of(rigged) / CURVE).unlink()  # panels draw what was read, until the timer reads again
     assert "energy than linear blend skinning" in " ".join(drawn(TrainingPanel, ready.context))
-    progress.read_all(trainings())
+    models.read_all(trainings())
     assert "energy than linear blend skinning" not in " ".join(drawn(TrainingPanel, ready.context))
     shown = plot._pictures[str(job_of(rigged))]
     pixels = np.array(shown.image_pixels_float).reshape(*shown.image_size, 4)
@@ -340,7 +340,7 @@ def test_what_cannot_be_trained_is_named(ready, rigged, harm, told):
 
 @pytest.mark.parametrize("lost", ["Rig", "Skirt"])
 def test_what_is_deleted_while_motions_are_sampled_changes_nothing(ready, rigged, monkeypatch, lost):
-    from blender_addon.scene import sampling
+    from blender_addon.motions import sampling
 
     kept = sampling._sample_slice
 

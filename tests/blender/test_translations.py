@@ -32,12 +32,12 @@ def declared(kind) -> set[str]:
 
 
 def registered_strings(bpy) -> set[str]:
-    from blender_addon import preflight_properties
     from blender_addon.registration import CLASSES
+    from blender_addon.settings import preflight
 
     found: set[str] = set()
     for kind in CLASSES:
-        if kind in preflight_properties.CLASSES:
+        if kind in preflight.CLASSES:
             continue  # never drawn as properties
         found.add(getattr(kind, "bl_label", ""))
         rna = kind.bl_rna

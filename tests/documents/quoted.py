@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ssilk_usd import memory, trial
+from ssilk_usd.opening import memory, trial
 
 from ssilk_core.delivery.farm.openjd import CHUNK, CHUNK_SECONDS
 from ssilk_core.network import checkpoint

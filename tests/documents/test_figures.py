@@ -11,8 +11,8 @@ import re
 import shlex
 
 import pytest
-from ssilk_usd.check import TOLERANCE, WORLD
-from ssilk_usd.read_motion import FARTHEST
+from ssilk_usd.checking.shot import TOLERANCE, WORLD
+from ssilk_usd.reading.motion import FARTHEST
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
 from ssilk_core.cli import parser

@@ -14,7 +14,7 @@ import pytest
 import torch
 import trimesh
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
-from ssilk_usd import trial
+from ssilk_usd.opening import trial
 
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE

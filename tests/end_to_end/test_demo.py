@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
-from ssilk_usd.write import write_garment, write_motion
+from ssilk_usd.writing.files import write_garment, write_motion
 
 from ssilk_core.cli import demo, main, parser, view
 from ssilk_core.cli.options import load_scene

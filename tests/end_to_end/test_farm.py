@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 from pxr import Sdf
-from ssilk_usd import layers as layers_of_usd
-from ssilk_usd import read_visibility
+from ssilk_usd.reading import visibility as read_visibility
+from ssilk_usd.shots import layers as layers_of_usd
 
 from ssilk_core import files
 from ssilk_core.cli import main

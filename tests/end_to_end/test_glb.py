@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdSkel
-from ssilk_usd.play import Shot
-from ssilk_usd.read_mesh import read_mesh
+from ssilk_usd.reading.mesh import read_mesh
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.gltf.geometry import ShapeNormals, drawn_mesh

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
-from ssilk_usd.body_faces import BODY, COVERED_HIDDEN, FULL, open_with_full_bodies
-from ssilk_usd.play import Shot
+from ssilk_usd.shots.play import Shot
+from ssilk_usd.writing.body_faces import BODY, COVERED_HIDDEN, FULL, open_with_full_bodies
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.farm.job import read_job
@@ -146,10 +146,10 @@ def test_refined_points_and_the_network_hide_alike(copy):
 
 
 def test_a_body_that_is_hidden_altogether_is_not_there(copy):
-    from ssilk_usd.author import define_mesh
-    from ssilk_usd.body_faces import HiddenPolygons, hide_polygons
-    from ssilk_usd.read_character import read_character
+    from ssilk_usd.reading.character import read_character
     from ssilk_usd.units import StageUnits
+    from ssilk_usd.writing.author import define_mesh
+    from ssilk_usd.writing.body_faces import HiddenPolygons, hide_polygons
 
     (body,) = read_character("rigged.usda", garment=None).bodies
     for variants in (False, True):

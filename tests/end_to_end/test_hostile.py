@@ -19,11 +19,11 @@ from hypothesis import strategies as st
 from pxr import Sdf, Usd, UsdGeom, Vt
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
-from ssilk_usd.memory import bounded_memory
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_scene
-from ssilk_usd.trial import ending
+from ssilk_usd.opening.memory import bounded_memory
+from ssilk_usd.opening.trial import ending
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.scene import read_scene
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model
@@ -198,7 +198,7 @@ def test_arrays_that_declare_a_thousand_million_elements_take_no_memory(files, t
         path.write_bytes(content[:at] + struct.pack("<Q", declared) + content[at + 8 :])
         code = (
             "import sys\n"
-            "from ssilk_usd.read_scene import read_scene\n"
+            "from ssilk_usd.reading.scene import read_scene\n"
             "from ssilk_core.errors import SsilkError\n"
             "try: read_scene(sys.argv[1])\nexcept SsilkError: pass\n"
             # Not what getrusage tells, which begins with what the process that started this one holds.

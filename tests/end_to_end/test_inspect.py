@@ -161,8 +161,8 @@ def test_clean_garments_raise_no_alarm(garment, capsys):
 
 def write_clip(path: Path, roots: np.ndarray) -> Path:
     """The pillar swaying from its root, which moves along `roots` (F,) [m]; its spine is still."""
-    from ssilk_usd.read_character import read_character
-    from ssilk_usd.write import write_motion
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.writing.files import write_motion
 
     skeleton = read_character(write_hero(path.with_name(f"{path.stem}_hero.usda"))).skeleton
     half = 0.05 * np.sin(np.arange(len(roots)) / 5)

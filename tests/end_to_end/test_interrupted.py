@@ -60,7 +60,8 @@ def forks():
     forks = multiprocessing.get_context("forkserver")
     forks.set_forkserver_preload(
         [
-            *("ssilk_core.cli.train", "ssilk_core.training.run", "ssilk_usd.read_character", "ssilk_usd.read_motion"),
+            *("ssilk_core.cli.train", "ssilk_core.training.run"),
+            *("ssilk_usd.reading.character", "ssilk_usd.reading.motion"),
             *("torch._dynamo", "safetensors.torch", "scipy.spatial", "scipy.sparse.csgraph"),
         ]
     )

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, UsdValidation
-from ssilk_usd.garment_api import SCHEMA, read_garment_record
-from ssilk_usd.play import Shot
+from ssilk_usd.opening.garment_api import SCHEMA, read_garment_record
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, load_rollout, shot_bytes
@@ -399,7 +399,7 @@ def test_a_garment_says_how_it_was_made_with_and_without_the_schema(copy):
     )
     alone = subprocess.run([sys.executable, "-c", code, str(anim())], capture_output=True, text=True, check=True)
     assert record.model_hash in alone.stdout and SCHEMA in alone.stdout and not alone.stderr
-    plugin = Path(sys.modules["ssilk_usd.garment_api"].__file__).parent / "schema"
+    plugin = Path(sys.modules["ssilk_usd.opening.garment_api"].__file__).parents[1] / "schema"
     known = code.replace("assert not", "assert")
     environment = {**os.environ, "PXR_PLUGINPATH_NAME": str(plugin)}
     subprocess.run([sys.executable, "-c", known, str(anim())], check=True, capture_output=True, env=environment)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch
 from pxr import Gf, Sdf, Usd, UsdSkel, Vt
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRollout, bake_layers

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.cli import main
 from ssilk_core.network.checkpoint import load_model, save_model

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdSkel, Vt
-from ssilk_usd.play import Shot
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake

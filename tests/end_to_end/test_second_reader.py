@@ -8,8 +8,8 @@ import json
 import numpy as np
 import pytest
 import tinyusdz
-from ssilk_usd.author import unique_names
-from ssilk_usd.play import Shot
+from ssilk_usd.shots.play import Shot
+from ssilk_usd.writing.author import unique_names
 
 from ssilk_core.cli import main
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 from pxr import Usd
-from ssilk_usd import layers as layers_of_usd
-from ssilk_usd.play import Shot
+from ssilk_usd.shots import layers as layers_of_usd
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, LayerFolder, plan_layers

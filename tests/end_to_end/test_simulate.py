@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, UsdSkel
-from ssilk_usd.play import Shot
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main, simulate
 from ssilk_core.delivery.bake import BakeRequest, plan_layers

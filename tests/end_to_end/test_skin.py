@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
-from ssilk_usd.play import Shot
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import motion_at

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdShade
-from ssilk_usd.provenance import read_provenance
+from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_WORSE

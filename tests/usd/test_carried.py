@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_scene import read_scene
-from ssilk_usd.rig_io import write_rigged_stage
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.writing.rig import write_rigged_stage
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene import kinematics

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_garment import read_garment
-from ssilk_usd.read_motion import motion_files, read_motion, read_motions
-from ssilk_usd.read_polygons import triangulate
-from ssilk_usd.read_scene import read_scene
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.garment import read_garment
+from ssilk_usd.reading.motion import motion_files, read_motion, read_motions
+from ssilk_usd.reading.polygons import triangulate
+from ssilk_usd.reading.scene import read_scene
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene import kinematics

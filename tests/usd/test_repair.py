@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, Vt
-from ssilk_usd.facts import animated, stage_facts
-from ssilk_usd.read_garment import read_garment
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.repair import repair_lock, write_repaired, write_with_units
-from ssilk_usd.repair_mesh import offset_points
+from ssilk_usd.reading.facts import animated, stage_facts
+from ssilk_usd.reading.garment import read_garment
+from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.units import StageUnits
+from ssilk_usd.writing.repair import repair_lock, write_repaired, write_with_units
+from ssilk_usd.writing.repair_mesh import offset_points
 
 from ssilk_core.authoring.preflight.repair import MeshRepair
 from ssilk_core.errors import SsilkError

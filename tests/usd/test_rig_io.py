@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
-from ssilk_usd.facts import playback_rate
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_scene import read_rigged, read_scene
-from ssilk_usd.rig_io import read_proxy_rig, write_rigged_stage
+from ssilk_usd.reading.facts import playback_rate
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.rig import read_proxy_rig
+from ssilk_usd.reading.scene import read_rigged, read_scene
+from ssilk_usd.writing.rig import write_rigged_stage
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene import kinematics

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdShade
-from ssilk_usd.read_scene import read_scene
-from ssilk_usd.rig_io import write_rigged_stage
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.writing.rig import write_rigged_stage
 
 from ssilk_core.scene.assets import Garment, ProxyRig, Scene, SkinWeights
 from ssilk_core.scene.fabrics import fabric_of_surface

@@ -8,21 +8,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import ssilk_usd.shot as shot_module
+import ssilk_usd.shots.shot as shot_module
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
-from ssilk_usd.author import prim_names
-from ssilk_usd.check import allowed_error, check_shot, compare_points
-from ssilk_usd.play import Shot
-from ssilk_usd.read_character import read_character
-from ssilk_usd.read_garment import read_garment
-from ssilk_usd.read_motion import read_motion
-from ssilk_usd.read_polygons import triangulate
-from ssilk_usd.read_scene import read_scene
-from ssilk_usd.read_shot import read_baked
-from ssilk_usd.shot import write_shot
-from ssilk_usd.skinned import SkinnedGarment
+from ssilk_usd.checking.shot import allowed_error, check_shot, compare_points
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.reading.garment import read_garment
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.reading.polygons import triangulate
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.shots.play import Shot
+from ssilk_usd.shots.read import read_baked
+from ssilk_usd.shots.shot import write_shot
+from ssilk_usd.shots.skinned import SkinnedGarment
 from ssilk_usd.units import StageUnits
-from ssilk_usd.write import write_scene
+from ssilk_usd.writing.author import prim_names
+from ssilk_usd.writing.files import write_scene
 
 from ssilk_core.errors import SsilkError, VerificationError
 from ssilk_core.scene.assets import (

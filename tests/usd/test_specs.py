@@ -7,10 +7,10 @@ import ctypes
 import sys
 
 import pytest
-from ssilk_usd.export import new_stage, save
-from ssilk_usd.read_stage import open_stage
-from ssilk_usd.specs import free_when_closed
+from ssilk_usd.opening.specs import free_when_closed
+from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.units import StageUnits
+from ssilk_usd.writing.export import new_stage, save
 
 PRIMS, TIMES = 40, 100
 

@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from ssilk_usd.read_mesh import display_colour, read_mesh
-from ssilk_usd.read_surface import read_surface
+from ssilk_usd.reading.mesh import display_colour, read_mesh
+from ssilk_usd.reading.surface import read_surface
 from ssilk_usd.units import StageUnits
-from ssilk_usd.write_surface import write_surface
+from ssilk_usd.writing.surface import write_surface
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import SurfaceMaterial

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
-from ssilk_usd.trajectories import MeshTrajectories
+from ssilk_usd.shots.trajectories import MeshTrajectories
 
 from ssilk_core.errors import SsilkError
 

@@ -25,7 +25,7 @@ def on_character(file: ModelFile, stage: Usd.Stage, root: str | None) -> Scene:
     Raises:
         SsilkError: the stage's character is not the one that the model was trained with.
     """
-    from ssilk_usd.read_character import read_character
+    from ssilk_usd.reading.character import read_character
 
     character = read_character(stage, root=root, garment=None)
     return replace(file.scene, character=in_order_of(file.scene.character.skeleton, character))
@@ -51,7 +51,7 @@ def in_order_of(trained: Skeleton, character: Character) -> Character:
 
 def _places(found: Skeleton, trained: Skeleton) -> Ints:
     """Return where each joint of the model stands in a skeleton, by its path or unique name, shape (J,)."""
-    from ssilk_usd.read_skin import match_joints
+    from ssilk_usd.reading.skin import match_joints
 
     order = np.array(match_joints(trained.joint_names, found.joint_names))
     missing = [name for name, place in zip(trained.joint_names, order) if place < 0]

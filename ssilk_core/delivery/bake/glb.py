@@ -12,8 +12,8 @@ from ...scene.assets import Deformer, GarmentPose, Motion
 from ..gltf.shot import SET, GlbLabels, write_glb
 
 if TYPE_CHECKING:
-    from ssilk_usd.body_faces import HiddenPolygons
-    from ssilk_usd.shot import ShotSummary
+    from ssilk_usd.shots.shot import ShotSummary
+    from ssilk_usd.writing.body_faces import HiddenPolygons
 
 
 def write_glb_shot(
@@ -32,14 +32,14 @@ def write_glb_shot(
     """Write a shot in metres, y up.
 
     Args:
-        path, deformer, motion, poses: as `ssilk_usd.shot.write_shot` takes them, and all others.
+        path, deformer, motion, poses: as `ssilk_usd.shots.shot.write_shot` takes them, and all others.
 
     Raises:
         SsilkError: poses that do not cover the motion or do not fit it, or a file that cannot be written.
     """
-    from ssilk_usd.author import prim_names, unique_names
     from ssilk_usd.names import shape_name
-    from ssilk_usd.shot import TimeSpan, checked_poses, summary
+    from ssilk_usd.shots.shot import TimeSpan, checked_poses, summary
+    from ssilk_usd.writing.author import prim_names, unique_names
 
     scene = deformer.scene
     garment, *bodies = prim_names([scene.garment.mesh.path, *(body.mesh.path for body in scene.character.bodies)])

@@ -15,7 +15,7 @@ from ...scene.kinematics import motion_transforms, skin_points, skinning_matrice
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
-    from ssilk_usd.body_faces import HiddenPolygons
+    from ssilk_usd.writing.body_faces import HiddenPolygons
 
 CHUNK = 16  # frames whose bodies are in memory at once
 
@@ -26,7 +26,7 @@ def covered_polygons(rollout: BakeRollout, report: Reporter = silent) -> HiddenP
     Raises:
         SsilkError: the character has no body.
     """
-    from ssilk_usd.body_faces import HiddenPolygons
+    from ssilk_usd.writing.body_faces import HiddenPolygons
 
     scene = rollout.deformer.scene
     body, frames = scene.character.merged_body().mesh, rollout.motion.frame_count

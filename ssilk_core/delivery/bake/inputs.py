@@ -77,7 +77,7 @@ def stage_contents(location: str, hashed: Callable[[str], str] = sha256) -> Inpu
     Raises:
         SsilkError: it cannot be read.
     """
-    from ssilk_usd.read_stage import split_location, used_files
+    from ssilk_usd.opening.stage import split_location, used_files
 
     return _hashed(used_files(split_location(location)[0]), hashed)
 

@@ -31,8 +31,8 @@ from .verification import verify_file
 from .write import result_of
 
 if TYPE_CHECKING:
-    from ssilk_usd.author import Asset
-    from ssilk_usd.layers import Layout, WrittenAsset
+    from ssilk_usd.shots.layers import Layout, WrittenAsset
+    from ssilk_usd.writing.author import Asset
 
 
 def bake_layers(
@@ -103,7 +103,7 @@ class LayerFolder:
 
     def layout(self, task: BakeTask) -> Layout:
         """Return where the files of a task lie."""
-        from ssilk_usd.layers import Layout
+        from ssilk_usd.shots.layers import Layout
 
         return Layout(self.path, task.garment, task.shot)
 
@@ -247,7 +247,7 @@ def _as_one(errors: Sequence[SsilkError], shots: int) -> SsilkError:
 
 def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> WrittenAsset:
     """Write the asset of a task where it is not there already; warn of changes that layers above may rely on."""
-    from ssilk_usd import layers
+    from ssilk_usd.shots import layers
 
     written = layers.write_asset(
         layout, garment.deformer, garment.units, include_body=task.include_body, record=garment.record
@@ -261,7 +261,7 @@ def _write_layer(
     layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter
 ) -> tuple[BakeResult, dict[Path, str]]:
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
-    from ssilk_usd import layers
+    from ssilk_usd.shots import layers
 
     rollout = refined(rollout, report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None

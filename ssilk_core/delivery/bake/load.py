@@ -24,8 +24,8 @@ from .rollout import BakeRollout
 
 if TYPE_CHECKING:
     from pxr import Usd
-    from ssilk_usd.frame_range import FrameRange
-    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.opening.garment_api import GarmentRecord
+    from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
 
     from ...network.model.network import GarmentModel
@@ -104,9 +104,9 @@ class LoadedGarment:
         )
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
-        from ssilk_usd.frame_range import read_frame_range
-        from ssilk_usd.read_motion import read_motion
-        from ssilk_usd.read_visibility import read_hidden
+        from ssilk_usd.reading.frame_range import read_frame_range
+        from ssilk_usd.reading.motion import read_motion
+        from ssilk_usd.reading.visibility import read_hidden
 
         character, root, samples = self.file.scene.character, request.root, request.samples_per_frame
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
@@ -170,7 +170,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
 def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits]:
     """Return a model's scene with the character of a stage, and the units of what is written."""
-    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
     return on_character(file, stage, request.root), _units(stage, request.receiver)
@@ -228,7 +228,7 @@ def _units(stage: Usd.Stage, target: Target) -> StageUnits:
 
 
 def _record(file: ModelFile, model_hash: str) -> GarmentRecord:
-    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.opening.garment_api import GarmentRecord
 
     unused = {"collision"} if file.fabric.contact_model == "surface" else {"contact", "loose_contact"}
     unused |= set() if file.fabric.stitch else {"stitch"}

@@ -156,7 +156,7 @@ class UsedNames:
 
     def _same(self, before: RecordedInput, location: str, contents: Callable[[str], InputContents]) -> bool:
         """Return whether an input is the one that a record names."""
-        from ssilk_usd.read_stage import split_location
+        from ssilk_usd.opening.stage import split_location
 
         if before.path == portable(location, self.folder):
             return True

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..targets import GLB
 
 if TYPE_CHECKING:
-    from ssilk_usd.play import Shot
+    from ssilk_usd.shots.play import Shot
 
     from ..gltf.play import GlbShot
 
@@ -25,7 +25,7 @@ def open_shot(path: Path) -> Shot | GlbShot:
         from ..gltf.play import GlbShot
 
         return GlbShot(path)
-    from ssilk_usd.play import Shot
+    from ssilk_usd.shots.play import Shot
 
     return Shot(path)
 
@@ -40,6 +40,6 @@ def provenance_of(path: Path) -> Mapping[str, Any]:
         from ..gltf.play import GlbShot
 
         return GlbShot(path).provenance
-    from ssilk_usd.provenance import read_provenance
+    from ssilk_usd.reading.facts import read_provenance
 
     return read_provenance(path)

@@ -119,7 +119,7 @@ def _existing(shot: Path, name: str, near: str, then: Path, held: object) -> Pat
 
 def _file(place: Path) -> Path:
     """Return the file of a place, which may name a prim in it."""
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
 
     return Path(split_location(str(place))[0])
 

@@ -83,7 +83,7 @@ def portable(location: str, folder: Path) -> str:
     Where the two share nothing but the root, a hash tells the file from others of its name, and nothing tells where a
     studio keeps it.
     """
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
 
     file, prim = split_location(location)
     path = relative_path(file, folder)

@@ -19,8 +19,8 @@ from .request import BakeRequest
 from .result import FrameSpan, RefinementSummary
 
 if TYPE_CHECKING:
-    from ssilk_usd.frame_range import FrameRange
-    from ssilk_usd.garment_api import GarmentRecord
+    from ssilk_usd.opening.garment_api import GarmentRecord
+    from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
 
     from ...network.model.network import GarmentModel

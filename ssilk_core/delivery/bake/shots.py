@@ -15,7 +15,7 @@ from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
 
 if TYPE_CHECKING:
-    from ssilk_usd.layers import Layout
+    from ssilk_usd.shots.layers import Layout
 
 
 def write_shot_stage(
@@ -37,7 +37,7 @@ def write_shot_stage(
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
             written.
     """
-    from ssilk_usd.layers import Layout, write_stage
+    from ssilk_usd.shots.layers import Layout, write_stage
 
     # Several processes may finish at once. Each writes its record, then the stage from all records that it finds, and
     # does so again until it finds what it wrote the stage from. The last to rename its stage therefore sees every
@@ -125,7 +125,7 @@ def remove_layers(folder: Path, names: Sequence[str], report: Reporter = silent)
     Raises:
         SsilkError: a name is that of no baked garment, or a file cannot be removed.
     """
-    from ssilk_usd.layers import Layout
+    from ssilk_usd.shots.layers import Layout
 
     baked = sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in _layers(folder))
     chosen: dict[str, Layout] = {}

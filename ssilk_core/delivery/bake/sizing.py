@@ -125,7 +125,7 @@ class _Excerpt:
         return ShotBytes(second - frame * many, frame)
 
     def _bytes(self, poses: Iterator[GarmentPose], frames: int) -> int:
-        from ssilk_usd.shot import write_shot
+        from ssilk_usd.shots.shot import write_shot
 
         motion = self.motion.clip(0, frames)
         common: dict[str, Any] = {"samples_per_frame": self.samples_per_frame, "include_body": self.include_body}

@@ -24,7 +24,7 @@ from .result import SKINNED, BakeResult, ShotShapes, Verification
 from .verification import compare_trajectories, need_valid
 
 if TYPE_CHECKING:
-    from ssilk_usd.trajectories import MeshTrajectories
+    from ssilk_usd.shots.trajectories import MeshTrajectories
     from ssilk_usd.units import StageUnits
 
     from ...scene.decomposition import FitTolerance
@@ -43,7 +43,7 @@ def trained_deformer(model: str | os.PathLike[str], stage: str | os.PathLike[str
     Raises:
         SsilkError: a file cannot be read, or the character is not the model's.
     """
-    from ssilk_usd.read_stage import open_stage
+    from ssilk_usd.opening.stage import open_stage
 
     from ...network.checkpoint import load_model, network
 
@@ -107,8 +107,8 @@ def skin_trajectories(
             be written.
         VerificationError: the file is not what was computed; it is not kept.
     """
-    from ssilk_usd.export import packaged
-    from ssilk_usd.shot import write_shot
+    from ssilk_usd.shots.shot import write_shot
+    from ssilk_usd.writing.export import packaged
 
     from ...devices import select_device
     from ...scene.decomposition import FitTolerance, decompose
@@ -143,7 +143,7 @@ def skin_trajectories(
 
 def cache_origin(cache: str, mesh: str, output: Path) -> dict[str, object]:
     """Return what a shot says of the cache that it was made from, so that it is found again."""
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
 
     file = split_location(cache)[0]
     return {

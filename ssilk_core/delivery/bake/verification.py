@@ -25,7 +25,7 @@ from .result import SKINNED, Verification
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
-    from ssilk_usd.check import PosedGarment
+    from ssilk_usd.checking.shot import PosedGarment
 
     from ...scene.decomposition import FitTolerance
 
@@ -86,7 +86,7 @@ def _verify_skinned(
         SsilkError: the cache is not found.
         VerificationError: a check fails, or the shot is further off than it was made to be.
     """
-    from ssilk_usd.trajectories import MeshTrajectories
+    from ssilk_usd.shots.trajectories import MeshTrajectories
 
     from ...scene.decomposition import FitTolerance
 
@@ -113,7 +113,7 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     Raises:
         VerificationError: a check fails, or a vertex is further off than allowed.
     """
-    from ssilk_usd.check import compare_points
+    from ssilk_usd.checking.shot import compare_points
 
     need_valid(path, report)
     shot, samples = open_shot(path), rollout.request.samples_per_frame
@@ -174,7 +174,7 @@ def compare_trajectories(
     Raises:
         VerificationError: other frames or vertices, or they are further off than allowed.
     """
-    from ssilk_usd.check import allowed_error
+    from ssilk_usd.checking.shot import allowed_error
 
     from ...scene.decomposition import FitTolerance
 
@@ -208,7 +208,7 @@ def need_valid(path: Path, report: Reporter) -> None:
 
     The checks are those of stages. A glTF binary is checked by reading it.
     """
-    from ssilk_usd.check import check_shot
+    from ssilk_usd.checking.shot import check_shot
 
     if path.suffix == GLB:
         return

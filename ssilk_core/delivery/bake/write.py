@@ -22,8 +22,8 @@ from .sizing import load_sized
 from .verification import verify_file
 
 if TYPE_CHECKING:
-    from ssilk_usd.body_faces import HiddenPolygons
-    from ssilk_usd.shot import ShotSummary
+    from ssilk_usd.shots.shot import ShotSummary
+    from ssilk_usd.writing.body_faces import HiddenPolygons
 
 
 def bake(
@@ -98,7 +98,7 @@ def result_of(
 
 def _check_output(request: BakeRequest, path: Path) -> None:
     """Raise `SsilkError` where the target does not take the file, or it cannot be written."""
-    from ssilk_usd.read_stage import split_location
+    from ssilk_usd.opening.stage import split_location
 
     suffixes = request.receiver.suffixes
     if path.suffix not in suffixes:
@@ -118,7 +118,7 @@ def _write_verified(
     report: Reporter,
 ) -> tuple[ShotSummary, Verification | None]:
     """Write a file that appears once it is verified; return what it holds."""
-    from ssilk_usd.export import packaged
+    from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
@@ -132,8 +132,8 @@ def _write(
     layer: Path, meter: ShownSkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
-    from ssilk_usd.points import point_cache
-    from ssilk_usd.shot import write_shot
+    from ssilk_usd.shots.points import point_cache
+    from ssilk_usd.shots.shot import write_shot
 
     rollout = meter.rollout
     common: dict[str, Any] = {

@@ -299,8 +299,8 @@ def test_prepare_respects_what_is_authored(trunk):
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")
 @pytest.mark.parametrize("name", ["tshirt", "long_sleeve", "pants"])
 def test_close_garments_of_the_wardrobe_are_tight_with_a_pinned_ring(name):
-    from ssilk_usd.read_character import read_character
-    from ssilk_usd.read_garment import read_garment
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.reading.garment import read_garment
 
     character = read_character(SHARED / "character.usdc")
     mesh = read_garment(SHARED / "garments" / f"{name}.usdc", character.skeleton).mesh
@@ -317,8 +317,8 @@ def test_close_garments_of_the_wardrobe_are_tight_with_a_pinned_ring(name):
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")
 def test_a_long_skirt_is_tight_on_the_hips_alone():
-    from ssilk_usd.read_character import read_character
-    from ssilk_usd.read_garment import read_garment
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.reading.garment import read_garment
 
     character = read_character(SHARED / "character.usdc")
     mesh = read_garment(SHARED / "garments" / "long_skirt.usdc", character.skeleton).mesh
@@ -329,7 +329,7 @@ def test_a_long_skirt_is_tight_on_the_hips_alone():
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the shared data is not beside the checkout")
 def test_cape_hangs_from_its_collar():
-    from ssilk_usd.read_character import read_character
+    from ssilk_usd.reading.character import read_character
 
     from ssilk_core.demo.garments import build_garment
 

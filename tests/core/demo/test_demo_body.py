@@ -11,7 +11,7 @@ import igl
 import numpy as np
 import pytest
 from pxr import Usd, UsdSkel, UsdValidation
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.scene.mesh.topology import edge_use

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.demo.garments import GARMENTS, build_garment

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from ssilk_usd.read_character import read_character
+from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.demo.motions import GESTURES, MOTIONS, build_motion, chain, demo_shot, mirrored, training_motions

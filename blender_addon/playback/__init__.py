@@ -1,0 +1,7 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Models on garments: a model comes in; keys on the timeline, a garment played live or a glTF binary go out.
+
+`bake.py` puts a bake's weights, shape keys and keys on a garment and its proxies. `live.py` plays one garment with
+numpy, and `playing.py` keeps those that are played and updates them as frames change. `models` finds a garment's
+training and model, `saving` keeps their paths valid, and `gltf` exports a bake.
+"""

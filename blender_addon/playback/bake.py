@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Apply a bake as weights, shape keys and keys on a garment and its proxies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import bpy
+import numpy as np
+from ssilk_usd.shots.skinned import BakedGarment, SkinnedGarment
+
+from ssilk_core.scene.kinematics import (
+    local_transforms,
+    matrix_from_quaternion,
+    multiply_quaternions,
+    quaternion_from_matrix,
+)
+
+from ..arrays.joints import Joints, joint_order
+from ..errors import SetupError
+from ..motions.keys import Channel, bake_keys, remove_keys
+from ..scene.armature import proxy_names
+from ..scene.garment import need_uncarried
+from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
+from ..scene.modifiers import need_plain_modifiers
+from ..scene.objects import scene_units
+from ..scene.weights import put_trained_weights, restore_own_weights
+
+MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
+TURNED = 1e-3  # how far the axes and places of bones may be
+
+
+def need_bakeable(
+    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, *, simulated: bool = False
+) -> None:
+    """Check that Blender will deform a garment as ssilk does, apart from what may simulate it.
+
+    Raises:
+        SetupError: an option of the modifier, of a bone or of shape keys is in the way.
+    """
+    need_relative(garment)
+    need_uncarried(garment)
+    need_plain_modifiers(garment, simulated=simulated)
+    _need_linear(garment, armature)
+    names = joints.names
+    for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
+        bone = armature.data.bones[name]
+        above = bone.parent.name if bone.parent else ""
+        if parent < 0 or above != names[parent]:
+            raise SetupError(
+                f"The proxy '{name}' hangs on '{above}', which does not deform; give it a parent that does."
+            )
+        if not bone.use_inherit_rotation:
+            raise SetupError(f"The proxy '{name}' does not inherit rotation; switch that on.")
+    bent = next((name for name in names if armature.data.bones[name].bbone_segments > 1), None)
+    if bent:
+        raise SetupError(f"The bone '{bent}' bends (B-Bone segments); a garment follows stiff bones only.")
+
+
+def animated(garment: bpy.types.Object, armature: bpy.types.Object) -> list[object]:
+    """Return what a bake animates: the armature, and the garment's shape keys where it has any."""
+    keys = garment.data.shape_keys
+    return [armature, keys] if keys else [armature]
+
+
+def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, baked: BakedGarment) -> None:
+    """Put a bake in place of what was baked for a garment before. In object mode.
+
+    Proxies that it lacks stay at rest and move nothing.
+
+    Args:
+        joints: of the armature, as `read_joints` returns them.
+
+    Raises:
+        SetupError: garment or bones are not those that it was trained with.
+    """
+    order = joint_order(joints, baked.garment.joint_names, fewer_proxies=True)
+    proxies = order[joints.character_count :] - joints.character_count
+    there = proxies >= 0
+    if baked.pose.translations is not None:  # before anything changes
+        need_movable(armature, [joints.proxies[index] for index in np.flatnonzero(there)])
+    shapes = apply_deformation(garment, armature, joints, baked.garment, order)
+    rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
+    rotations[:, there] = baked.pose.rotations[:, proxies[there]]
+    channels = _channels(joints.proxies, "rotation_quaternion", turns_from_rest(joints, rotations))
+    if baked.pose.translations is not None:
+        places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
+        places[:, there] = baked.pose.translations[:, proxies[there]]
+        channels += _channels(joints.proxies, "location", shifts_from_rest(armature, joints, places))
+    moved = [
+        (armature, channels),
+        (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
+    ]
+    bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
+
+
+def apply_deformation(
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    joints: Joints,
+    skinned: SkinnedGarment,
+    order: np.ndarray,
+) -> list[str]:
+    """Give a garment trained shapes and weights, its proxies at rest; return its shape keys. In object mode.
+
+    Args:
+        order: where each joint stands among the trained ones, -1 for none, shape (J,).
+
+    Raises:
+        SetupError: as `apply_bake` does.
+    """
+    to_trained = _moved_back(armature, joints, skinned, order) @ scene_units().matrix @ np.array(garment.matrix_world)
+    _need_same_points(garment, to_trained, skinned)
+    shapes = write_shapes(garment, skinned.shapes @ np.linalg.inv(to_trained[:3, :3]).T, skinned.shape_names)
+    weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
+    put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
+    _free(armature, joints.proxies)
+    return shapes
+
+
+def turns_from_rest(joints: Joints, rotations: np.ndarray) -> np.ndarray:
+    """Return the proxies' turns from their rest rotations, which is what pose bones hold, shape (F, P, 4).
+
+    Args:
+        rotations: of each proxy to its parent, unit quaternions (w, x, y, z), shape (F, P, 4).
+    """
+    return multiply_quaternions(rest_rotations(joints) * [1, -1, -1, -1], rotations)
+
+
+def shifts_from_rest(armature: bpy.types.Object, joints: Joints, places: np.ndarray) -> np.ndarray:
+    """Return how far the proxies are from rest, in their own axes at rest and units of the armature, as pose bones
+    hold it, shape (F, P, 3).
+
+    Args:
+        places: of each proxy in its parent's axes [m], shape (F, P, 3).
+    """
+    own = matrix_from_quaternion(rest_rotations(joints)).swapaxes(-1, -2)
+    unit = scene_units().meters_per_unit * armature.matrix_world.median_scale
+    return (own @ (places - _rest_places(joints))[..., None])[..., 0] / unit
+
+
+def rest_rotations(joints: Joints) -> np.ndarray:
+    """Return the rotations of the proxies to their parents at rest, unit quaternions (w, x, y, z), shape (P, 4)."""
+    local = local_transforms(joints.binds, joints.parents)[joints.character_count :]
+    return quaternion_from_matrix(local[:, :3, :3])
+
+
+def _rest_places(joints: Joints) -> np.ndarray:
+    """Return the places of the proxies in their parents' axes at rest [m], shape (P, 3)."""
+    return local_transforms(joints.binds, joints.parents)[joints.character_count :, :3, 3]
+
+
+def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    """Remove what was baked for a garment, and give it its own weights back. In object mode."""
+    remove_keys(garment, animated(garment, armature))
+    remove_shapes(garment)
+    restore_own_weights(armature, garment)
+    _free(armature, proxy_names(armature, garment))
+
+
+def _need_linear(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    for modifier in garment.modifiers:
+        if modifier.type != "ARMATURE" or modifier.object != armature:
+            continue
+        options = {
+            "Preserve Volume": modifier.use_deform_preserve_volume,
+            "Bone Envelopes": modifier.use_bone_envelopes,
+            "a vertex group": bool(modifier.vertex_group),
+            "Multi Modifier": modifier.use_multi_modifier,
+        }
+        for label, on in options.items():
+            if on:
+                raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' uses {label}; switch that off.")
+        if not modifier.use_vertex_groups:
+            raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' ignores vertex groups.")
+        return
+    raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+
+
+def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarment, order: np.ndarray) -> np.ndarray:
+    """Return how the armature has moved as an object [m], back to where it was when the garment was trained, (4, 4).
+
+    Raises:
+        SetupError: bones have moved.
+    """
+    there = np.flatnonzero(order >= 0)
+    now, trained = joints.binds[there], skinned.bind_transforms[order[there]]
+    back = trained[0] @ np.linalg.inv(now[0])
+    away = np.abs(back @ now - trained)
+    away[:, :3, 3] /= _size(skinned)
+    worst = int(away.max(axis=(1, 2)).argmax())
+    if not away[worst].max() <= TURNED:
+        raise SetupError(
+            f"The bone '{joints.names[there[worst]]}' of '{armature.name}' was moved since the garment was trained; "
+            "undo that, or train again."
+        )
+    return back
+
+
+def _need_same_points(garment: bpy.types.Object, to_trained: np.ndarray, skinned: SkinnedGarment) -> None:
+    """Check a garment's points at rest, given its own space to where it was trained [m]."""
+    count = len(garment.data.vertices)
+    if count != len(skinned.points):
+        raise SetupError(
+            f"'{garment.name}' had {len(skinned.points)} vertices when it was trained and has {count} now; train it "
+            "again."
+        )
+    away = np.abs(rest_points(garment) @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max()
+    if not away <= MOVED * _size(skinned):
+        raise SetupError(
+            f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train "
+            "again."
+        )
+
+
+def _size(skinned: SkinnedGarment) -> float:
+    return max(float(np.ptp(skinned.points, axis=0).max()), 1e-9)
+
+
+def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:
+    """Put proxies without keys at rest, with quaternion rotation."""
+    for name in proxies:
+        bone = armature.pose.bones[name]
+        bone.rotation_mode = "QUATERNION"
+        bone.location, bone.scale, bone.rotation_quaternion = (0, 0, 0), (1, 1, 1), (1, 0, 0, 0)
+
+
+def need_movable(armature: bpy.types.Object, names: Sequence[str]) -> None:
+    """Check that Blender moves proxies by their own locations, as most networks and all solver's shots do.
+
+    Raises:
+        SetupError: one cannot move.
+    """
+    for name in names:
+        bone = armature.data.bones[name]
+        if bone.use_connect or not bone.use_local_location:
+            raise SetupError(
+                f"The proxy '{name}' cannot move by itself; switch off Connected and switch on Local Location."
+            )
+
+
+def _channels(names: Sequence[str], what: str, values: np.ndarray) -> list[Channel]:
+    """Return the channels of a property of pose bones, shape (F, P, components)."""
+    return [
+        Channel(f'pose.bones["{bpy.utils.escape_identifier(name)}"].{what}', index, name, each)
+        for name, rows in zip(names, values.swapaxes(0, 1))
+        for index, each in enumerate(rows.T)
+    ]
+
+
+def _weight_channels(names: Sequence[str], weights: np.ndarray) -> list[Channel]:
+    return [
+        Channel(f'key_blocks["{bpy.utils.escape_identifier(name)}"].value', 0, "SSILK", values)
+        for name, values in zip(names, weights.T)
+    ]

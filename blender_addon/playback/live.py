@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A trained garment played in Blender with numpy alone, following the armature at any frame of the timeline.
+
+The armature's motion over the scene's frames is read once, a little at a time. Latents are rolled out in blocks, as
+far as frames are shown, and kept. A frame therefore looks the same whether it was scrubbed or played to. Where the
+armature differs from what was read, latents are kept up to that frame and rolled out again from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+from ssilk_usd.shots.skinned import SkinnedGarment
+
+from ssilk_core.network.runtime import Playback
+from ssilk_core.scene.assets import Motion
+
+from ..errors import SetupError
+from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
+from ..motions.sources import TIMELINE, Source
+from ..scene.armature import read_joints
+from ..scene.garment import armature_of
+from ..scene.objects import found_again
+from .bake import apply_deformation, need_bakeable, need_movable, shifts_from_rest, turns_from_rest
+from .models import TrainedGarment
+
+BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
+PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
+READING = 0.8  # the part of the preparation that is reading, mostly; the rest is rolling
+MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
+
+
+class Live:
+    """One garment that is played. In object mode when it begins.
+
+    Attributes:
+        done: the part of the motion that was read; None when there is nothing to read.
+        stale: whether the armature does something else by now than what was read.
+        model_only: whether a newer model is read, for the motion that was read before.
+
+    Raises:
+        SetupError: bones or the garment do not deform as ssilk has it.
+    """
+
+    def __init__(self, garment: bpy.types.Object, model: Path) -> None:
+        armature = armature_of(garment)
+        self.joints = read_joints(armature, garment)
+        need_bakeable(garment, armature, self.joints)
+        self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
+        self.model, self.trained, self._written = model, None, 0.0
+        self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
+        self.done: float | None = None
+        self.stale = self.model_only = False
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the motion again; the old one is played until that is done."""
+        _, armature = self.objects()
+        (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
+        self._steps = self._reading(take)
+        self.done, self.stale, self.model_only = 0.0, False, False
+
+    def take_up(self) -> None:
+        """Read the model again, for the motion that was read; the old one is played until the new one can be."""
+        if self.playback is None or self.stale:
+            self.refresh()
+        else:
+            self._steps, self.done, self.model_only = self._taking_up(), 0.0, True
+
+    @property
+    def renewed(self) -> bool:
+        """Whether the model was written since it was read, as by a training that goes on."""
+        return _written(self.model) not in (0.0, self._written)
+
+    def read(self) -> bool:
+        """Read a little of the model, then of the motion; return whether there is more.
+
+        Raises:
+            SetupError: the model cannot be read, or is of another garment or other bones.
+        """
+        self.done = next(self._steps, None)
+        return self.done is not None
+
+    def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
+        """Return the garment and its armature; raise `SetupError` if one was deleted."""
+        garment, armature = (_found(name, uid) for name, uid in self.things)
+        return garment, armature
+
+    def ready(self) -> bool:
+        """Return whether the garment may be given other shapes and weights now."""
+        garment, _ = self.objects()
+        return garment.mode == "OBJECT"
+
+    def is_in(self, scene: bpy.types.Scene) -> bool:
+        """Return whether a scene holds the garment; motions are read in one that does not."""
+        garment, _ = self.objects()
+        return garment.name in scene.objects
+
+    def show(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+        """Put proxies and shape keys where the garment is in this frame; what lies outside the range is held."""
+        if self.playback is None or not self.is_in(scene):
+            return
+        garment, armature = self.objects()
+        index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
+        if index == scene.frame_current - self.first:
+            self._take_notice(armature.evaluated_get(depsgraph), index)
+        pose = self.playback.pose(index)
+        self._need_all(garment, armature)
+        turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
+        for name, turn in zip(self.joints.proxies, turns.tolist()):
+            armature.pose.bones[name].rotation_quaternion = turn
+        if pose.translations is not None:
+            shifts = shifts_from_rest(armature, self.joints, pose.translations[:, self.trained.proxies])[0]
+            for name, shift in zip(self.joints.proxies, shifts.tolist()):
+                armature.pose.bones[name].location = shift
+        blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
+        for name, weight in zip(self.shapes, pose.weights[0].tolist()):
+            blocks[name].value = weight
+
+    def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+        """Check that nothing that is written to was deleted."""
+        keys = garment.data.shape_keys
+        lost = [name for name in self.joints.names if name not in armature.pose.bones]
+        lost += [name for name in self.shapes if not keys or name not in keys.key_blocks]
+        if lost:
+            raise SetupError(f"'{lost[0]}' was deleted while '{garment.name}' was played; play it again.")
+
+    def _reading(self, take: SampledTake) -> Iterator[float]:
+        """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
+        if self.trained is None or self.renewed:
+            yield from self._dressing()
+        _, armature = self.objects()
+        yield from (READING * done for done in sample(armature, self.joints.character, [take]))
+        need_company(*self.objects(), take)
+        placed = np.array(take.worlds)
+        playback = yield from self._rolling(self.trained, placed, READING)
+        self.first, self.placed, self.playback = take.frames.start, placed, playback
+
+    def _rolling(self, trained: TrainedGarment, placed: np.ndarray, done: float) -> Generator[float, None, Playback]:
+        """Return what plays joints to the world, shape (F, J, 4, 4); yield the part that is done, from `done` on."""
+        playback = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK)
+        for frame in range(0, len(placed), BLOCK):
+            playback.pose(frame)
+            yield done + (1 - done) * frame / len(placed)
+        return playback
+
+    def _trained(self) -> TrainedGarment:
+        """Read the model, and check that the bones move as it says."""
+        trained = TrainedGarment(self.model, self.joints)
+        if trained.player.file.config.translations:
+            need_movable(self.objects()[1], self.joints.proxies)
+        return trained
+
+    def _taking_up(self) -> Iterator[float]:
+        """Read the model and roll it out, then give the garment its shapes and weights and play it at once."""
+        written, trained, placed = _written(self.model), self._trained(), self.placed.copy()
+        yield 0.0
+        skinned = SkinnedGarment.of(trained.player.deformer())
+        playback = yield from self._rolling(trained, placed, 0.0)
+        garment, armature = self.objects()
+        if not self.ready():  # the artist edits it; the model is still a new one afterwards
+            return
+        moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
+        if len(moved):
+            playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
+        self.trained, self.playback, self._written = trained, playback, written
+
+    def _dressing(self) -> Iterator[float]:
+        """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
+        self._written = _written(self.model)
+        trained = self._trained()
+        yield 0.0
+        skinned = SkinnedGarment.of(trained.player.deformer())
+        yield 0.0
+        garment, armature = self.objects()
+        if not self.ready():
+            raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
+        self.trained, self.playback = trained, None
+        yield 0.0
+
+    def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
+        """Roll out again from a pose that differs from the one that was read."""
+        bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
+        placed = worlds(armature)[bones]
+        if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
+            return
+        self.placed[index] = placed
+        self.playback, self.stale = self.playback.with_motion(_motion(self.trained, self.placed), index), True
+
+
+def _motion(trained: TrainedGarment, placed: np.ndarray) -> Motion:
+    """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
+    return motion_of(placed[:, trained.own], trained.player.skeleton.parents, "the timeline")
+
+
+def _written(path: Path) -> float:
+    """Return when a file was written; zero where there is none."""
+    return path.stat().st_mtime if path.is_file() else 0.0
+
+
+def _found(name: str, uid: int) -> bpy.types.Object:
+    """Return an object, mostly by its name, which is fast; raise `SetupError` if it was deleted."""
+    thing = bpy.data.objects.get(name)
+    return thing if thing and thing.session_uid == uid else found_again(uid, name)

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""A garment's training, how far it is, and its model.
+
+Trainings are found beside the blend file, by what they say they train: an undo, or closing without saving, changes
+nothing about them. What a garment remembers of its training, relative to the file, finds it where either was renamed.
+A timer reads how they are: panels are drawn many times a second, and the disk may be slow.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ssilk_core.errors import SsilkError
+from ssilk_core.network.runtime import Player
+
+from ..arrays.joints import Joints, joint_order
+from ..errors import SetupError
+from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
+from ..outside.wording import recall, reworded
+
+FIRST = "wait for its training, or resume it"
+FOLDER = "ssilk"  # of trainings, beside the blend file
+_orphans: tuple[str, list[Orphan]] = ("", [])  # the blend file, and what was found beside it
+
+
+def trainings_folder() -> Path:
+    """Return the folder of the trainings that are begun in this file; the file was saved."""
+    return Path(os.path.normpath(bpy.data.filepath)).parent / FOLDER
+
+
+def trainings() -> list[OwnedJob]:
+    """Return the trainings beside the blend file, the latest one last; none where it was never saved."""
+    return owned(trainings_folder()) if bpy.data.filepath else []
+
+
+def remembered(garment: bpy.types.Object) -> Path | None:
+    """Return the folder of the training that a garment remembers; None where it remembers none."""
+    folder = garment.ssilk.training.folder
+    return Path(os.path.normpath(bpy.path.abspath(folder))) if folder else None
+
+
+def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -> Path | None:
+    """Return the folder of a garment's latest training; None where it has none.
+
+    Args:
+        known: the trainings beside the file, where they were read already.
+    """
+    own, name, file = remembered(garment), garment.name, Path(bpy.data.filepath).name
+    found = [job for job in (trainings() if known is None else known) if (job.garment, job.file) == (name, file)]
+    before = owner(own) if own else None
+    if found and not (before and before.begun > found[-1].begun):
+        return found[-1].folder
+    return own
+
+
+@dataclass(frozen=True)
+class Orphan:
+    """A training that goes on without its garment, and the part of it that is done, in [0, 1]."""
+
+    job: OwnedJob
+    fraction: float
+
+
+def orphans() -> list[Orphan]:
+    """Return the trainings of this file that went on and belonged to no garment in it when they were looked for."""
+    file, found = _orphans
+    return found if file == bpy.data.filepath else []
+
+
+def look_for_orphans(known: Sequence[OwnedJob] | None = None) -> bool:
+    """Read from disk what `orphans` returns from now on; return whether it has changed.
+
+    Args:
+        known: the trainings beside the file, where they were read already.
+    """
+    global _orphans
+    before = orphans()
+    _orphans = bpy.data.filepath, _read_orphans(trainings() if known is None else known)
+    return before != orphans()
+
+
+def _read_orphans(known: Sequence[OwnedJob]) -> list[Orphan]:
+    here = [job for job in known if job.file == Path(bpy.data.filepath).name]
+    if not here:
+        return []
+    things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
+    linked = {job for thing in things if (job := job_of(thing, known)) and thing.users_scene}
+    states = ((job, read_state(job.folder)) for job in here if job.folder not in linked)
+    return [Orphan(job, state.fraction) for job, state in states if state and state.alive]
+
+
+def model_of(garment: bpy.types.Object) -> Path:
+    """Return the model that was chosen for a garment, else the one that its training has reached.
+
+    Raises:
+        SetupError: there is none.
+    """
+    return need_model(garment, job_of(garment))
+
+
+def need_model(garment: bpy.types.Object, job: Path | None) -> Path:
+    """Return the model that was chosen for a garment, else the one in the folder of its training.
+
+    Raises:
+        SetupError: there is none.
+    """
+    chosen = garment.ssilk.model
+    if not chosen and not job:
+        raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
+    path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
+    if not path.is_file():
+        where, todo = (f" at {path}", "choose another") if chosen else (" yet", FIRST)
+        raise SetupError(f"'{garment.name}' has no model{where}; {todo}.")
+    return path
+
+
+def relative(path: Path) -> str:
+    """Return a path as the blend file should remember it: relative to itself where it has a place on that drive."""
+    try:
+        return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
+    except ValueError:  # another drive
+        return str(path)
+
+
+Question = tuple[str, str, str]  # what decides which training is a garment's
+
+
+@dataclass(frozen=True)
+class TrainingProgress:
+    """A garment's training as it was when it was read.
+
+    Attributes:
+        state: None where there is none.
+        curve: what validations found (`read_curve`).
+        written: when the state was written [s].
+        has_model: whether there is a model to play.
+    """
+
+    folder: Path
+    state: JobState | None
+    curve: dict[str, Any] = field(compare=False)
+    written: float
+    has_model: bool
+
+    @property
+    def alive(self) -> bool:
+        """Whether somebody works on it, or waits to."""
+        return bool(self.state and self.state.alive)
+
+
+_known: dict[int, tuple[Question, TrainingProgress | None]] = {}
+
+
+def progress_of(garment: bpy.types.Object) -> TrainingProgress | None:
+    """Return a garment's training as it was read last; it is read now where it was not, or is another one by now."""
+    question, known = _known.get(garment.session_uid, (None, None))
+    return known if question == _question(garment) else _read(garment)
+
+
+def read_all(jobs: Sequence[OwnedJob]) -> bool:
+    """Read from disk what `progress_of` returns from now on; return whether anything has changed.
+
+    Args:
+        jobs: the trainings beside the file.
+    """
+    before = dict(_known)
+    forget()
+    for thing in bpy.data.objects:
+        if thing.type == "MESH":
+            _known[thing.session_uid] = (_question(thing), _read(thing, jobs))
+    return before != _known
+
+
+def forget() -> None:
+    """Let every training be read again: one began, or was asked to end."""
+    _known.clear()
+
+
+def no_model(garment: bpy.types.Object) -> str:
+    """Return why a garment has no model to play; empty if it has one."""
+    found = progress_of(garment)
+    if found and found.has_model and not garment.ssilk.model:
+        return ""
+    try:
+        need_model(garment, found.folder if found else None)
+    except SetupError as error:
+        return str(error).removesuffix(".")
+    return ""
+
+
+def _question(garment: bpy.types.Object) -> Question:
+    return (bpy.data.filepath, garment.name, garment.ssilk.training.folder)
+
+
+def _read(garment: bpy.types.Object, jobs: Sequence[OwnedJob] | None = None) -> TrainingProgress | None:
+    folder = job_of(garment, jobs)
+    if folder is None:
+        return None
+    return TrainingProgress(
+        folder, read_state(folder), read_curve(folder), stamp(folder), (folder / MODEL).is_file()
+    )  # fmt: skip
+
+
+class TrainedGarment:
+    """A model on an armature.
+
+    Attributes:
+        player: plays it.
+        own: joints of the armature in the order of the model's character, shape (J,).
+        order: joints of the model in the order of the armature, proxies included, shape (J + P,).
+
+    Raises:
+        SsilkError: it cannot be read, or has other joints than the armature.
+    """
+
+    def __init__(self, path: Path, joints: Joints) -> None:
+        try:
+            self.player = Player.load(path)
+        except SsilkError as error:
+            raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
+        self.joints = joints
+        self.order = joint_order(joints, self.player.file.scene.joint_names)
+        self.own = np.argsort(self.order[: joints.character_count])
+
+    @property
+    def proxies(self) -> np.ndarray:
+        """Proxies of the model in the order of the armature, counted from the first one, shape (P,)."""
+        return self.order[self.joints.character_count :] - self.joints.character_count

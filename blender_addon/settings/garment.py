@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Settings that are stored with each garment object."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProperty
+
+from ..scene.classes import tighten
+from . import fabric, training
+from .fabric import FabricSettings
+from .training import RELATIVE, TrainingSettings
+
+
+def _is_armature(_: object, thing: bpy.types.Object) -> bool:
+    return thing.type == "ARMATURE"
+
+
+def _tighten(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
+    garment = settings.id_data
+    if garment.type == "MESH" and garment.mode != "EDIT" and not garment.data.library:
+        tighten(garment.data, settings.tightness)
+
+
+class GarmentSettings(bpy.types.PropertyGroup):
+    """Choices for one garment; where one is empty, what is meant is found (see `scene.garment`)."""
+
+    armature: PointerProperty(
+        type=bpy.types.Object,
+        poll=_is_armature,
+        name="Armature",
+        description="Armature of the character that wears the garment; found by its Armature modifier when empty",
+    )
+    bodies: PointerProperty(
+        type=bpy.types.Collection,
+        name="Bodies",
+        description="Meshes that the garment collides with; all others bound to the armature when empty",
+    )
+    fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
+    tightness: FloatProperty(
+        name="Tightness",
+        description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, "
+        "once classes were found automatically",
+        default=0.5,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        update=_tighten,
+    )
+    pins: StringProperty(
+        name="Pins",
+        description="Vertex group of what is pinned when classes are found; the band it hangs from when empty",
+    )
+    model: StringProperty(
+        name="Model",
+        subtype="FILE_PATH",
+        options=RELATIVE,
+        description="Trained model of the garment; that of its own training when empty",
+    )
+    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
+    awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
+    heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"})
+    heat_told: StringProperty(description="What the heat map shows in this frame, in words", options={"HIDDEN"})
+    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"})
+    training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
+
+
+CLASSES = (*training.CLASSES, *fabric.CLASSES, GarmentSettings)
+
+
+def attach() -> None:
+    """Give every object the settings."""
+    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings)
+
+
+def detach() -> None:
+    """Remove them; chosen values stay in the file."""
+    del bpy.types.Object.ssilk

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read a character from a stage: its skeleton and the body meshes bound to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ssilk_core.errors import fail
+from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.scene.assets import Body, Character, Floats, SkinWeights
+
+from ..names import SKEL
+from ..opening.stage import (
+    PRIMS,
+    StageLike,
+    column_matrix,
+    inherited,
+    listed,
+    location,
+    named,
+    needs_whole_files,
+    open_stage,
+)
+from .carried import carried_by
+from .mesh import is_drawn, is_garment, read_mesh
+from .skeleton import bound_skeleton, character_skeleton, find_skeleton
+from .skin import read_skin
+from .spaces import SkelSource
+
+GEOM_BIND = "primvars:skel:geomBindTransform"
+SKINNING_METHOD = "primvars:skel:skinningMethod"
+
+
+@needs_whole_files
+def read_character(
+    source: StageLike,
+    *,
+    root: str | None = None,
+    bodies: Sequence[str] = (),
+    garment: str | None = None,
+    report: Reporter = silent,
+) -> Character:
+    """Read a character; its bodies are all drawn meshes bound to its skeleton, except garments.
+
+    Meshes that a joint carries are bodies where they are named, or where none is bound.
+
+    Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
+    geomBindTransform) in metres, y up. It includes the uniform scale of the character's xforms but not their
+    position; see `SkelSource.bind_to_core`. Rest transforms of root joints are in world space.
+
+    Args:
+        source: a file or an open stage.
+        root: SkelRoot or Skeleton, by path or name, if there are several.
+        bodies: body meshes, by path or name; all if empty.
+        garment: a garment mesh that is not marked as one, by path or name.
+        report: receives a warning about each body that does not use linear blend skinning.
+
+    Raises:
+        SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
+    """
+    skel = find_skeleton(open_stage(source), root=root)
+    skeleton = character_skeleton(skel)
+    order = skeleton.joint_names
+    return Character(
+        location(skel.root),
+        skeleton,
+        tuple(_read_body(prim, skel, order, report) for prim in _body_prims(skel, bodies, garment)),
+    )
+
+
+def geom_to_core(prim: Usd.Prim, skel: SkelSource) -> Floats:
+    """Return the transform from a bound mesh's local space to the core's bind space [m], column vectors, (4, 4)."""
+    bind = inherited(prim, GEOM_BIND)
+    matrix = None if bind is None else bind.Get()
+    return skel.bind_to_core if matrix is None else skel.bind_to_core @ column_matrix(matrix)
+
+
+def is_skinned(prim: Usd.Prim, skel: SkelSource) -> bool:
+    """Return whether a prim is bound to this skeleton and has influences."""
+    return bound_skeleton(prim) == skel.prim and inherited(prim, SKEL[0]) is not None
+
+
+def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) -> list[Usd.Prim]:
+    every = [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    garments = named(every, garment) if garment else []
+    meshes = [prim for prim in every if is_skinned(prim, skel)]
+    if not bodies:
+        drawn = [prim for prim in every if is_drawn(prim) and not is_garment(prim) and prim not in garments]
+        return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
+    meshes = [prim for prim in every if prim in meshes or carried_by(prim, skel)]
+    unknown = next((name for name in bodies if not named(meshes, name)), None)
+    if unknown is not None:
+        fail(
+            location(skel.root),
+            f"no mesh '{unknown}' is bound to the skeleton",
+            f"there are {listed(meshes)}",
+            "name one of these with --body",
+        )
+    return [prim for name in bodies for prim in named(meshes, name)]
+
+
+def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report: Reporter) -> Body:
+    method = inherited(prim, SKINNING_METHOD)
+    if method is not None and method.Get() != UsdSkel.Tokens.classicLinear:
+        report(
+            Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
+        )
+    carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
+    if carried:
+        mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
+        return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
+    mesh = read_mesh(prim, geom_to_core(prim, skel))
+    skin = read_skin(prim, skel.joints, order)
+    assert skin is not None  # is_skinned
+    return Body(mesh, skin)

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read a garment from the character's stage or from its own file."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Usd, UsdGeom
+
+from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
+
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
+from ..opening.stage import (
+    EARLIEST,
+    PRIMS,
+    StageLike,
+    has_value,
+    listed,
+    location,
+    named,
+    needs_whole_files,
+    open_stage,
+    stage_name,
+    world_matrix,
+)
+from ..units import StageUnits
+from .carried import carried_by
+from .character import geom_to_core, is_skinned
+from .mesh import display_colour, is_drawn, is_garment, read_mesh
+from .skeleton import bound_skeleton, find_skeleton, skeletons
+from .skin import match_joints, read_influences, read_skin
+from .spaces import SkelSource
+from .surface import read_surface
+
+
+@needs_whole_files
+def read_garment(
+    source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
+) -> Garment:
+    """Read a garment at rest, in the core's bind space [m], y up.
+
+    A mesh with influences is placed by its geomBindTransform, as in UsdSkel. A mesh without influences is placed by
+    its world transform: relative to the character in a stage with one, and absolutely in its own file. One without
+    influences whose xforms move as a joint does is bound to that joint, at its bind pose.
+
+    Args:
+        source: the character's stage or a file with garments, each with its own units and axes.
+        skeleton: skeleton of the character; weights are remapped to its joints by name.
+        garment: the mesh, by path or name, if there are several.
+        root: the character that the garment is fitted to, if the stage has several.
+
+    Raises:
+        SsilkError: there is no garment or several, or the data is malformed.
+    """
+    stage = open_stage(source)
+    prim = find_garment(stage, garment)
+    skel = fitted_skeleton(prim, root)
+    mesh = read_mesh(prim, garment_to_core(prim, skel))
+    skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
+    carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
+    if carried:
+        assert skel is not None
+        joint = match_joints((skel.joints[carried.joint],), skeleton.joint_names)[0]
+        skin = SkinWeights.rigid(mesh.path, joint, mesh.vertex_count)
+    pins, levels = (_per_point(prim, name) for name in (PIN, LEVEL))
+    pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
+    surface = read_surface(prim, mesh)
+    return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface, display_colour(prim))
+
+
+def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
+    """Find the garment mesh of a stage: the named one, the only marked one, or the only mesh without a character.
+
+    Raises:
+        SsilkError: there is no such mesh, or no unique one; the message lists the meshes.
+    """
+    where = stage_name(stage)
+    meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    marked = [prim for prim in meshes if is_garment(prim)]
+    if garment is not None:
+        found = named(meshes, garment)
+        if not found:
+            fail(where, f"no mesh is named '{garment}'", f"there are {listed(meshes)}", "choose one with --garment")
+    else:
+        found = marked if marked or skeletons(stage) else [prim for prim in meshes if is_drawn(prim)]
+        if not found:
+            fail(
+                where,
+                f"no mesh is marked as a garment; the meshes are {listed(meshes)}",
+                "a garment has primvars:ssilk:class or ssilk:garment = true",
+                "name it with --garment",
+            )
+    if len(found) != 1:
+        fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
+    return found[0]
+
+
+def fitted_skeleton(prim: Usd.Prim, root: str | None = None) -> SkelSource | None:
+    """Return the skeleton in its stage that a garment is fitted to; None if the stage has no character."""
+    stage = prim.GetStage()
+    found, bound = skeletons(stage), bound_skeleton(prim)
+    if not found:
+        return None
+    above = [skeleton for top, skeleton in found if prim.GetPath().HasPrefix(top.GetPath())]
+    own = bound or (above[0] if len(above) == 1 else None)
+    return find_skeleton(stage, root=str(own.GetPath()) if own else root)
+
+
+def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
+    """Return the transform from a garment's local space to the core's bind space [m], column vectors, (4, 4)."""
+    if skel is None:
+        return StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim)
+    if is_skinned(prim, skel):
+        return geom_to_core(prim, skel)
+    if carried := carried_by(prim, skel):
+        return skel.bind_to_core @ carried.to_bind
+    return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
+
+
+def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
+    """Return a garment's LBS weights over the character's joints, or None.
+
+    Weights that were saved separately next to a proxy rig take precedence.
+    """
+    if has_value(prim, LBS_SKIN[0]):
+        influences = read_influences(prim, joints, LBS_SKIN)
+        assert influences is not None
+        return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
+    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
+
+
+def _per_point(prim: Usd.Prim, name: str) -> Floats | None:
+    """Return a primvar with one value for each point, or None; `Garment` checks the count."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(name.removeprefix("primvars:"))
+    if not primvar or not primvar.HasAuthoredValue():
+        return None
+    interpolation = primvar.GetInterpolation()
+    if interpolation not in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        fail(
+            location(prim),
+            f"{name} has {interpolation} interpolation",
+            "it needs one value per point (vertex interpolation)",
+            "paint it on points",
+        )
+    return np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
+
+
+def _whole(prim: Usd.Prim, classes: Floats | None) -> Ints | None:
+    """Return vertex classes as integers; `Garment` checks their range."""
+    if classes is None:
+        return None
+    broken = int(np.count_nonzero(classes != np.round(classes)))
+    if broken:
+        fail(location(prim), f"{broken} vertex classes are not integers", "classes are 0, 1 or 2", "paint them again")
+    return classes.astype(np.int64)

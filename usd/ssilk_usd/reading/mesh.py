@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Convert UsdGeom meshes to core meshes: points, triangles, polygons and texture coordinates."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom
+
+from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, Mesh
+
+from ..names import CLASS, GARMENT, PROXIES
+from ..opening.stage import EARLIEST, apply, has_value, location, value
+from .polygons import triangulate
+
+
+def is_garment(prim: Usd.Prim) -> bool:
+    """Return whether a mesh has vertex classes, a proxy rig, or `ssilk:garment = true`."""
+    return has_value(prim, CLASS) or has_value(prim, PROXIES) or value(prim, GARMENT) is True
+
+
+def is_drawn(prim: Usd.Prim) -> bool:
+    """Return whether a prim is visible at its earliest time and not a guide."""
+    imageable = UsdGeom.Imageable(prim)
+    invisible = imageable.ComputeVisibility(EARLIEST) == UsdGeom.Tokens.invisible
+    return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
+
+
+def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
+    """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without finite colours."""
+    primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+    found = np.asarray(primvar.ComputeFlattened(EARLIEST)) if primvar and primvar.HasAuthoredValue() else None
+    # Any type may be authored under this name.
+    if found is None or found.dtype.kind != "f" or not found.size or found.shape[1:] != (3,):
+        return None
+    if not np.isfinite(found).all():
+        return None
+    red, green, blue = found.astype(np.float64).mean(axis=0).clip(0, 1).tolist()
+    return red, green, blue
+
+
+def read_mesh(prim: Usd.Prim, to_core: Floats) -> Mesh:
+    """Read a UsdGeom.Mesh; its earliest points are its rest shape.
+
+    Args:
+        prim: the mesh. Hole faces are omitted, and left-handed faces are reversed.
+        to_core: transform from the mesh's local space to the core's bind space [m], column vectors, shape (4, 4).
+
+    Raises:
+        SsilkError: counts, indices or texture coordinates do not match, or points are not finite.
+    """
+    where = location(prim)
+    points = np.array(value(prim, "points") or [], dtype=np.float64).reshape(-1, 3)
+    counts, indices = _polygons(prim, len(points), where)
+    corners, counts = _kept_corners(prim, counts)
+    uvs = _texture_coordinates(prim, indices)
+    return Mesh(
+        where,
+        apply(to_core, points),
+        triangulate(points, counts, indices[corners]),
+        counts,
+        indices[corners],
+        None if uvs is None else uvs[corners],
+    )
+
+
+def _polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]:
+    """Return checked face vertex counts and indices."""
+    counts = np.array(value(prim, "faceVertexCounts") or [], dtype=np.int64)
+    indices = np.array(value(prim, "faceVertexIndices") or [], dtype=np.int64)
+    few = int(np.count_nonzero(counts < 3))
+    if few:
+        fail(where, f"{few} faces have fewer than three corners", "a face has three or more", "remove them")
+    if counts.sum() != len(indices):
+        fail(
+            where,
+            f"faceVertexCounts add up to {counts.sum()} but there are {len(indices)} faceVertexIndices",
+            "both must match",
+            "export the mesh again",
+        )
+    bad = int(np.count_nonzero((indices < 0) | (indices >= point_count)))
+    if bad:
+        fail(
+            where,
+            f"{bad} face indices lie outside 0 to {point_count - 1}",
+            "an index names a point of the mesh",
+            "export the mesh again",
+        )
+    return counts, indices
+
+
+def _kept_corners(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints]:
+    """Return the face corners to keep, counter-clockwise from outside, and the vertex counts of their faces."""
+    keep = np.ones(len(counts), dtype=bool)
+    holes = np.array(value(prim, "holeIndices") or [], dtype=np.int64)
+    keep[holes[(holes >= 0) & (holes < len(counts))]] = False
+    starts = np.cumsum(counts) - counts
+    step = -1 if value(prim, "orientation") == UsdGeom.Tokens.leftHanded else 1
+    corners = [np.arange(start, start + count)[::step] for start, count in zip(starts[keep], counts[keep])]
+    return np.concatenate(corners) if corners else np.zeros(0, dtype=np.int64), counts[keep]
+
+
+def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
+    """Return (u, v) for each face corner from `primvars:st`, else the first primvar of that type, or None."""
+    primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
+    by_name = [primvar for primvar in primvars if primvar.GetPrimvarName() == "st"]
+    by_type = [primvar for primvar in primvars if primvar.GetTypeName() in _TEXTURE_TYPES]
+    chosen = next(iter(by_name + by_type), None)
+    if chosen is None:
+        return None
+    uvs = np.array(chosen.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1, 2)
+    if chosen.GetInterpolation() == UsdGeom.Tokens.faceVarying:
+        expected, corners = len(indices), np.arange(len(indices), dtype=np.int64)
+    elif chosen.GetInterpolation() in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        expected, corners = len(value(prim, "points")), indices.astype(np.int64)
+    else:
+        return None  # one value per face or mesh is not a mapping
+    if len(uvs) != expected:
+        fail(
+            location(prim),
+            f"{chosen.GetName()} holds {len(uvs)} texture coordinates for {expected} "
+            f"({chosen.GetInterpolation()} interpolation)",
+            "one for each is needed",
+            "unwrap the mesh again, or remove them",
+        )
+    return uvs[corners]
+
+
+_TEXTURE_TYPES = (
+    Sdf.ValueTypeNames.TexCoord2fArray,
+    Sdf.ValueTypeNames.TexCoord2dArray,
+    Sdf.ValueTypeNames.TexCoord2hArray,
+)

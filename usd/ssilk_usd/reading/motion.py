@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read motions from SkelAnimations, in their own files or on characters in stages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
+from ssilk_core.scene.kinematics import MAX_FPS, MIN_FPS, matrix_from_quaternion, quaternion_from_matrix, rigid
+
+from ..opening.stage import (
+    PRIMS,
+    USD_SUFFIXES,
+    StageLike,
+    inherited_target,
+    listed,
+    location,
+    named,
+    needs_whole_files,
+    open_stage,
+    split_location,
+    world_matrix,
+)
+from ..units import StageUnits
+from .skeleton import skeletons
+from .skin import match_joints
+from .spaces import joints_to_core, need_similarity, similarity_scale
+
+_SCALE_TOLERANCE = 1e-3
+_FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
+FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
+_MOST_TIME_CODES = 1e9  # in a second; some programs count in ticks
+_MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
+
+
+def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
+    """Read several motions, each given as "file[:/Prim/Path]"; a folder means all USD files in it, sorted by name.
+
+    Raises:
+        SsilkError: a folder has no USD files; also as `read_motion`.
+    """
+    return [read_motion(path, skeleton) for path in motion_sources(paths)]
+
+
+def motion_files(paths: Iterable[str | Path]) -> list[Path]:
+    """Return the files that motions are read from, folders sorted by name."""
+    return [Path(split_location(str(path))[0]) for path in motion_sources(paths)]
+
+
+def motion_sources(paths: Iterable[str | Path]) -> list[Path]:
+    """Return the motions that paths name, "file[:/Prim/Path]" each; a folder stands for its USD files.
+
+    Raises:
+        SsilkError: there is no such file or folder, or a folder holds no USD file.
+    """
+    files: list[Path] = []
+    for path in map(Path, paths):
+        if not (path.is_dir() or Path(split_location(str(path))[0]).is_file()):
+            fail(str(path), "there is no such file or folder", "motions are USD files or folders of them")
+        within = sorted(file for file in path.iterdir() if file.suffix in USD_SUFFIXES) if path.is_dir() else [path]
+        if not within:
+            fail(str(path), "the folder holds no USD files", f"motions are {', '.join(USD_SUFFIXES)} files")
+        files += within
+    return files
+
+
+@needs_whole_files
+def read_motion(
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    prim: str | None = None,
+    root: str | None = None,
+    within: tuple[float, float] | None = None,
+) -> Motion:
+    """Read a motion at its own rate: framesPerSecond if authored, else timeCodesPerSecond.
+
+    Frames run from the first to the last authored sample, whatever range the stage says; USD interpolates between
+    samples. On a character, the root joints include the xforms above the skeleton, animated or not. Joints are
+    matched by path, then by unique leaf name. Joints that the animation lacks stay in the rest pose.
+
+    Args:
+        source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
+        skeleton: skeleton whose joints the motion is for.
+        prim: the SkelAnimation, by path or name, if there are several.
+        root: the character, by path or name, if several are animated.
+        within: time codes of the first and the last frame, in place of all samples.
+
+    Raises:
+        SsilkError: there is no animation or several, it is for another skeleton or has scales, or the data is
+            malformed.
+    """
+    if not isinstance(source, Usd.Stage):
+        source, asked = split_location(str(source))
+        prim = prim or asked
+    stage = open_stage(source)
+    animation, placed = find_animation(stage, prim, root)
+    where = location(animation)
+    joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    match = _matched(joints, skeleton, where)
+    codes, fps = _time_codes(stage, animation, placed, within)
+    placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
+    if placed:
+        need_similarity(placed, placements)
+    scale = similarity_scale(placements)
+    rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
+    for first in range(0, len(codes), _FRAMES_AT_ONCE):
+        part = slice(first, first + _FRAMES_AT_ONCE)
+        turned, moved = read_samples(animation, codes[part], len(joints), where)
+        authored = rigid(matrix_from_quaternion(turned), moved)[:, match]
+        placement = placements[part] if placed else placements
+        local = joints_to_core(authored, skeleton.parents, placement, StageUnits.of(stage), scale)
+        local[:, match < 0] = skeleton.rest_transforms[match < 0]
+        if not first:
+            kept = match >= 0
+            _check_lengths(local[:, kept], skeleton.rest_transforms[kept], skeleton.parents[kept], where)
+        rotations[part], translations[part] = quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3]
+    _check_places(translations, skeleton, codes, where)
+    start = float(codes[0] * fps / stage.GetTimeCodesPerSecond())
+    return Motion(where, fps, rotations, translations, start)
+
+
+def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
+    """Return the SkelAnimation and the Skeleton that it animates (None for an unbound animation)."""
+    where = stage.GetRootLayer().identifier
+    bound, own = {}, {}
+    for top, skeleton in skeletons(stage):
+        animation = inherited_target(skeleton, "skel:animationSource")
+        if animation:
+            bound[animation] = skeleton
+        if animation and root and named([top, skeleton], root):
+            own[animation] = skeleton
+    bound = own or bound
+    every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
+    found = named(every, prim) if prim else list(bound) or every
+    if not found:
+        fail(
+            where,
+            f"no SkelAnimation{f' is named {prim!r}' if prim else ''}",
+            f"a motion is a SkelAnimation; there are {listed(every)}",
+            "export the animation, or name another prim",
+        )
+    if len(found) != 1:
+        fail(
+            where,
+            f"there are several animations: {listed(found)}",
+            "one is needed",
+            f"name one, such as {where}:{found[0].GetPath()}",
+        )
+    return found[0], bound.get(found[0])
+
+
+def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
+    """Return the index of each joint of the skeleton in the animation, or -1."""
+    match = np.array(match_joints(skeleton.joint_names, joints))
+    found, smaller = int(np.count_nonzero(match >= 0)), min(len(joints), skeleton.joint_count)
+    missing = [name for name, index in zip(skeleton.joint_names, match) if index < 0]
+    if not found or 2 * found < smaller:
+        fail(
+            where,
+            f"this is a motion of another skeleton: {found} of {skeleton.joint_count} joints match its {len(joints)} "
+            f"(it lacks {', '.join(missing[:3])})",
+            f"at least half of the joints of {skeleton.path} must be in it, by path or by leaf name",
+            "retarget the motion or rename its joints",
+        )
+    return match
+
+
+def _time_codes(
+    stage: Usd.Stage, animation: Usd.Prim, placed: Usd.Prim | None, within: tuple[float, float] | None
+) -> tuple[Floats, float]:
+    """Return the time codes of the frames and their rate [1/s]."""
+    fps, second = frame_rate(stage)
+    span = within or sampled_span(animation, placed)
+    if span is None:
+        return np.zeros(1), fps
+    step = second / fps
+    first, last = span
+    if last - first >= step * _MOST_FRAMES:
+        fail(
+            location(animation),
+            f"samples run from time code {first:g} to {last:g}",
+            f"a motion has at most {_MOST_FRAMES} frames",
+            "remove stray samples",
+        )
+    return first + step * np.arange(int((last - first) / step + 1e-6) + 1), fps
+
+
+def frame_rate(stage: Usd.Stage) -> tuple[float, float]:
+    """Return the frames and the time codes of a second; raise `SsilkError` where they are out of range."""
+    second = stage.GetTimeCodesPerSecond()
+    fps = stage.GetFramesPerSecond() if stage.HasAuthoredMetadata("framesPerSecond") else second
+    for rate, what, most in ((fps, "frames", MAX_FPS), (second, "time codes", _MOST_TIME_CODES)):
+        if not MIN_FPS <= rate <= most:
+            where = stage.GetRootLayer().identifier
+            fail(where, f"a rate of {rate:g} {what}", f"it must be from {MIN_FPS:g} to {most:g} in a second")
+    return fps, second
+
+
+def sampled_span(animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[float, float] | None:
+    """Return the time codes of the first and last sample of a motion and its placement; None where there is none."""
+    samples = [
+        time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
+    ]
+    above = placed
+    while above and not above.IsPseudoRoot():
+        samples += UsdGeom.Xformable(above).GetTimeSamples() if above.IsA(UsdGeom.Xformable) else []
+        above = above.GetParent()
+    return (min(samples), max(samples)) if samples else None
+
+
+def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
+    """Return rotations (F, N, 4) as (w, x, y, z) and translations (F, N, 3) in stage units."""
+    rotations = _sampled(animation, "rotations", codes, (count, 4), where)
+    translations = _sampled(animation, "translations", codes, (count, 3), where)
+    if animation.GetAttribute("scales").HasAuthoredValue():
+        scales = _sampled(animation, "scales", codes, (count, 3), where)
+        scaled = int(np.count_nonzero((np.abs(scales - 1) > _SCALE_TOLERANCE).any(axis=(0, 2))))
+        if scaled:
+            fail(where, f"{scaled} joints are scaled", "joints may only rotate and move", "remove the scale")
+    norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
+    if norms.min() <= 1e-6:
+        fail(where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it")
+    return np.roll(rotations / norms, 1, axis=-1), translations
+
+
+def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, int], where: str) -> Floats:
+    """Return an attribute at each time code, shape (F, *shape)."""
+    values = [np.array(animation.GetAttribute(name).Get(code)) for code in codes]
+    odd = next((item for item in values if item.shape != shape), None)
+    if odd is not None:
+        found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}"
+        fail(where, f"the animation has {found}", f"{shape[0]} are needed, one for each joint", "export it again")
+    result = np.array(values, dtype=np.float64)
+    bad = np.flatnonzero(~np.isfinite(result).all(axis=(1, 2)))
+    if len(bad):
+        found = f"{name} hold NaN or infinity in {len(bad)} frames, first at time code {codes[bad[0]]:g}"
+        fail(where, found, "all must be finite", "repair the animation")
+    return result
+
+
+def _check_lengths(local: Floats, rest: Floats, parents: Ints, where: str) -> None:
+    """Raise `SsilkError` if a motion's bones are far longer or shorter than the skeleton's: its units are wrong."""
+    bones = np.linalg.norm(rest[:, :3, 3], axis=-1)
+    kept = (parents >= 0) & (bones > 1e-3)
+    if not kept.any():
+        return
+    ratio = float(np.median(np.linalg.norm(local[0, kept, :3, 3], axis=-1) / bones[kept]))
+    if not 0.5 < ratio < 2:
+        fail(
+            where,
+            f"bones are {ratio:.3g} times as long as the skeleton's",
+            "both must agree in metres",
+            "set metersPerUnit of the motion's file to its units",
+        )
+
+
+def _check_places(translations: Floats, skeleton: Skeleton, codes: Floats, where: str) -> None:
+    """Raise `SsilkError` if a joint leaves any sensible world; `translations` [m] are local, shape (F, J, 3)."""
+    far = np.abs(translations).max(axis=-1)
+    beyond = ~(far <= FARTHEST)
+    if beyond.any():
+        frame, joint = np.argwhere(beyond)[0]
+        name = skeleton.joint_names[joint].rpartition("/")[2]
+        apart = "the origin" if skeleton.parents[joint] < 0 else "its parent"
+        fail(
+            where,
+            f"joint {name} is {far[frame, joint]:.3g} m from {apart} at time code {codes[frame]:g}",
+            f"at most {FARTHEST:g} m are allowed",
+            "repair the animation, or set metersPerUnit of its file",
+        )

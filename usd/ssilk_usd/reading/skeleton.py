@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find and check a character's skeleton in a stage, and separate its own joints from proxies."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
+
+from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Floats, Ints, Skeleton
+
+from ..names import PROXIES
+from ..opening.stage import (
+    PRIMS,
+    column_matrix,
+    has_value,
+    inherited_target,
+    location,
+    named,
+    stage_name,
+    value,
+    world_matrix,
+)
+from ..units import StageUnits
+from .skin import match_joints
+from .spaces import SkelSource, joints_to_core, need_similarity
+
+_CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
+
+
+def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
+    """Find the only skeleton of a stage, or the one named by `root` (path or name of its SkelRoot or Skeleton).
+
+    Raises:
+        SsilkError: there is no skeleton or no unique one, or the skeleton is malformed.
+    """
+    where, found = stage_name(stage), skeletons(stage)
+    if not found:
+        fail(
+            where,
+            "there is no SkelRoot with a Skeleton",
+            "a character is a SkelRoot with a Skeleton and meshes bound to it",
+            "export the character with its armature",
+        )
+    chosen = found if root is None else _pairs_named(found, root)
+    there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
+    if not chosen:
+        fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, _CHOOSE)
+    if len(chosen) != 1:
+        fail(
+            where,
+            f"{len(chosen)} skeletons could be the character's",
+            there_are,
+            f"{_CHOOSE}, by the path of its Skeleton if need be",
+        )
+    return _source(*chosen[0])
+
+
+def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
+    """Return the pairs whose SkelRoot has this path or name, or if there are none, whose Skeleton has it."""
+    roots, skeletons_named = (named([pair[side] for pair in pairs], name) for side in (0, 1))
+    return [pair for pair in pairs if pair[0] in roots] or [pair for pair in pairs if pair[1] in skeletons_named]
+
+
+def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
+    """Return each outermost SkelRoot with the skeletons that its meshes are bound to, or else that it contains."""
+    pairs = []
+    prims = iter(Usd.PrimRange.Stage(stage, PRIMS))
+    for prim in prims:
+        if prim.IsA(UsdSkel.Root):
+            prims.PruneChildren()
+            within = list(Usd.PrimRange(prim, PRIMS))
+            bound = [bound_skeleton(mesh) for mesh in within if mesh.IsA(UsdGeom.Mesh)]
+            held = [other for other in within if other.IsA(UsdSkel.Skeleton)]
+            pairs += [(prim, skeleton) for skeleton in dict.fromkeys(filter(None, bound)) or held]
+    return pairs
+
+
+def bound_skeleton(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the Skeleton that a prim or its nearest bound ancestor is bound to, or None."""
+    target = inherited_target(prim, "skel:skeleton")
+    return target if target and target.IsA(UsdSkel.Skeleton) else None
+
+
+def character_skeleton(source: SkelSource) -> Skeleton:
+    """Return the character's own joints, without proxies, as the core's skeleton.
+
+    Rest transforms of root joints include the character's placement, as those of a motion do.
+    """
+    kept = source.character_joints
+    position = np.full(len(source.joints) + 1, -1)
+    position[kept] = np.arange(len(kept))
+    parents = position[source.parents[kept]]
+    rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
+    names = tuple(source.joints[index] for index in kept)
+    return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest)
+
+
+def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
+    where, joints = location(prim), tuple(str(name) for name in value(prim, "joints") or ())
+    if not joints:
+        fail(where, "the skeleton has no joints", "at least one is needed", "export the armature again")
+    parents = _parents(joints, where)
+    bind = _matrices(prim, "bindTransforms", len(joints))
+    if bind is None:
+        fail(where, "the skeleton has no bindTransforms", "one for each joint is needed", "export the armature again")
+    rest = _matrices(prim, "restTransforms", len(joints))
+    placement = need_similarity(prim, world_matrix(prim))
+    return SkelSource(
+        stage=prim.GetStage(),
+        root=root,
+        prim=prim,
+        units=StageUnits.of(prim.GetStage()),
+        joints=joints,
+        parents=parents,
+        bind=bind,
+        rest=_rest_from_bind(bind, parents) if rest is None else rest,
+        placement=placement,
+        owners=_owners(root, joints, parents),
+    )
+
+
+def _parents(joints: tuple[str, ...], where: str) -> Ints:
+    """Return parent indices by UsdSkel's rule: the parent is the nearest ancestor path that is a joint."""
+    repeated = next((name for name, count in Counter(joints).items() if count > 1), None)
+    if repeated is not None:
+        fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
+    broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
+    if broken is not None:
+        fail(where, f"joint '{broken}' is not a path", "joints are paths like 'Hips/Spine'", "rename it")
+    topology = UsdSkel.Topology(joints)
+    valid, reason = topology.Validate()
+    if not valid:
+        fail(
+            where,
+            f"the joints are out of order ({reason.partition('.')[0]})",
+            "parents must precede their children, and a joint must not be its own ancestor",
+            "reorder the joints",
+        )
+    return np.array(topology.GetParentIndices(), dtype=np.int64)
+
+
+def _matrices(prim: Usd.Prim, name: str, count: int) -> Floats | None:
+    """Return a skeleton's matrices for column vectors, checked against its joints; None if not authored."""
+    matrices = value(prim, name)
+    if matrices is None or not len(matrices):
+        return None
+    if len(matrices) != count:
+        fail(
+            location(prim),
+            f"{len(matrices)} {name} for {count} joints",
+            "one for each joint is needed",
+            "export the armature again",
+        )
+    result = column_matrix(matrices)
+    if not np.isfinite(result).all():
+        fail(location(prim), f"{name} hold NaN or infinity", "all must be finite", "repair it")
+    singular = int(np.count_nonzero(np.abs(np.linalg.det(result)) < 1e-30))
+    if singular:
+        fail(location(prim), f"{singular} {name} cannot be inverted", "joints must not have zero scale")
+    return result
+
+
+def _rest_from_bind(bind: Floats, parents: Ints) -> Floats:
+    children = np.flatnonzero(parents >= 0)
+    rest = np.array(bind)
+    rest[children] = np.linalg.inv(bind[parents[children]]) @ bind[children]
+    return rest
+
+
+def _owners(root: Usd.Prim, joints: tuple[str, ...], parents: Ints) -> tuple[str, ...]:
+    """Return the garment that each joint is a proxy of: a listed joint or a descendant of one; empty for others."""
+    listed_by: dict[int, str] = {}
+    for prim in Usd.PrimRange(root, PRIMS):
+        names = tuple(value(prim, PROXIES) or ()) if has_value(prim, PROXIES) else ()
+        listed_by.update({index: str(prim.GetPath()) for index in match_joints(names, joints) if index >= 0})
+    owners: list[str] = []
+    for index, parent in enumerate(parents):
+        owners.append(listed_by.get(index, owners[parent] if parent >= 0 else ""))
+    return tuple(owners)

@@ -1,0 +1,394 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bake as layers: a lasting asset, and for each shot one small layer that a new bake replaces.
+
+    FOLDER/assets/cape/asset.usda        component; payload and variants
+    FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
+    FOLDER/assets/cape/used.json         what the name is used for; `ssilk_core.delivery.bake.names_used` writes it
+    FOLDER/shots/walk/cape/anim.usdc     what moves; opens by itself
+    FOLDER/shots/walk/cape/points.usdc   a point cache, where one is asked for
+    FOLDER/shots/walk/shot.usda          every garment of the shot
+
+Artists put layers of their own above these: nothing here is edited in place, and what has not changed is not touched.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Container, Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.errors import SsilkError, fail
+from ssilk_core.files import replacing, sha256
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion
+
+from ..names import shape_name
+from ..opening.garment_api import GarmentRecord
+from ..opening.specs import free_when_closed
+from ..opening.stage import open_stage
+from ..reading.mesh import is_garment
+from ..units import StageUnits
+from ..writing.author import Asset, define_asset, define_blendshapes, extent_array
+from ..writing.body_faces import HiddenPolygons, hide_polygons
+from ..writing.export import new_stage, save
+from .layers_facts import AssetFacts, asset_facts
+from .samples import PATH_OP, Samples, kept_joints, root_path
+from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
+
+DEFORMATION, QUALITY = "deformation", "quality"
+FRAMES_PER_SAVE = 128  # of points: 5 MB in memory for a garment of 3,000 vertices
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Paths of the files of one garment in one shot; `garment` is also the name of its prim."""
+
+    folder: Path
+    garment: str
+    shot: str
+
+    @property
+    def asset(self) -> Path:
+        return self.folder / "assets" / self.garment / "asset.usda"
+
+    @property
+    def geometry(self) -> Path:
+        return self.asset.with_name("geometry.usdc")
+
+    @property
+    def animation(self) -> Path:
+        return self.folder / "shots" / self.shot / self.garment / "anim.usdc"
+
+    @property
+    def points(self) -> Path:
+        return self.animation.with_name("points.usdc")
+
+    @property
+    def stage(self) -> Path:
+        return self.folder / "shots" / self.shot / "shot.usda"
+
+
+@dataclass(frozen=True)
+class WrittenAsset:
+    """An asset on disk.
+
+    Attributes:
+        asset: the paths of its prims.
+        changes: that may break stronger layers.
+        digests: path and SHA-256 of each file.
+    """
+
+    asset: Asset
+    changes: tuple[str, ...]
+    digests: tuple[tuple[Path, str], ...]
+
+
+def write_asset(
+    layout: Layout,
+    deformer: Deformer,
+    units: StageUnits,
+    *,
+    include_body: bool = True,
+    record: GarmentRecord | None = None,
+) -> WrittenAsset:
+    """Write a garment's asset; files that hold the same already are left alone.
+
+    Raises:
+        SsilkError: as `author.define_asset` does, or a file cannot be written.
+    """
+    before, unknown = _facts_before(layout)
+    bodies = deformer.scene.character.bodies if include_body else ()
+    with replacing(layout.geometry, keep_same=True) as temporary:
+        stage = new_stage(temporary, units)
+        asset = define_asset(stage, deformer, bodies, units, name=layout.garment, record=record)
+        save(stage.GetRootLayer(), layout.geometry)
+        box = _extent(stage, asset)
+        del stage
+        geometry = sha256(temporary)
+    with replacing(layout.asset, keep_same=True) as temporary:
+        stage = new_stage(temporary, units)
+        _define_component(stage, asset, layout, box)
+        free_when_closed(stage.GetUsedLayers())
+        save(stage.GetRootLayer(), layout.asset)
+        del stage
+        component = sha256(temporary)
+    changes = unknown if before is None else asset_facts(layout.asset).changes_since(before)
+    return WrittenAsset(asset, changes, ((layout.geometry, geometry), (layout.asset, component)))
+
+
+def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
+    """Return the facts of an existing asset; None if there is none, or if it is damaged, with a message."""
+    if not (layout.asset.is_file() and layout.geometry.is_file()):
+        return None, ()
+    try:
+        return asset_facts(layout.asset), ()
+    except SsilkError as error:
+        return None, (f"the file that was there could not be read and is replaced ({str(error).rstrip('.')})",)
+
+
+def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
+    """Return the bounds of each mesh at its bind pose."""
+    meshes = [prim for prim in stage.GetPrimAtPath(asset.root).GetChildren() if prim.IsA(UsdGeom.Mesh)]
+    corners = np.stack([np.array(UsdGeom.Mesh(prim).GetExtentAttr().Get()) for prim in meshes])
+    return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
+
+
+def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray) -> None:
+    """Define the SkelRoot over its payload, with bounds that need no payload, and the variants."""
+    root = UsdSkel.Root.Define(stage, asset.root).GetPrim()
+    stage.SetDefaultPrim(root)
+    model = Usd.ModelAPI(root)
+    model.SetKind(Kind.Tokens.component)
+    model.SetAssetName(layout.garment)
+    UsdGeom.Boundable(root).CreateExtentAttr(box)
+    root.GetPayloads().AddPayload(f"./{layout.geometry.name}", asset.root)
+    with _variant(root, DEFORMATION, "rest"):
+        UsdSkel.BindingAPI(root).CreateAnimationSourceRel().SetTargets([])
+    with _variant(root, QUALITY, "skin"):
+        binding = UsdSkel.BindingAPI(stage.OverridePrim(asset.garment))
+        binding.CreateBlendShapesAttr().Block()
+        binding.CreateBlendShapeTargetsRel().SetTargets([])
+    _variant(root, DEFORMATION, "skel")
+    _variant(root, QUALITY, "full")
+
+
+def _variant(prim: Usd.Prim, name: str, choice: str) -> Usd.EditContext:
+    """Add a variant and select it; return the context that authors in it."""
+    variants = prim.GetVariantSets().AddVariantSet(name)
+    variants.AddVariant(choice)
+    variants.SetVariantSelection(choice)
+    return Usd.EditContext(prim.GetStage(), variants.GetVariantEditTarget())
+
+
+def write_animation(
+    layout: Layout,
+    asset: Asset,
+    deformer: Deformer,
+    motion: Motion,
+    poses: Iterable[GarmentPose],
+    *,
+    units: StageUnits,
+    start: float = 0.0,
+    samples_per_frame: int = 1,
+    lean: bool = True,
+    hidden: Sequence[tuple[int, bool]] = (),
+    hidden_polygons: HiddenPolygons | None = None,
+    points: bool = False,
+    provenance: Mapping[str, object] | None = None,
+    path: Path | None = None,
+) -> ShotSummary:
+    """Write what moves in one shot as a layer that references its asset.
+
+    Blendshapes of the deformer that the asset lacks are the shot's own, and are written with it.
+
+    Args:
+        motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
+        lean: see `samples.Samples`.
+        hidden_polygons: polygons of the bodies that this shot hides, in a variant.
+        points: offer the point cache that `write_points` writes as a variant.
+        path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
+
+    Raises:
+        SsilkError: as `shot.write_shot` does.
+    """
+    span = TimeSpan.of(motion, start, samples_per_frame)
+    with replacing(path or layout.animation) as temporary:
+        layer = Sdf.Layer.CreateNew(str(temporary))
+        stage = Usd.Stage.Open(layer, None)
+        _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
+        asset = _define_own_shapes(stage, asset, deformer, units)
+        set_metadata(stage, span, units)
+        if lean:
+            UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
+        set_visibility(stage, asset.root, span, hidden)
+        if hidden_polygons and asset.bodies:
+            meshes = [body.mesh for body in asset.bodies]
+            hide_polygons(stage, asset.root, asset.body_paths, meshes, replace(hidden_polygons, variants=True))
+        if points:
+            _define_points(stage, asset, layout)
+        free_when_closed(stage.GetUsedLayers())
+        del stage  # nobody has to hear of each sample
+        samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step, lean=lean)
+        write_samples(samples, poses, layout.animation, provenance)
+        del samples, layer  # the file is closed before it is renamed
+    return summary(layout.animation, deformer, motion, span, len(asset.shapes))
+
+
+def kept_names(deformer: Deformer, motion: Motion, lean: bool) -> list[str]:
+    """Return the joints that a shot animates."""
+    return [deformer.scene.joint_names[joint] for joint in kept_joints(deformer, motion, lean)]
+
+
+def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, joints: list[str]) -> None:
+    """Reference the asset, and override its SkelAnimation with the joints that this shot moves."""
+    root = stage.DefinePrim(asset.root)
+    stage.SetDefaultPrim(root)
+    root.GetReferences().AddReference(os.path.relpath(layout.asset, layout.animation.parent))
+    animation = UsdSkel.Animation(stage.OverridePrim(asset.animation))
+    animation.CreateJointsAttr(Vt.TokenArray(joints))
+    animation.CreateRotationsAttr()
+    animation.CreateTranslationsAttr()
+    animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1)))
+    if len(asset.shapes):
+        animation.CreateBlendShapeWeightsAttr()
+    UsdGeom.Boundable(root).CreateExtentAttr()
+
+
+def _define_own_shapes(stage: Usd.Stage, asset: Asset, deformer: Deformer, units: StageUnits) -> Asset:
+    """Define the blendshapes that the asset lacks, in the variant that has any; return the asset with them."""
+    own = np.setdiff1d(np.flatnonzero(deformer.shapes.any(axis=(1, 2))), asset.shapes)
+    if not own.size:
+        return asset
+    before, names = (list(map(shape_name, indices)) for indices in (asset.shapes, own))
+    with _variant(stage.GetPrimAtPath(asset.root), QUALITY, "full"):
+        mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
+        define_blendshapes(mesh, names, deformer.shapes[own], units, before=before)
+    animation = UsdSkel.Animation(stage.GetPrimAtPath(asset.animation))
+    animation.CreateBlendShapesAttr(Vt.TokenArray([*before, *names]))
+    animation.CreateBlendShapeWeightsAttr()
+    return replace(asset, shapes=np.concatenate([asset.shapes, own]))
+
+
+def _define_points(stage: Usd.Stage, asset: Asset, layout: Layout) -> None:
+    """Add a variant of the shot in which the garment is bound to nothing and has its points from a file."""
+    root = stage.GetPrimAtPath(asset.root)
+    with _variant(root, DEFORMATION, "points"):
+        root.GetPayloads().AddPayload(f"./{layout.points.name}", asset.root)
+        mesh = stage.OverridePrim(asset.garment)
+        # The schema stays applied, since its properties come with the asset; without a skeleton nothing is skinned.
+        UsdSkel.BindingAPI(mesh).CreateSkeletonRel().SetTargets([])
+    root.GetVariantSet(DEFORMATION).SetVariantSelection("skel")
+
+
+def write_points(
+    layout: Layout,
+    asset: Asset,
+    vertices: Iterable[Floats],
+    deformer: Deformer,
+    motion: Motion,
+    *,
+    units: StageUnits,
+    start: float = 0.0,
+    samples_per_frame: int = 1,
+    lean: bool = True,
+) -> str:
+    """Write the garment's points at each sample of a shot, [m] in world space, shape (V, 3), as a point cache.
+
+    Returns:
+        SHA-256 of the file.
+    """
+    span = TimeSpan.of(motion, start, samples_per_frame)
+    paths = root_path(deformer, motion) if lean else np.zeros((motion.frame_count, 3))
+    with replacing(layout.points) as temporary:
+        layer = Sdf.Layer.CreateNew(str(temporary))
+        stage = Usd.Stage.Open(layer, None)
+        mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
+        attributes = [mesh.CreatePointsAttr().GetPath(), mesh.CreateExtentAttr().GetPath()]
+        set_metadata(stage, span, units)
+        del stage
+        for frame, (points, path) in enumerate(zip(vertices, paths, strict=True)):
+            placed = np.ascontiguousarray(units.points_from_core(points - path), dtype=np.float32)
+            values = Vt.Vec3fArray.FromNumpy(placed), extent_array(placed.min(axis=0), placed.max(axis=0))
+            for attribute, value in zip(attributes, values):
+                layer.SetTimeSample(attribute, start + span.step * frame, value)
+            if frame % FRAMES_PER_SAVE == FRAMES_PER_SAVE - 1:
+                save(layer, layout.points)
+        save(layer, layout.points)
+        del layer  # the file is closed before it is renamed
+        return sha256(temporary)
+
+
+@dataclass(frozen=True)
+class WrittenStage:
+    """The stage of a shot: garments that are left out because they cannot be read, and why; garments whose body is
+    not shown, with the garment whose body is."""
+
+    unreadable: Mapping[str, str]
+    bodies: Mapping[str, str]
+
+
+def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = frozenset()) -> WrittenStage:
+    """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
+
+    Args:
+        garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
+            its garments that has one. If none can be read, no stage is written.
+        needed: names of garments that have to be in it; others are left out where they cannot be read.
+
+    Raises:
+        SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
+            written.
+    """
+    stages, unreadable = _opened(garments, needed)
+    shown: dict[Hashable, str] = {}
+    others: dict[str, str] = {}
+    if not stages:
+        return WrittenStage(unreadable, others)
+    layout, units = next(iter(stages)), _common_units(stages)
+    first = stages[layout].GetRootLayer()
+    spans = [_span(stage.GetRootLayer(), first.timeCodesPerSecond) for stage in stages.values()]
+    with replacing(layout.stage, keep_same=True) as temporary:
+        stage = new_stage(temporary, units)
+        shot = UsdGeom.Xform.Define(stage, "/Shot").GetPrim()
+        stage.SetDefaultPrim(shot)
+        Usd.ModelAPI(shot).SetKind(Kind.Tokens.assembly)
+        for name in ("timeCodesPerSecond", "framesPerSecond"):
+            stage.SetMetadata(name, first.pseudoRoot.GetInfo(name))
+        stage.SetStartTimeCode(min(start for start, _ in spans))
+        stage.SetEndTimeCode(max(end for _, end in spans))
+        for garment, opened in stages.items():
+            prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
+            prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
+            bodies = _body_names(opened)
+            if bodies and shown.setdefault(garments[garment], garment.garment) != garment.garment:
+                others[garment.garment] = shown[garments[garment]]
+                for name in bodies:
+                    stage.OverridePrim(prim.GetPath().AppendChild(name)).SetActive(False)
+        free_when_closed(stage.GetUsedLayers())
+        save(stage.GetRootLayer(), layout.stage)
+        del stage, shot, prim
+    return WrittenStage(unreadable, others)
+
+
+def _opened(garments: Iterable[Layout], needed: Container[str]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:
+    """Return the stages of garments that can be read, and why others cannot."""
+    stages, unreadable = {}, {}
+    for garment in garments:
+        try:
+            stages[garment] = open_stage(garment.animation)
+        except SsilkError as error:
+            if garment.garment in needed:
+                raise
+            unreadable[garment.garment] = str(error)
+    return stages, unreadable
+
+
+def _common_units(stages: Mapping[Layout, Usd.Stage]) -> StageUnits:
+    """Return the units of the garments of a shot, which references do not convert."""
+    found = {garment: StageUnits.of(stage) for garment, stage in stages.items()}
+    one = next(iter(found))
+    for other, units in found.items():
+        if units != found[one]:
+            fail(
+                str(one.stage),
+                f"'{one.garment}' is in units of {found[one].meters_per_unit:g} m with {found[one].up_axis} up, "
+                f"'{other.garment}' in units of {units.meters_per_unit:g} m with {units.up_axis} up",
+                "the garments of a shot share units and axis",
+                "bake them for one target, or into separate folders",
+            )
+    return found[one]
+
+
+def _span(layer: Sdf.Layer, rate: float) -> tuple[float, float]:
+    """Return the first and last time code of a layer, as a stage of another rate plays them."""
+    scale = rate / layer.timeCodesPerSecond
+    return layer.startTimeCode * scale, layer.endTimeCode * scale
+
+
+def _body_names(stage: Usd.Stage) -> list[str]:
+    """Return the names of the body meshes that come with a garment."""
+    prims = stage.GetDefaultPrim().GetChildren()
+    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and not is_garment(prim)]

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The prims of a UsdSkel asset that do not move: skeleton, skinned meshes, blendshapes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import count
+
+import numpy as np
+from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.errors import fail
+from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
+
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
+from ..opening.garment_api import GarmentRecord, apply_garment_api
+from ..reading.mesh import display_colour
+from ..reading.skin import leaf
+from ..units import StageUnits
+from .body_faces import HiddenPolygons, author_faces, hide_polygons
+
+
+@dataclass(frozen=True)
+class Asset:
+    """Paths of the prims of an authored asset that a shot animates.
+
+    Attributes:
+        root: the SkelRoot.
+        garment: the garment's mesh.
+        animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
+        bodies, body_paths: the bodies whose meshes were written, and the prims of these.
+        shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
+    """
+
+    root: Sdf.Path
+    garment: Sdf.Path
+    animation: Sdf.Path
+    bodies: tuple[Body, ...]
+    body_paths: tuple[Sdf.Path, ...]
+    shapes: Ints
+
+
+def define_asset(
+    stage: Usd.Stage,
+    deformer: Deformer,
+    bodies: tuple[Body, ...],
+    units: StageUnits,
+    *,
+    name: str | None = None,
+    record: GarmentRecord | None = None,
+    hidden_polygons: HiddenPolygons | None = None,
+) -> Asset:
+    """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
+
+    Args:
+        name: of the SkelRoot (default: the character's).
+        record: how the garment was made, kept on its mesh.
+        hidden_polygons: polygons of the bodies to hide.
+
+    Raises:
+        SsilkError: the joint paths spell another hierarchy than the parents.
+    """
+    scene = deformer.scene
+    meshes = [scene.garment.mesh.path, *(body.mesh.path for body in bodies)]
+    names = prim_names(["Skeleton", "Animation", *meshes])
+    root = UsdSkel.Root.Define(stage, "/" + (name or prim_names([scene.character.path])[0]))
+    paths = [root.GetPath().AppendChild(name) for name in names]
+    skeleton = define_skeleton(stage, paths[0], scene.character.skeleton, scene.rig, units)
+    shapes = np.flatnonzero(deformer.shapes.any(axis=(1, 2)))
+    shape_names = [shape_name(index) for index in shapes]
+    _define_animation(stage, paths[1], scene.joint_names, shape_names)
+    _bind_root(root, skeleton, paths[1])
+    garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
+    mark_garment(garment.GetPrim(), scene.garment, scene.rig.joint_names or None)
+    apply_garment_api(garment.GetPrim(), record)
+    bind_skin(garment, deformer.skin, skeleton)
+    define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
+    for path, body in zip(paths[3:], bodies):
+        bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
+    if hidden_polygons is not None:
+        hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
+    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes)
+
+
+def prim_names(paths: Sequence[str]) -> list[str]:
+    """Return a valid and unique prim name for each path, based on its last element."""
+    names: list[str] = []
+    for path in paths:
+        word = re.search(r"\w+", path.rsplit("/", 1)[-1])
+        stem = re.sub(r"^(\d|$)", r"_\1", word.group() if word else "")
+        names.append(free_name(stem, names))
+    return names
+
+
+def free_name(stem: str, taken: Collection[str]) -> str:
+    """Return a name that is not taken: `stem`, or the first of `stem`_2, `stem`_3 and so on."""
+    copies = (f"{stem}_{copy}" for copy in count(2))
+    return stem if stem not in taken else next(name for name in copies if name not in taken)
+
+
+def _define_animation(stage: Usd.Stage, path: Sdf.Path, joints: Sequence[str], shapes: Sequence[str]) -> None:
+    animation = UsdSkel.Animation.Define(stage, path)
+    animation.CreateJointsAttr(Vt.TokenArray(joints))
+    animation.CreateRotationsAttr()
+    animation.CreateTranslationsAttr()
+    animation.CreateScalesAttr(Vt.Vec3hArray(len(joints), Gf.Vec3h(1)))
+    if shapes:
+        animation.CreateBlendShapesAttr(Vt.TokenArray(shapes))
+        animation.CreateBlendShapeWeightsAttr()
+
+
+def _bind_root(root: UsdSkel.Root, skeleton: UsdSkel.Skeleton, animation: Sdf.Path) -> None:
+    """Make the SkelRoot the default prim and a component, and bind skeleton and animation to it."""
+    prim = root.GetPrim()
+    prim.GetStage().SetDefaultPrim(prim)
+    Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
+    root.CreateExtentAttr()
+    binding = UsdSkel.BindingAPI.Apply(prim)
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateAnimationSourceRel().SetTargets([animation])
+
+
+def define_skeleton(
+    stage: Usd.Stage, path: Sdf.Path, skeleton: Skeleton, rig: ProxyRig | None, units: StageUnits
+) -> UsdSkel.Skeleton:
+    """Define the character's joints followed by the proxies, at their bind and rest transforms.
+
+    Raises:
+        SsilkError: the joint paths spell another hierarchy than the parents.
+    """
+    joints, parents, binds = skeleton.joint_names, skeleton.parents, skeleton.bind_transforms
+    if rig is not None:
+        joints, parents = (*joints, *rig.joint_names), np.concatenate([parents, rig.parents])
+        binds = np.concatenate([binds, rig.bind_transforms])
+    wrong = np.flatnonzero(np.array(UsdSkel.Topology(joints).GetParentIndices()) != parents)
+    if wrong.size:
+        fail(
+            skeleton.path if rig is None else rig.path,
+            f"the path of joint '{joints[wrong[0]]}' does not spell its parent",
+            "UsdSkel reads the hierarchy from the joint paths",
+            "name each joint '<path of its parent>/<name>'",
+        )
+    prim = UsdSkel.Skeleton.Define(stage, path)
+    prim.CreateJointsAttr(Vt.TokenArray(joints))
+    prim.CreateJointNamesAttr(Vt.TokenArray(unique_names(joints)))
+    prim.CreateBindTransformsAttr(matrix_array(units.transforms_from_core(binds)))
+    prim.CreateRestTransformsAttr(matrix_array(_rest_transforms(skeleton, binds, parents, units)))
+    UsdSkel.BindingAPI.Apply(prim.GetPrim())
+    return prim
+
+
+def unique_names(joints: Sequence[str]) -> list[str]:
+    """Return a name of its own for each joint path: its last part, numbered where several joints have it."""
+    leaves = [leaf(joint) for joint in joints]
+    names, taken = dict.fromkeys(leaves), set(leaves)
+    found = []
+    for name in leaves:
+        own = name if name in names else free_name(name, taken)
+        names.pop(name, None)  # the first joint of a name keeps it
+        taken.add(own)
+        found.append(own)
+    return found
+
+
+def _rest_transforms(skeleton: Skeleton, binds: Floats, parents: Ints, units: StageUnits) -> Floats:
+    """Return joint-to-parent rest transforms in stage units; those of proxies follow from their bind transforms."""
+    proxies = local_transforms(binds, parents)[skeleton.joint_count :]
+    world = world_transforms(np.concatenate([skeleton.rest_transforms, proxies]), parents)
+    return local_transforms(units.transforms_from_core(world), parents)
+
+
+def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
+    """Convert column-vector transforms (N, 4, 4) to USD's row-vector matrices."""
+    return Vt.Matrix4dArray.FromNumpy(np.ascontiguousarray(np.swapaxes(transforms, -1, -2), dtype=np.float64))
+
+
+def define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits) -> UsdGeom.Mesh:
+    """Define a polygon mesh at its bind pose, with its own polygons and texture coordinates."""
+    points = np.asarray(units.points_from_core(mesh.points), dtype=np.float32)
+    prim = UsdGeom.Mesh.Define(stage, path)
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
+    author_faces(prim, mesh)
+    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    prim.CreateExtentAttr(extent_array(points.min(axis=0), points.max(axis=0)))
+    return prim
+
+
+def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
+    """Return a bounding box as an extent."""
+    return Vt.Vec3fArray.FromNumpy(np.stack([low, high]).astype(np.float32))
+
+
+def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
+    """Author a garment's vertex classes, what finds them, the joint paths of its proxies, each unless None.
+
+    Its colour is authored where the prim has none.
+    """
+    if garment.colour is not None and display_colour(prim) is None:
+        UsdGeom.Gprim(prim).CreateDisplayColorAttr([Gf.Vec3f(*garment.colour)])
+    if garment.classes is not None:
+        _author_rows(prim, CLASS, garment.classes[:, None].astype(np.int32))
+    if garment.pins is not None:
+        _author_rows(prim, PIN, garment.pins[:, None].astype(np.int32))
+    if garment.levels is not None:
+        _author_rows(prim, LEVEL, garment.levels[:, None].astype(np.float32))
+    if proxies is not None:
+        _author_names(prim, PROXIES, proxies)
+
+
+def keep_lbs_skin(prim: Usd.Prim, skin: SkinWeights, joints: Sequence[str]) -> None:
+    """Author a garment's LBS weights over the character's joints, in addition to those of its rig."""
+    _author_names(prim, LBS_SKIN[2], joints)
+    for name, rows in zip(LBS_SKIN[:2], sorted_influences(skin)):
+        _author_rows(prim, name, rows)
+
+
+def _author_names(prim: Usd.Prim, name: str, names: Sequence[str]) -> None:
+    """Author a uniform list of names."""
+    attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False, Sdf.VariabilityUniform)
+    attribute.Set(Vt.TokenArray(list(names)))
+
+
+def _author_rows(prim: Usd.Prim, name: str, rows: np.ndarray) -> None:
+    """Author a vertex primvar of integers or floats, shape (V, elementSize)."""
+    whole = np.issubdtype(rows.dtype, np.integer)
+    kind = Sdf.ValueTypeNames.IntArray if whole else Sdf.ValueTypeNames.FloatArray
+    array = (Vt.IntArray if whole else Vt.FloatArray).FromNumpy(np.ascontiguousarray(rows).reshape(-1))
+    primvar = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(name.removeprefix("primvars:"), kind, UsdGeom.Tokens.vertex)
+    if rows.shape[1] > 1:
+        primvar.SetElementSize(rows.shape[1])
+    primvar.Set(array)
+
+
+def bind_skin(mesh: UsdGeom.Mesh, skin: SkinWeights, skeleton: UsdSkel.Skeleton) -> None:
+    """Bind a mesh to a skeleton; influences are sorted, padded with zeros, and sum to one in float32."""
+    indices, weights = sorted_influences(skin)
+    binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    width = indices.shape[1]
+    binding.CreateJointIndicesPrimvar(False, width).Set(Vt.IntArray.FromNumpy(indices.reshape(-1)))
+    binding.CreateJointWeightsPrimvar(False, width).Set(Vt.FloatArray.FromNumpy(weights.reshape(-1)))
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1))
+
+
+def define_blendshapes(
+    mesh: UsdGeom.Mesh, names: Sequence[str], offsets: Floats, units: StageUnits, *, before: Sequence[str] = ()
+) -> None:
+    """Define blendshapes below a bound mesh, with only the nonzero rows of their offsets [m], shape (K, V, 3).
+
+    Args:
+        before: blendshapes that the mesh has already, which stay in front.
+    """
+    if not names:
+        return
+    binding, path = UsdSkel.BindingAPI(mesh), mesh.GetPath()
+    stage = mesh.GetPrim().GetStage()
+    for name, shape in zip(names, offsets):
+        rows = np.flatnonzero(shape.any(axis=1))
+        moved = np.asarray(units.points_from_core(shape[rows]), dtype=np.float32)
+        prim = UsdSkel.BlendShape.Define(stage, path.AppendChild(name))
+        prim.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(moved))
+        prim.CreatePointIndicesAttr(Vt.IntArray.FromNumpy(rows.astype(np.int32)))
+    names = [*before, *names]
+    binding.CreateBlendShapesAttr(Vt.TokenArray(names))
+    binding.CreateBlendShapeTargetsRel().SetTargets([path.AppendChild(name) for name in names])

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a layer as a file, completely or not at all."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pxr import Sdf, Tf, Usd, UsdGeom
+
+from ssilk_core.errors import fail
+from ssilk_core.files import replacing
+
+from ..names import LAYER_SUFFIXES
+from ..opening.specs import free_when_closed
+from ..opening.stage import usd_reason
+from ..units import StageUnits
+
+PACKED = "shot.usdc"  # the layer in a package
+ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, and the field that USD pads with
+
+
+def need_layer_suffix(out: str | Path) -> None:
+    """Raise `SsilkError` unless a name has the suffix of a USD layer."""
+    suffix, allowed = Path(out).suffix, ", ".join(LAYER_SUFFIXES)
+    if suffix not in LAYER_SUFFIXES:
+        fail(str(out), f"the suffix is '{suffix}'", f"it must be one of {allowed}")
+
+
+def new_stage(path: Path, units: StageUnits) -> Usd.Stage:
+    """Create a stage on a new layer at `path` with these units, without a session layer."""
+    stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(path)), None)
+    UsdGeom.SetStageMetersPerUnit(stage, units.meters_per_unit)
+    UsdGeom.SetStageUpAxis(stage, units.up_axis)
+    return stage
+
+
+def save(layer: Sdf.Layer, name: str | Path) -> None:
+    """Write pending changes of a layer to its file; messages call it `name`."""
+    try:
+        layer.Save()
+    except Tf.ErrorException as error:
+        fail(str(name), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+    free_when_closed([layer])
+
+
+def export(layer: Sdf.Layer, out: str | Path) -> None:
+    """Write a layer in the format of the file's suffix.
+
+    Raises:
+        SsilkError: the suffix is not .usdc, .usd or .usda, or the file cannot be written.
+    """
+    need_layer_suffix(out)
+    with replacing(out) as temporary:
+        try:
+            layer.Export(str(temporary))
+        except Tf.ErrorException as error:
+            fail(str(out), f"writing failed ({usd_reason(error)})", "free some space or choose another output")
+
+
+@contextmanager
+def packaged(out: str | Path) -> Iterator[Path]:
+    """Yield the path of a layer to write: `out`, or for .usdz a temporary layer that is then packed into `out`.
+
+    Raises:
+        OSError: the package cannot be written.
+    """
+    out = Path(out)
+    if out.suffix != ".usdz":
+        yield out
+        return
+    with tempfile.TemporaryDirectory(dir=out.parent) as folder:
+        layer = Path(folder) / PACKED
+        yield layer
+        _pack(layer, out)
+
+
+def _pack(layer: Path, out: Path) -> None:
+    """Write a package of one layer: a zip without compression, its data 64 bytes aligned, as USD maps it into memory.
+
+    USD's own function stores times of day, so that no two packages are alike.
+    """
+    entry = zipfile.ZipInfo(layer.name, date_time=(1980, 1, 1, 0, 0, 0))
+    padding = -(ZIP_HEADER + len(entry.filename) + EXTRA_HEADER) % ALIGNMENT
+    entry.extra = struct.pack("<HH", EXTRA_FIELD, padding) + bytes(padding)
+    with zipfile.ZipFile(out, "w") as package, layer.open("rb") as source, package.open(entry, "w") as target:
+        shutil.copyfileobj(source, target)

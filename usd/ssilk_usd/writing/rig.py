@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write proxy rigs: joints appended to the skeleton, listed in the garment's `ssilk:proxyJoints`.
+
+`reading.rig` reads them back, and says which joints are proxies after a rig was edited by hand.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.scene.assets import Floats, Garment, Scene
+
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
+from ..opening.garment_api import apply_garment_api
+from ..opening.stage import (
+    PRIMS,
+    apply,
+    inherited,
+    open_stage,
+    split_location,
+    value,
+)
+from ..reading.carried import carried_by
+from ..reading.garment import garment_to_core
+from ..reading.mesh import is_garment
+from ..reading.skeleton import find_skeleton
+from ..reading.skin import leaf
+from ..reading.spaces import SkelSource
+from ..units import StageUnits
+from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
+from .export import export, need_layer_suffix
+from .repair_mesh import offset_points
+from .surface import reads_as, shield_surface, write_surface
+
+
+def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> None:
+    """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
+
+    The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
+    of the same garment. The garment's mesh stands under the SkelRoot with its classes, the rig's weights, and the
+    LBS weights over the character beside them (`primvars:ssilk:plainJointIndices` and `...Weights`). Where the mesh
+    would lose its physics material, or take another one from where it stands, it is bound to its own.
+
+    Args:
+        source: the stage that `scene.character` was read from.
+        scene: the character, its garment (from the same stage or from another file) and the rig.
+        out: the file to write: .usdc, .usd or .usda.
+        moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
+
+    Raises:
+        SsilkError: the output cannot be written.
+    """
+    need_layer_suffix(out)
+    layer = _flattened(source, scene)
+    stage = Usd.Stage.Open(layer)
+    skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
+    mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
+    _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
+    proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
+    _bind_garment(mesh, to_bind, skel, scene, proxies)
+    export(layer, out)
+
+
+def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
+    """Flatten the source into one layer, without instances on the paths of the rig."""
+    stage = open_stage(source)
+    stage.SetEditTarget(stage.GetSessionLayer())
+    for path in (_prim_path(scene.character.path), _prim_path(scene.garment.mesh.path)):
+        for prefix in Sdf.Path(path).GetPrefixes():
+            _expand(stage.GetPrimAtPath(prefix))
+    top = stage.GetPrimAtPath(_prim_path(scene.character.path))
+    while instances := [prim for prim in Usd.PrimRange(top) if prim.IsInstance()]:
+        for prim in instances:
+            _expand(prim)
+    return stage.Flatten()
+
+
+def _expand(prim: Usd.Prim) -> None:
+    if prim and prim.IsInstance():
+        prim.SetInstanceable(False)
+
+
+def _prim_path(where: str) -> str:
+    return split_location(where)[1] or where
+
+
+def _place_garment(
+    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment, moved: Floats | None
+) -> tuple[UsdGeom.Mesh, Floats]:
+    """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
+
+    A mesh of the stage keeps its points but for what `moved`, and is moved if it stands elsewhere; one from its own
+    file is copied.
+    """
+    file, path = split_location(garment.mesh.path)
+    old = stage.GetPrimAtPath(path or "/")
+    same = Path(file).exists() and Path(file).samefile(source)
+    if not (same and old and old.IsA(UsdGeom.Mesh)):
+        return _copy_garment(stage, skel, garment), np.eye(4)
+    to_core = garment_to_core(old, skel)
+    to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
+    if moved is not None:
+        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
+    if carried_by(old, skel):
+        old = _let_go(stage, skel, old)
+    if not old.GetPath().HasPrefix(skel.root.GetPath()):
+        old = _move(stage, old, _free_path(skel, old.GetName()))
+    return UsdGeom.Mesh(old), to_bind
+
+
+def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Floats | None) -> None:
+    """Bind the mesh to a physics material of its own where what it inherits is not what the garment was read with."""
+    surface, mesh = garment.surface, garment.mesh
+    if moved is not None:  # a mass for each area was read over the area before
+        mesh = replace(mesh, points=mesh.points - moved)
+    if reads_as(prim, mesh, surface):
+        return
+    if surface is None:
+        shield_surface(prim, _free_path(skel, f"{prim.GetName()}_without_physics"))
+    else:
+        write_surface(prim, _free_path(skel, leaf(surface.path)), surface)
+
+
+def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
+    """Take the xforms from a mesh that its joint moves from now on; move it where others hang on them too."""
+    above = prim
+    while above != skel.root and not above.IsPseudoRoot():
+        if any(_is_beside(other.GetPath(), prim.GetPath()) for other in Usd.PrimRange(above)):
+            return _move(stage, prim, _free_path(skel, prim.GetName()))
+        UsdGeom.Xformable(above).ClearXformOpOrder()
+        above = above.GetParent()
+    return prim
+
+
+def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
+    """Return whether a path is neither above another one nor below it."""
+    return not (own.HasPrefix(path) or path.HasPrefix(own))
+
+
+def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
+    """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
+    name = prim_names([garment.mesh.path])[0]
+    older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
+    if older and is_garment(older):
+        stage.RemovePrim(older.GetPath())
+    points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
+    return define_mesh(stage, _free_path(skel, name), replace(garment.mesh, points=points), StageUnits())
+
+
+def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
+    taken = [str(child.GetPath()) for child in skel.root.GetAllChildren()]
+    return skel.root.GetPath().AppendChild(prim_names([*taken, name])[-1])
+
+
+def _move(stage: Usd.Stage, prim: Usd.Prim, to: Sdf.Path) -> Usd.Prim:
+    edit = Sdf.BatchNamespaceEdit()
+    edit.Add(Sdf.NamespaceEdit(prim.GetPath(), to, Sdf.NamespaceEdit.atEnd))
+    stage.GetRootLayer().Apply(edit)
+    return stage.GetPrimAtPath(to)
+
+
+def _append_proxies(skel: SkelSource, garment: str, scene: Scene) -> tuple[str, ...]:
+    """Replace the garment's joints in the skeleton by those of the rig; return the proxies' joint paths."""
+    kept = [index for index, owner in enumerate(skel.owners) if owner != garment]
+    if len(kept) < len(skel.joints):
+        _keep_joint_names(skel)
+    joints = tuple(skel.joints[index] for index in kept)
+    proxies = _proxy_paths(scene, joints)
+    binds = skel.binds_from_core(scene.rig.bind_transforms)
+    bind = np.concatenate([skel.bind[kept], binds])
+    combined = np.concatenate([skel.binds_from_core(scene.character.skeleton.bind_transforms), binds])
+    rest = np.linalg.inv(combined[scene.rig.parents]) @ binds
+    skeleton = UsdSkel.Skeleton(skel.prim)
+    skeleton.CreateJointsAttr(Vt.TokenArray((*joints, *proxies)))
+    skeleton.CreateBindTransformsAttr(matrix_array(bind))
+    skeleton.CreateRestTransformsAttr(matrix_array(np.concatenate([skel.rest[kept], rest])))
+    names = value(skel.prim, "jointNames")
+    if names:
+        short = [*(names[index] for index in kept), *map(leaf, proxies)]
+        skeleton.CreateJointNamesAttr(Vt.TokenArray(short))
+    return proxies
+
+
+def _keep_joint_names(skel: SkelSource) -> None:
+    """Author the joint order on meshes that rely on the skeleton's, before its indices change."""
+    for prim in Usd.PrimRange(skel.root, PRIMS):
+        if prim.HasAttribute(SKEL[0]) and inherited(prim, "skel:joints") is None:
+            UsdSkel.BindingAPI.Apply(prim).CreateJointsAttr(Vt.TokenArray(skel.joints))
+
+
+def _proxy_paths(scene: Scene, taken: tuple[str, ...]) -> tuple[str, ...]:
+    """Return joint paths that match the proxies' parents, with unique leaf names."""
+    leaves = {leaf(name) for name in taken}
+    paths = list(scene.character.skeleton.joint_names)
+    for name, parent in zip(scene.rig.joint_names, scene.rig.parents):
+        unique = free_name(leaf(name), leaves)
+        leaves.add(unique)
+        paths.append(f"{paths[parent]}/{unique}")
+    return tuple(paths[scene.character.skeleton.joint_count :])
+
+
+def _bind_garment(
+    mesh: UsdGeom.Mesh, to_bind: Floats, skel: SkelSource, scene: Scene, proxies: tuple[str, ...]
+) -> None:
+    """Author classes, weights and the list of proxies on the garment's mesh.
+
+    Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
+    """
+    prim, character_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
+    for name in (CLASS, PIN, LEVEL, *SKEL, *LBS_SKIN):
+        prim.RemoveProperty(name)
+        prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
+    apply_garment_api(prim)
+    bind_skin(mesh, scene.rig.skin, UsdSkel.Skeleton(skel.prim))
+    binding = UsdSkel.BindingAPI(prim)
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(to_bind.T.tolist()))
+    binding.CreateJointsAttr(Vt.TokenArray((*character_joints, *proxies)))
+    mark_garment(prim, scene.garment, proxies)
+    keep_lbs_skin(prim, scene.lbs_skin, character_joints)
