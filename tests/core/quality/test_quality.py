@@ -11,12 +11,12 @@ import pytest
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import model_file
 from ssilk_core.network.runtime import Player
+from ssilk_core.quality import cost
 from ssilk_core.quality.levels import (
     QUALITIES,
     Budget,
     best_within,
     candidate_sizes,
-    cost,
     format_amount,
     parse_budget,
     quality_named,
