@@ -25,10 +25,9 @@ from documents import farm, guides, results  # noqa: E402  # the script runs by 
 TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
-        results.overview, results.other_methods, results.trainings, results.refined_skin, results.worst_frames,
-        results.own_start, results.rest, results.refinement, results.levels, results.playing, results.crowds,
-        results.extremes,
-        farm.cluster, farm.disturbed, farm.disk, farm.disk_workers, farm.large_job,
+        results.overview, results.other_methods, results.trainings, results.own_start, results.rest,
+        results.refinement, results.levels, results.playing, results.extremes,
+        farm.cluster, farm.fuzzed, farm.disturbed, farm.disk, farm.disk_workers, farm.large_job,
         guides.targets, guides.presets,
     )
 }  # fmt: skip

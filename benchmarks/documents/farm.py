@@ -28,7 +28,18 @@ def cluster() -> str:
     for count in ("1,000", "3,000", "10,000"):
         memory = soak[f"memory after {count} bakes [MiB]"]
         rows.append([f"memory after {count} bakes in one process [MiB]", fixed(memory)])
+    for words in ("start Python and its modules", "load the model and its character"):
+        rows.append([f"seconds to {words}", fixed(result("farm")["start"][f"seconds to {words}"], 2)])
     return table(("measured", ""), rows)
+
+
+def fuzzed() -> str:
+    """Damaged files that readers refused or read."""
+    rows = [
+        [f"`{name}`", f"{at['refused']:,}", f"{at['read']:,}", fixed(at["longest [s]"])]
+        for name, at in result("fuzz_stages")["readers"].items()
+    ]
+    return table(("damaged file", "refused", "read", "longest [s]"), rows)
 
 
 def disturbed() -> str:

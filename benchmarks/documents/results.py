@@ -23,76 +23,68 @@ def cells(name: str) -> dict[tuple[str, str, str], dict[str, Any]]:
 
 
 def overview() -> str:
-    """Energy, skin that shows and limbs through the cloth, beside linear blend skinning."""
+    """Energy, skin that shows, limbs through the cloth and bare skin: as trained, refined, and skinned."""
     energies, rows = cells("table1"), []
     for name, words in GARMENTS.items():
         for split in SPLITS:
-            skin = result("shown_skin")[name][split]
+            own = [result("shown_skin")[name][split][method] for method in ("network", REFINED, LBS)]
             pairs = (energies[IN_RESULTS[name], method, split]["total"] for method in ("ssilk", "LBS"))
             row = [words if split == "valid" else "", split, *(digits(mean(each)) for each in pairs)]
-            for figure, places in (("mean", 3), ("worst", 1), ("pierced", 1)):
-                row += [percent(skin[method][figure], places) for method in ("network", LBS)]
-            rows.append(row)
-    header = ("garment", "clips", "energy [J]", "LBS", "shows, mean [%]", "LBS", "shows, worst [%]", "LBS",
-              "limbs [%]", "LBS")  # fmt: skip
+            row += [f"{percent(at['mean'], 3)}, {percent(at['worst'])}" for at in own]
+            row += [percent(at["pierced"]) for at in own]
+            rows.append([*row, *(percent(at["bare"]) for at in (own[0], own[2]))])
+    header = ("garment", "clips", "energy [J]", "LBS", "shows", "refined", "LBS", "limbs", "refined", "LBS", "bare",
+              "LBS")  # fmt: skip
     return table(header, rows, 2)
 
 
 def other_methods() -> str:
     """Energies of all methods, and their excess and velocities beside the simulator."""
     energies, dynamics, rows = cells("table1"), cells("table2"), []
+    iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
     for name, words in GARMENTS.items():
         for number, (method, shown) in enumerate(METHODS.items()):
             keys = [(IN_RESULTS[name], method, split) for split in SPLITS]
-            row = ["" if number else words, shown, *(digits(mean(energies[key]["total"])) for key in keys)]
+            row = ["" if number else words, shown, iterations.get((IN_RESULTS[name], method), "")]
+            row += [digits(mean(energies[key]["total"])) for key in keys]
             for key in keys[1:]:
                 row.append(digits(mean(energies[key]["total_excess"])) if "total_excess" in energies[key] else "")
             for key in keys[1:]:
                 found = dynamics.get(key, {}).get("velocity_error")
                 row.append(fixed(mean(found), 2) if found else "")
             rows.append(row)
-    header = ("garment", "method", "`valid` [J]", "`test` [J]", "flips [J]", "excess, `test` [J]", "flips [J]",
-              "velocity, `test` [m/s]", "flips [m/s]")  # fmt: skip
+    header = ("garment", "method", "iterations", "`valid` [J]", "`test` [J]", "flips [J]", "excess, `test` [J]",
+              "flips [J]", "velocity, `test` [m/s]", "flips [m/s]")  # fmt: skip
     return table(header, rows, 2)
+
+
+def _trained() -> list[dict[str, Any]]:
+    """Return garment, method and iterations; those of a model that ships are where it was kept."""
+    baselines = [each for each in result("table1")["trainings"] if each["method"] != "ssilk"]
+    kept = [
+        {"garment": IN_RESULTS[name], "method": "ssilk", "iterations": run["iterations"][kept_at(run)]}
+        for name, run in result("shipped_training").items()
+    ]
+    return baselines + kept
+
+
+def kept_at(run: dict[str, Any]) -> int:
+    """Return the number of the validation with the lowest total."""
+    totals: list[float] = run["total"]
+    return totals.index(min(totals))
 
 
 def trainings() -> str:
-    """What the methods of the table above were trained for."""
-    found = {(each["garment"], each["method"]): each for each in result("table1")["trainings"]}
+    """How the garments that ship were trained, and what their validations said."""
     rows = []
     for name, words in GARMENTS.items():
-        counts = (f"{found[IN_RESULTS[name], method]['iterations']:,}" for method in ("ncs", "ncs*", "snug"))
         run = result("shipped_training")[name]
-        best = run["total"].index(min(run["total"]))
-        rows.append([words, *counts, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}",
-                     duration(run["seconds"][-1]), digits(run["total"][best]), digits(run["total"][-1])])  # fmt: skip
-    header = ("garment", "NCS", "NCS*", "SNUG", "SSILK, kept at", "time of its steps", "best [J]", "last [J]")
+        best = kept_at(run)
+        rows.append([words, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}",
+                     duration(run["seconds"][-1]), digits(run["total"][best]), digits(run["total"][-1]),
+                     document("shipped_training")["hardware"][name]])  # fmt: skip
+    header = ("garment", "kept at iteration", "time of its steps", "best [J]", "last [J]", "on")
     return table(header, rows)
-
-
-def refined_skin() -> str:
-    """Skin that shows, bare skin and limbs, as trained and refined."""
-    rows = []
-    for name, words in GARMENTS.items():
-        for split in SPLITS:
-            own = [result("shown_skin")[name][split][method] for method in ("network", REFINED)]
-            pairs = (f"{percent(at['mean'], 3)}, {percent(at['worst'])}" for at in own)
-            limbs, bare = ([percent(at[figure]) for at in own] for figure in ("pierced", "bare"))
-            rows.append([words if split == "valid" else "", split, *pairs, *limbs, *bare])
-    header = ("garment", "clips", "shows: network", "refined", "limbs: network", "refined", "bare: network",
-              "refined")  # fmt: skip
-    return table(header, rows, 2)
-
-
-def worst_frames() -> str:
-    """Whether the solver can cover what shows in the worst frame of the hardest clip."""
-    rows = []
-    for name, words in GARMENTS.items():
-        at = result("worst_frames")[name]["01_14"]
-        shares = (f"{percent(at[key]['shows'], 2)} ({percent(at[key]['inside'], 2)})"
-                  for key in ("network", "4 iterations", "200 iterations"))  # fmt: skip
-        rows.append([words, at["frame"], *shares])
-    return table(("garment", "frame", "network", "4 iterations", "200 iterations"), rows)
 
 
 def beside_solver() -> Iterator[tuple[str, str, dict[str, Any]]]:
@@ -121,36 +113,37 @@ def own_start() -> str:
 
 
 def rest() -> str:
-    """Whether the cape comes to rest after stops, and repeats itself in loops."""
-    rows = []
-    for row in document("evaluate_cape")["figures"]:
-        if row["method"] == "ssilk":
-            stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
-            time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
-            rows.append([row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
-                         fixed(stops["static_distance"], 0, 1e-3), fixed(stops["max_static_distance"], 0, 1e-3),
-                         fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
-    header = ("clips", "stops", "settled [%]", "median time [s]", "distance to P [mm]", "largest",
+    """Whether garments come to rest after stops, and repeat themselves in loops."""
+    rows: list[list[object]] = []
+    for name in ("cape", "fringe_skirt"):
+        for row in document(f"evaluate_{name}")["figures"]:
+            if row["method"] == "ssilk" and row["split"] in SPLITS:
+                stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
+                time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
+                away = (fixed(stops[figure], 0, 1e-3) for figure in ("static_distance", "max_static_distance"))
+                words = "" if rows and name == "cape" else GARMENTS[name]
+                rows.append([words, row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
+                             *away, fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
+    header = ("garment", "clips", "stops", "settled [%]", "median time [s]", "distance to P [mm]", "largest",
               "between loops [mm]")  # fmt: skip
-    return table(header, rows)
+    return table(header, rows, 2)
 
 
 def refinement() -> str:
     """What iterations of the solver buy in a jump."""
     rows = []
-    ways = {"0": ("network", ""), "4 network": ("4", "network"), "4 refined": ("4", "refined"),
-            "8 network": ("8", "network"), "8 refined": ("8, *hero*", "refined"),
-            "simulator": ("simulator", "simulated")}  # fmt: skip
+    ways = {"0": "network", "4 network": "`--refine 4`", "8 refined": "`hero`", "simulator": "simulator"}
     for clip, found in result("refine").items():
-        for key, (count, past) in ways.items():
+        for key, way in ways.items():
             at = found[key]
             seconds = digits(at["seconds"], 2) if at["seconds"] else ""
             words = GARMENTS[clip.split()[0]] if key == "0" else ""
-            rows.append([words, count, past, seconds, digits(at["energy"]), percent(at["shows"], 2),
-                         percent(at["limbs"], 0), fixed(at["apart"], 0, 1e-3), fixed(at["jitter"], 1, 1e-3)])  # fmt: skip
-    header = ("garment", "iterations", "inertia from", "s a frame", "energy [J]", "shows, worst [%]", "limbs [%]",
+            away = fixed(at["apart"], 0, 1e-3), fixed(at["jitter"], 1, 1e-3)
+            skin = percent(at["shows"], 2), percent(at["limbs"], 0)
+            rows.append([words, way, seconds, digits(at["energy"]), *skin, *away])
+    header = ("garment", "", "s a frame", "energy [J]", "shows, worst [%]", "limbs [%]",
               "apart [mm]", "jitter [mm]")  # fmt: skip
-    return table(header, rows, 3)
+    return table(header, rows, 2)
 
 
 def levels() -> str:
@@ -158,10 +151,12 @@ def levels() -> str:
     on_cpu = {(at["model"], at["variant"]): at["solving"] for at in document("trade_cpu")["points"]}
     rows = []
     for at in document("trade_cuda")["points"]:
+        if at["variant"] in ("1 iterations", "film"):
+            continue
         variant, skin = at["variant"], at["shown_skin"]
         cpu = on_cpu.get((at["model"], variant))
         solver = ("", "") if at["solving"] is None else (digits(at["solving"], 2), digits(cpu, 2) if cpu else "")
-        name = f"`{variant}`" if at["swept"] == "level" else variant.replace("1 iterations", "1 iteration")
+        name = f"`{variant}`" if at["swept"] == "level" else variant
         rows.append([GARMENTS[at["model"]] if variant == "as trained" else "", name,
                      fixed(at["milliseconds"], 2), *solver, fixed(at["total"], 3), percent(skin["mean"], 3),
                      digits(1000 * at["position"], 2), fixed(at["model_bytes"], 1, 1e6),
@@ -182,24 +177,12 @@ def playing() -> str:
     return table(("garment", "SSILK, numpy [ms]", "SSILK, PyTorch [ms]", "NCS, PyTorch [ms]"), rows)
 
 
-def crowds() -> str:
-    """Many shots at once on a GPU."""
-    rows = []
-    for count in (1, 8, 64, 512, 2048):
-        at = [result("batch")[f"{count} {what}"] for what in ("network alone", "with vertices")]
-        rows.append([f"{count:,}", *(fixed(each["median [us]"]) for each in at),
-                     *(digits(each["frames per second"], 3) for each in at)])  # fmt: skip
-    header = ("shots", "network [µs]", "with vertices [µs]", "network [frames/s]", "with vertices [frames/s]")
-    return table(header, rows)
-
-
 def extremes() -> str:
-    """How many extremes work, fall back and are refused, by group."""
+    """How many extremes of each kind work, fall back and are refused."""
     outcomes = document("stress_cape")["outcomes"]
-    verdicts = ("works", "falls back", "refuses")
-    groups = {each["group"]: Counter[str]() for each in outcomes}
-    for each in outcomes:
-        groups[each["group"]][each["verdict"]] += 1
-    rows = [[group, *(counts[verdict] or "" for verdict in verdicts)] for group, counts in groups.items()]
-    total = Counter(each["verdict"] for each in outcomes)
-    return table(("extremes of", *verdicts), [*rows, ["all", *(total[verdict] or "" for verdict in verdicts)]])
+    groups = dict.fromkeys(each["group"] for each in outcomes)
+    rows = []
+    for verdict in ("works", "falls back", "refuses"):
+        counts = Counter(each["group"] for each in outcomes if each["verdict"] == verdict)
+        rows.append([verdict, *(counts[group] or "" for group in groups), counts.total()])
+    return table(("", *groups, "all"), rows)

@@ -35,7 +35,7 @@ START, VALIDATION, EVALUATION, FRAME = 25.0, 1.5, 3.0, 0.05  # [s]; the last: of
 VALIDATIONS = 10
 MOTION = ("recombinations=8", "perturbations=3")
 USUAL = {"batch": 64, "window": 6, "static_batch": 512}
-RECIPES = {garment: ("latent=256", "widths=512,512,512") for garment in ("tshirt", "long_sleeve", "pants")}
+RECIPES = dict.fromkeys(("tshirt", "long_sleeve", "pants"), ("latent=256", "widths=512,512,512"))
 SWEEPS: dict[str, dict[str, tuple[str, ...]]] = {
     "table4": {"latent_regularization": ("0.001", "0.01")},
     "table5": {"batch": ("32", "128", "256"), "window": ("4", "10", "18"), "latent": ("16", "64", "512")},
