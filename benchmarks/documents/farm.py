@@ -25,9 +25,9 @@ def cluster() -> str:
     for count, cores in {1: "1 core", 2: "2 cores", 4: "4 cores"}.items():
         rate = result("farm_cores")["cores"][f"shots per second, cores: {count}"]
         rows.append([f"shots of 60 frames a second on {cores}", fixed(rate, 1)])
-    for count in ("1,000", "3,000", "10,000"):
-        memory = soak[f"memory after {count} bakes [MiB]"]
-        rows.append([f"memory after {count} bakes in one process [MiB]", fixed(memory)])
+    for bakes in ("1,000", "3,000", "10,000"):
+        memory = soak[f"memory after {bakes} bakes [MiB]"]
+        rows.append([f"memory after {bakes} bakes in one process [MiB]", fixed(memory)])
     for words in ("start Python and its modules", "load the model and its character"):
         rows.append([f"seconds to {words}", fixed(result("farm")["start"][f"seconds to {words}"], 2)])
     return table(("measured", ""), rows)
