@@ -36,6 +36,7 @@ SCHEDULE = (
     "learning_rate=1e-3",
     "final_learning_rate=4e-5",
     "optimiser=adam",
+    "weight_decay=0",
 )
 
 

@@ -89,7 +89,7 @@ def whole_step(steps: Stepper, phase: str, captured: bool, clock: Clock) -> Span
     """Time whole steps of a phase, one after the other."""
     iteration = 0 if phase == WARM else steps.config.static_iterations
     if clock.on_gpu and not captured:
-        return clock.calls(getattr(steps, phase))
+        return clock.calls(steps.static_step if phase == WARM else steps.dynamic_step)
     for _ in range(5):
         steps.run(iteration)  # settles and captures
     return clock.calls(lambda: steps.run(iteration))

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of docs/pipeline.md and docs/training.md."""
+
+from __future__ import annotations
+
+from ssilk_core.training.settings import PRESETS
+
+from .forms import digits, result, table
+
+TARGETS = {
+    "usd": ("all", "the stage's", "layers or a file"),
+    "blender": ("all", "z up, metres", "layers or a file"),
+    "game8": ("8", "y up, metres (as glTF)", "layers or a file"),
+    "game4": ("4", "y up, metres", "layers or a file"),
+    "arkit": ("4", "y up, metres", "one `.usdz`"),
+    "glb": ("all", "y up, metres", "one `.glb`"),
+    "glb4": ("4", "y up, metres", "one `.glb`"),
+}
+PURPOSES = {
+    "draft": "a first look, on a CPU",
+    "preview": "a look on a GPU",
+    "light": "many characters",
+    "final": "shots",
+}
+
+
+def targets() -> str:
+    """How far the vertices of each target are from the network's."""
+    found, rows = {row["name"]: row for row in result("compact")["rows"]}, []
+    for name, words in TARGETS.items():
+        at = found[f"one file for {name}, garment alone"]
+        rows.append([f"`{name}`", *words, *(digits(1000 * at[error], 2) for error in ("largest", "mean"))])
+    header = ("target", "influences", "axes, units", "packaging", "largest error [mm]", "mean error [mm]")
+    return table(header, rows, 4)
+
+
+def presets() -> str:
+    """Sizes and schedules of the presets."""
+    rows = []
+    for name, purpose in PURPOSES.items():
+        model, train = PRESETS[name].model, PRESETS[name].train
+        widths = ", ".join(map(str, model.widths))
+        rows.append([f"`{name}`", model.latent, model.shapes, widths, f"{train.iterations:,}",
+                     f"{train.batch} of {train.window}", purpose])  # fmt: skip
+    header = ("preset", "latent", "blendshapes", "hidden layers", "iterations", "windows of poses", "for")
+    return table(header, rows, 7)

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The tables of docs/results.md, all of the garments that ship."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from statistics import mean
+from typing import Any
+
+from .forms import GARMENTS, digits, document, duration, fixed, percent, result, table
+
+SPLITS = ("valid", "test", "flips")
+METHODS = {"LBS": "LBS", "ncs": "NCS", "ncs*": "NCS*", "snug": "SNUG", "ssilk": "**SSILK**"}
+IN_RESULTS = {"cape": "Cape", "fringe_skirt": "FringeSkirt", "hooded_dress": "HoodedDress"}
+LBS, REFINED = "linear blend skinning", "refine 4"
+FULL = "full, poses included"
+
+
+def cells(name: str) -> dict[tuple[str, str, str], dict[str, Any]]:
+    """Return the figures of `tables.py`, by garment, method and split."""
+    return {(row["garment"], row["method"], row["split"]): row for row in result(name)["figures"]}
+
+
+def overview() -> str:
+    """Energy, skin that shows, limbs through the cloth and bare skin: as trained, refined, and skinned."""
+    energies, rows = cells("table1"), []
+    for name, words in GARMENTS.items():
+        for split in SPLITS:
+            own = [result("shown_skin")[name][split][method] for method in ("network", REFINED, LBS)]
+            pairs = (energies[IN_RESULTS[name], method, split]["total"] for method in ("ssilk", "LBS"))
+            row = [words if split == "valid" else "", split, *(digits(mean(each)) for each in pairs)]
+            row += [f"{percent(at['mean'], 3)}, {percent(at['worst'])}" for at in own]
+            row += [percent(at["pierced"]) for at in own]
+            rows.append([*row, *(percent(at["bare"]) for at in (own[0], own[2]))])
+    header = ("garment", "clips", "energy [J]", "LBS", "shows", "refined", "LBS", "limbs", "refined", "LBS", "bare",
+              "LBS")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def other_methods() -> str:
+    """Energies of all methods, and their excess and velocities beside the simulator."""
+    energies, dynamics, rows = cells("table1"), cells("table2"), []
+    iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
+    for name, words in GARMENTS.items():
+        for number, (method, shown) in enumerate(METHODS.items()):
+            keys = [(IN_RESULTS[name], method, split) for split in SPLITS]
+            row = ["" if number else words, shown, iterations.get((IN_RESULTS[name], method), "")]
+            row += [digits(mean(energies[key]["total"])) for key in keys]
+            for key in keys[1:]:
+                row.append(digits(mean(energies[key]["total_excess"])) if "total_excess" in energies[key] else "")
+            for key in keys[1:]:
+                found = dynamics.get(key, {}).get("velocity_error")
+                row.append(fixed(mean(found), 2) if found else "")
+            rows.append(row)
+    header = ("garment", "method", "iterations", "`valid` [J]", "`test` [J]", "flips [J]", "excess, `test` [J]",
+              "flips [J]", "velocity, `test` [m/s]", "flips [m/s]")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def _trained() -> list[dict[str, Any]]:
+    """Return garment, method and iterations; those of a model that ships are where it was kept."""
+    baselines = [each for each in result("table1")["trainings"] if each["method"] != "ssilk"]
+    kept = [
+        {"garment": IN_RESULTS[name], "method": "ssilk", "iterations": run["iterations"][kept_at(run)]}
+        for name, run in result("shipped_training").items()
+    ]
+    return baselines + kept
+
+
+def kept_at(run: dict[str, Any]) -> int:
+    """Return the number of the validation with the lowest total."""
+    totals: list[float] = run["total"]
+    return totals.index(min(totals))
+
+
+def trainings() -> str:
+    """How the garments that ship were trained, and what their validations said."""
+    rows = []
+    for name, words in GARMENTS.items():
+        run = result("shipped_training")[name]
+        best = kept_at(run)
+        rows.append([words, f"{run['iterations'][best]:,} of {run['iterations'][-1]:,}",
+                     duration(run["seconds"][-1]), digits(run["total"][best]), digits(run["total"][-1]),
+                     document("shipped_training")["hardware"][name]])  # fmt: skip
+    header = ("garment", "kept at iteration", "time of its steps", "best [J]", "last [J]", "on")
+    return table(header, rows)
+
+
+def beside_solver() -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield garment, split and figures of networks that the simulator went on from."""
+    for name in ("cape", "hooded_dress"):
+        source = "evaluate_cape" if name == "cape" else "evaluate_solver_hooded_dress"
+        for row in document(source)["figures"]:
+            if row["method"] == "ssilk" and row["split"] in SPLITS:
+                yield name, row["split"], row["figures"]["solver"]
+
+
+def own_start() -> str:
+    """How far the network is from the simulator that starts from its own states."""
+    rows: list[list[object]] = []
+    named: set[str] = set()
+    for name, split, at in beside_solver():
+        away = (fixed(value, 0, 1e-3) for value in at["position_error"])
+        speeds = (fixed(at[figure], 2) for figure in ("velocity_error", "lbs_velocity_error"))
+        step = fixed(at["step_energy"], 0, 1e-3), fixed(at["step_distance"], 1, 1e-3)
+        words = "" if name in named else GARMENTS[name]
+        named.add(name)
+        rows.append([words, split, at["windows"], *step, *away, *speeds])
+    header = ("garment", "clips", "windows", "step [mJ]", "step [mm]", "after 5 [mm]", "10", "30", "60",
+              "velocity [m/s]", "LBS")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def rest() -> str:
+    """Whether garments come to rest after stops, and repeat themselves in loops."""
+    rows: list[list[object]] = []
+    for name in ("cape", "fringe_skirt"):
+        for row in document(f"evaluate_{name}")["figures"]:
+            if row["method"] == "ssilk" and row["split"] in SPLITS:
+                stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
+                time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
+                away = (fixed(stops[figure], 0, 1e-3) for figure in ("static_distance", "max_static_distance"))
+                words = "" if rows and name == "cape" else GARMENTS[name]
+                rows.append([words, row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
+                             *away, fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
+    header = ("garment", "clips", "stops", "settled [%]", "median time [s]", "distance to P [mm]", "largest",
+              "between loops [mm]")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def refinement() -> str:
+    """What iterations of the solver buy in a jump."""
+    rows = []
+    ways = {"0": "network", "4 network": "`--refine 4`", "8 refined": "`hero`", "simulator": "simulator"}
+    for clip, found in result("refine").items():
+        for key, way in ways.items():
+            at = found[key]
+            seconds = digits(at["seconds"], 2) if at["seconds"] else ""
+            words = GARMENTS[clip.split()[0]] if key == "0" else ""
+            away = fixed(at["apart"], 0, 1e-3), fixed(at["jitter"], 1, 1e-3)
+            skin = percent(at["shows"], 2), percent(at["limbs"], 0)
+            rows.append([words, way, seconds, digits(at["energy"]), *skin, *away])
+    header = ("garment", "", "s a frame", "energy [J]", "shows, worst [%]", "limbs [%]",
+              "apart [mm]", "jitter [mm]")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def levels() -> str:
+    """What each quality level costs and loses."""
+    on_cpu = {(at["model"], at["variant"]): at["solving"] for at in document("trade_cpu")["points"]}
+    rows = []
+    for at in document("trade_cuda")["points"]:
+        if at["variant"] in ("1 iterations", "film"):
+            continue
+        variant, skin = at["variant"], at["shown_skin"]
+        cpu = on_cpu.get((at["model"], variant))
+        solver = ("", "") if at["solving"] is None else (digits(at["solving"], 2), digits(cpu, 2) if cpu else "")
+        name = f"`{variant}`" if at["swept"] == "level" else variant
+        rows.append([GARMENTS[at["model"]] if variant == "as trained" else "", name,
+                     fixed(at["milliseconds"], 2), *solver, fixed(at["total"], 3), percent(skin["mean"], 3),
+                     digits(1000 * at["position"], 2), fixed(at["model_bytes"], 1, 1e6),
+                     fixed(at["shot_bytes"], 1, 1e6)])  # fmt: skip
+    header = ("garment", "variant", "play [ms]", "solver, GPU [ms]", "one thread [ms]", "energy [J]", "shows [%]",
+              "off [mm]", "model, 32 bits [MB]", "shot [MB]")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def playing() -> str:
+    """Times of a frame on one processor thread."""
+    rows = []
+    for name, words in GARMENTS.items():
+        found = result("runtime")["models"][name]
+        times = (fixed(found[way][FULL][0], 2, 1000)
+                 for way in ("numpy", "PyTorch, in chunks", "NCS, in chunks"))  # fmt: skip
+        rows.append([words, *times])
+    return table(("garment", "SSILK, numpy [ms]", "SSILK, PyTorch [ms]", "NCS, PyTorch [ms]"), rows)
+
+
+def extremes() -> str:
+    """How many extremes of each kind work, fall back and are refused."""
+    outcomes = document("stress_cape")["outcomes"]
+    groups = dict.fromkeys(each["group"] for each in outcomes)
+    rows = []
+    for verdict in ("works", "falls back", "refuses"):
+        counts = Counter(each["group"] for each in outcomes if each["verdict"] == verdict)
+        rows.append([verdict, *(counts[group] or "" for group in groups), counts.total()])
+    return table(("", *groups, "all"), rows)
