@@ -38,6 +38,7 @@ artist_guide
 pipeline
 farm
 results
+settings
 training
 architecture
 reference

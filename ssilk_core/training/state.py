@@ -23,13 +23,16 @@ from ..network.tensors import pack_tensors, read_tensors
 from ..scene.assets import Scene
 from ..scene.fabrics import fabric_of_file
 from .curve import CurvePoint
+from .latent_regularization import LATENT_SCALE
 from .settings import TrainConfig
-from .step import Stepper
+from .step import SKINNING_RATE, Stepper
 from .validation import Score
 
 Tensors = dict[str, Tensor]
 
 FORMAT = 1  # of training states
+# Former settings that are constants now; a state with another value cannot be resumed.
+FOLDED = {"latent_regularization_scale": LATENT_SCALE, "skin_learning_rate_scale": SKINNING_RATE}
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
@@ -253,6 +256,9 @@ def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> Non
     differing: list[str] = []
     if "fabric" in before:
         before = {**before, "fabric": asdict(fabric_of_file(before["fabric"]))}
+    if isinstance(train := before.get("train"), dict):
+        kept = {name: value for name, value in train.items() if name not in FOLDED or value != FOLDED[name]}
+        before = {**before, "train": kept}
     asked, before = _located(asked, asked), _located(before, asked)
     for key, value in asked.items():
         old = before.get(key)

@@ -68,7 +68,6 @@ PAPER = {
     "static_batch": 0,
     "static_learning_rate": "not stated",
     "learning_rate": "not stated",
-    "skin_learning_rate_scale": "not stated",
     "integrator_learning_rate_scale": "not stated",
     "shape_learning_rate_scale": "not stated",
     "shape_smoothing": 0,

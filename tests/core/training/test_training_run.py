@@ -42,7 +42,15 @@ from ssilk_core.training.run import train
 from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.signals import stop_on_signals
-from ssilk_core.training.state import RunState, _need_same, json_round_trip, learned_tensors, load_state, state_path
+from ssilk_core.training.state import (
+    FOLDED,
+    RunState,
+    _need_same,
+    json_round_trip,
+    learned_tensors,
+    load_state,
+    state_path,
+)
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
 from ssilk_core.training.verdict import is_worse, shortcomings, worse_message
@@ -431,6 +439,15 @@ def test_a_run_of_before_stitches_resumes_where_none_hold_anything(job):
     _need_same(Path("older"), asked, before)
     with pytest.raises(SsilkError, match="another drag"):
         _need_same(Path("older"), asked, {**before, "fabric": {**before["fabric"], "drag": 9.0}})
+
+
+@pytest.mark.parametrize("name", FOLDED)
+def test_a_run_with_a_former_setting_resumes_only_with_the_value_that_is_constant_now(job, name):
+    asked = job("older", replace(SHORT, iterations=1, static_fraction=0.0)).identity()
+    assert name not in asked["train"]
+    _need_same(Path("older"), asked, {**asked, "train": {**asked["train"], name: FOLDED[name]}})
+    with pytest.raises(SsilkError, match=f"another {name}"):
+        _need_same(Path("older"), asked, {**asked, "train": {**asked["train"], name: 2 * FOLDED[name]}})
 
 
 @pytest.fixture
