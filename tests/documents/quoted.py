@@ -21,6 +21,7 @@ from ssilk_core.scene.decomposition import FitTolerance
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 from ssilk_core.scene.mesh.stitches import TOUCH
 from ssilk_core.training.settings import PRESETS
+from tools.settings_page import settings
 
 from .measured import default, digits, duration, fixed, micro, milli, percent, result, row, series
 from .quoted_results import results
@@ -313,10 +314,30 @@ def fitted(over: str = "", where: str = "") -> str:
     return f"within {1000 * tolerance.rms:g} mm (RMS{over}) and {1000 * tolerance.largest:g} mm (any vertex{where})"
 
 
+# docs/settings.md
+
+
+def settings_page() -> Text:
+    for name, (usual, presets) in settings().items():
+        yield f"| `{name}` | {usual} | {presets} |" if presets else f"| `{name}` | {usual} |"
+    steps = [preset.train.iterations for preset in PRESETS.values()]
+    yield f"{min(steps)} to {max(steps):,}."
+    for name, unit in {"density": "kg/m²", "bending": "N m", "margin": "m"}.items():
+        values = [getattr(fabric, name) for fabric in FABRICS.values()]
+        yield f"{power(min(values))} to {power(max(values))} {unit}."
+    yield f"0 to {FABRICS['default'].drag:g} kg/(m² s)."
+
+
+def power(value: float) -> str:
+    """Return a number as the page writes it."""
+    return f"{value:g}" if value >= 1e-3 else f"{value:.0e}".replace("e-0", "e-")
+
+
 QUOTED: dict[str, Callable[[], Text]] = {
     "README.md": readme,
     "CHANGELOG.md": lambda: iter(()),
     "docs/results.md": results,
+    "docs/settings.md": settings_page,
     "docs/training.md": training,
     "docs/farm.md": farm,
     "docs/pipeline.md": pipeline,
