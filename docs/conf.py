@@ -39,6 +39,7 @@ artist_guide
 pipeline
 farm
 results
+settings
 training
 architecture
 reference

@@ -3,8 +3,8 @@
 
 Nothing is unpickled. Tensors are named "scene.*" (the garment, its rig and the skeleton) or "model.*" (the
 parameters). Each has the narrowest type that holds it. The header has one JSON document under "ssilk". Quantised
-matrices are 16-bit integers, with their scales in "scale.model.*". A checksum covers everything. Models of earlier
-versions, the shipped ones among them, have none and are read without a warning, on which nobody could act.
+matrices are 16-bit integers, with their scales in "scale.model.*". A checksum covers everything; a file that another
+program rewrote may lack it, and is read without a warning, on which nobody could act.
 """
 
 from __future__ import annotations
@@ -30,35 +30,8 @@ from .tensors import pack_tensors, read_tensors
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 6  # models of format 5 have no `velocity_allowance`, and proxies of format 4 only turn
-OLDER_LIMITS = {"velocity_allowance": 0.5, "max_latent_step": 0.3}  # of models before format 6
+FORMAT = 6  # the first that was released
 HEADER_NAME = "ssilk"  # of the JSON document in the metadata
-# Settings that format 3 stores under other names. Formats before 3 hold networks of another architecture.
-RENAMED_SINCE_3 = {
-    "config": {"bound": "latent_bound", "push": "max_latent_step"},
-    "model": {"bound": "latent_bound", "push": "max_latent_step"},
-    "shipped": {"plain skinning [J]": "linear blend skinning [J]"},
-    "train": {
-        "warm": "static_fraction",
-        "warm_batch": "pretraining_batch",
-        "carry": "state_reuse",
-        "rotated": "rotated_fraction",
-        "recombined": "recombinations",
-        "resting": "static_batch",
-        "kick": "noise_probability",
-        "regularity": "latent_regularization",
-        "regularity_scale": "latent_regularization_scale",
-        "through_time": "bptt",
-        "warm_rate": "static_learning_rate",
-        "rate": "learning_rate",
-        "final_rate": "final_learning_rate",
-        "rate_warmup": "learning_rate_warmup",
-        "skin_rate": "skin_learning_rate_scale",
-        "shape_rate": "shape_learning_rate_scale",
-        "average": "ema_decay",
-        "surface": "closest_point",
-    },
-}
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
@@ -209,28 +182,9 @@ def _read(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     except (TypeError, ValueError, RecursionError) as error:
         raise SsilkError(f"{path}: the model's header is damaged ({error}); train again.") from error
     found = document.get("format") if isinstance(document, dict) else None
-    if found not in (3, 4, 5, FORMAT):
-        fail(str(path), f"model format {found}", f"this version reads formats 3 to {FORMAT}", "train it again")
-    if found == 3:
-        document = _from_format_3(document)
-    if found != FORMAT and isinstance(document.get("config"), dict):
-        document = {**document, "config": OLDER_LIMITS | document["config"]}
+    if found != FORMAT:
+        fail(str(path), f"model format {found}", f"this version reads format {FORMAT}", "train it again")
     return tensors, document
-
-
-def _from_format_3(document: dict[str, Any]) -> dict[str, Any]:
-    """Convert the header of a format 3 model to format 4; damaged values stay for `_need_header` to report."""
-
-    def renamed(values: object, part: str) -> object:
-        names = RENAMED_SINCE_3.get(part, {})
-        return (
-            {names.get(name, name): value for name, value in values.items()} if isinstance(values, dict) else values
-        )
-
-    provenance = document.get("provenance")
-    if isinstance(provenance, dict):
-        provenance = {part: renamed(value, part) for part, value in provenance.items()}
-    return {**document, "config": renamed(document.get("config"), "config"), "provenance": provenance}
 
 
 def _need_header(document: dict[str, Any]) -> None:

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from ..network.model.network import GarmentModel
 
+# RMS distance between garments for each unit of distance between their latents [m]. The loss asks for this ratio;
+# no training needed another.
+LATENT_SCALE = 0.03
 MIN_DISTANCE = 1e-6  # floor for distances of latents, and of garments [m], before the logarithm
 
 

@@ -13,7 +13,7 @@ from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
 from ..physics.skinning import Skinning
 from ..scene.assets import SkinWeights
-from .latent_regularization import latent_distortion
+from .latent_regularization import LATENT_SCALE, latent_distortion
 from .motion_bank import MotionBank
 from .newton_distance import NewtonDistance
 from .windows import WindowSampler
@@ -163,8 +163,8 @@ class Objective:
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )
         if weight := sampler.config.latent_regularization:
-            drawn, scale = torch.cat([rolled[-batch:], quiet]), sampler.config.latent_regularization_scale
-            dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, scale)
+            drawn = torch.cat([rolled[-batch:], quiet])
+            dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, LATENT_SCALE)
         return dynamic, single, torch.stack(z[-2:]).detach()
 
 

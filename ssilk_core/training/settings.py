@@ -44,8 +44,6 @@ class TrainConfig:
         noise: standard deviation of the noise on the first two latents of a window.
         noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.
         latent_regularization: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
-        latent_regularization_scale: RMS distance between garments per unit of distance between their latents, for
-            Eq. 13 [m].
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
         optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam", as for all other parameters and in
             the paper's recipe.
@@ -53,7 +51,6 @@ class TrainConfig:
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
-        skin_learning_rate_scale: factor on the learning rate of skinning weights.
         integrator_learning_rate_scale: factor on the learning rate of the integrator's own parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
         shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
@@ -88,14 +85,12 @@ class TrainConfig:
     noise: float = 0.03
     noise_correlation: float = 0.99
     latent_regularization: float = 0.0
-    latent_regularization_scale: float = 0.03
     bptt: bool = False
     optimiser: str = "muon"
     static_learning_rate: float = 1e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
     learning_rate_warmup: int = 500
-    skin_learning_rate_scale: float = 0.1
     integrator_learning_rate_scale: float = 3.0
     shape_learning_rate_scale: float = 0.3
     shape_smoothing: float = 0.03
@@ -127,7 +122,6 @@ class TrainConfig:
             "learning_rate",
             "final_learning_rate",
             "learning_rate_warmup",
-            "skin_learning_rate_scale",
             "integrator_learning_rate_scale",
             "shape_learning_rate_scale",
             "outlier_energy",
@@ -143,7 +137,6 @@ class TrainConfig:
                 "their product must be less than 1",
             )
         need_between(self, 0, NO_BOUND, "latent_regularization")
-        need_between(self, 1e-9, NO_BOUND, "latent_regularization_scale")
         need_between(self, 0, 1000, "recombinations", "perturbations")
         need_between(self, 0, 2**63 - 1, "seed")
 

@@ -20,6 +20,7 @@ from .skipped_steps import SkippedSteps
 from .windows import WindowSampler
 
 MIN_GRADIENT_NORM = 1e-30  # floor for the norm that gradients are divided by
+SKINNING_RATE = 0.1  # of the learning rate: a skinning weight acts in all poses, so it changes slowly
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
@@ -195,7 +196,7 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
         "matrices": 1.0,
         "biases": 1.0,
         "integrator": config.integrator_learning_rate_scale,
-        "skinning": config.skin_learning_rate_scale,
+        "skinning": SKINNING_RATE,
         "shapes": config.shape_learning_rate_scale,
     }
     parts: dict[str, list[nn.Parameter]] = {name: [] for name in scales}

@@ -224,7 +224,6 @@ def test_each_part_of_a_model_moves_at_its_own_rate(objective):
         CONFIG,
         optimiser="adam",
         integrator_learning_rate_scale=3.0,
-        skin_learning_rate_scale=0.1,
         shape_learning_rate_scale=0.5,
     )
     other = copy.copy(objective)

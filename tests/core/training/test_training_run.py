@@ -42,7 +42,14 @@ from ssilk_core.training.run import train
 from ssilk_core.training.run_files import RunFiles
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.signals import stop_on_signals
-from ssilk_core.training.state import RunState, _need_same, json_round_trip, learned_tensors, load_state, state_path
+from ssilk_core.training.state import (
+    RunState,
+    _need_same,
+    json_round_trip,
+    learned_tensors,
+    load_state,
+    state_path,
+)
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
 from ssilk_core.training.verdict import is_worse, shortcomings, worse_message
