@@ -16,7 +16,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "usd")]
 
 project = html_title = "SSILK"
 root_doc = "docs/index"
-include_patterns = ["docs/*.md", "CHANGELOG.md"]
+include_patterns = ["docs/*.md", "benchmarks/README.md", "CHANGELOG.md"]
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 highlight_language = "none"
@@ -43,6 +43,7 @@ settings
 training
 architecture
 reference
+../benchmarks/README
 ../CHANGELOG
 ```
 """

@@ -30,7 +30,6 @@ from .validation import Score
 Tensors = dict[str, Tensor]
 
 FORMAT = 1  # of training states
-# Former settings that are constants now; a state with another value cannot be resumed.
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
