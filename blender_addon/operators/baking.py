@@ -49,7 +49,7 @@ ABOUT = {
 }
 QUALITY_ITEMS = [
     (WHOLE, "Whole", "All that the model has"),
-    *((name, name.capitalize(), ABOUT[name]) for name in QUALITIES),
+    *((name, name.capitalize(), ABOUT.get(name, level.about)) for name, level in QUALITIES.items()),
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 

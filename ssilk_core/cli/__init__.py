@@ -65,7 +65,7 @@ VERBS = (
     help,
 )
 
-# The extra of the distribution that installs everything a verb needs.
+# The extra of the distribution that installs everything a verb needs; "all" for others.
 EXTRAS = {
     "inspect": "train",
     "rig": "setup",
@@ -85,7 +85,6 @@ EXTRAS = {
     "view": "view",
     "farm": "farm",
     "task": "bake",
-    "demo": "all",
 }
 OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpeg", "PIL", "matplotlib", "ray",
             "onnxscript")  # fmt: skip
@@ -133,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in OPTIONAL:
             raise
-        extra = EXTRAS[options.verb]
+        extra = EXTRAS.get(options.verb, "all")
         report(
             Failed(f"'{options.verb}' needs {error.name}, which is not installed; install the extra ssilk[{extra}].")
         )

@@ -3,6 +3,6 @@
 
 In: a `Scene`, and vertices and skinning matrices as tensors of shape (V, 3, N). Out: energies [J], contact planes,
 simulated frames, figures of skin.
-Open `energy/garment.py` first: there the energy of a garment is summed.
+Open `energy/garment.py` first: it has each term of the energy.
 Public: `physics.energy`, `physics.collision`, `physics.simulate`, `physics.refine`.
 """

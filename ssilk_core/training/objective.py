@@ -32,7 +32,7 @@ class Objective:
         body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
-        clearance: see `config.TrainConfig` [m].
+        clearance: see `settings.TrainConfig` [m].
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
     """

@@ -66,11 +66,13 @@ def test_a_browser_draws_the_page_and_fetches_nothing(pages, name, tmp_path):
     from PIL import Image
 
     picture = tmp_path / "page.png"
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--v=0",
-               f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={SIZE[0]},{SIZE[1]}"]  # fmt: skip
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--v=0",
+               "--enable-logging=stderr", f"--user-data-dir={tmp_path / 'profile'}",
+               f"--window-size={SIZE[0]},{SIZE[1]}"]  # fmt: skip
     address = (pages / f"{name}.html").as_uri()
     shot = subprocess.run([*command, f"--screenshot={picture}", address], capture_output=True, text=True, timeout=120)
-    assert "CONSOLE" not in shot.stderr, shot.stderr  # where a refused request or an error would be told
+    told = [line for line in shot.stderr.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    assert told == []  # where a refused request or an error would be told
     drawn = np.asarray(Image.open(picture).convert("RGB"), dtype=int)
     assert drawn.shape[:2] == (SIZE[1], SIZE[0])
     assert (np.ptp(drawn, axis=2) > 60).sum() > 300  # coloured lines, marks and cloth, not a blank or an error page

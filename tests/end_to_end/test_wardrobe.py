@@ -36,7 +36,7 @@ preset = "draft"
 latent = 8
 widths = [16]
 shapes = 4
-iterations = 240
+iterations = 120
 static_fraction = 0.5
 batch = 2
 pretraining_batch = 4
@@ -62,7 +62,7 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
     skirt, torn = listed(tmp_path, LIST + 'material = { drag = 0.2, damp = true }\nvalid = ["a", "b"]\n')
     assert (skirt.name, torn.name) == ("skirt", "torn")
     settings = (
-        "--set latent=8 --set widths=16 --set shapes=4 --set iterations=240 --set static_fraction=0.5 --set batch=2 "
+        "--set latent=8 --set widths=16 --set shapes=4 --set iterations=120 --set static_fraction=0.5 --set batch=2 "
     )
     settings += "--set pretraining_batch=4 --set window=4"
     assert shlex.join(skirt.words) == (
@@ -343,7 +343,7 @@ def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
     assert main(command) == 2
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     skirt, torn = events[-1]["detail"]["garments"]
-    assert (skirt["state"], skirt["iterations"], torn["state"]) == ("finished", 240, "failed")
+    assert (skirt["state"], skirt["iterations"], torn["state"]) == ("finished", 120, "failed")
     said = [event["said"] for event in events if event["event"] == "garment" and event["name"] == "torn"]
     assert [event["event"] for event in said] == ["message", "failed"] and "torn.usda" in said[-1]["error"]
     assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())

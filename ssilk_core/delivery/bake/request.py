@@ -49,7 +49,7 @@ class BakeRequest:
             network has it.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
-        hide_covered: hide the body's faces that the garment covers in every frame (see `mesh.hidden_faces`).
+        hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The posed body, and the distance of garment vertices to it.
+"""The posed body, and the distance of the cloth to it.
 
 Positions have the shape (V, 3, N): vertices, coordinates, frames. A garment meets the body in this order:
 

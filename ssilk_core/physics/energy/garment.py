@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All energies of one garment."""
+"""All energies of one garment, term by term; whoever needs a total adds up `TERMS`."""
 
 from __future__ import annotations
 

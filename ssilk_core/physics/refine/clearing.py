@@ -3,7 +3,7 @@
 
 Contact pushes each sample of the cloth out of the part of the body that it can touch. Skin shows all the same where
 the body comes through between samples, where tight cloth lies in a part that is not beneath it at rest, and where few
-iterations were made. So covered points of the skin (`collision.covered_skin`) ask. Where the outermost cloth along
+iterations were made. So covered points of the skin (`skin.covered_skin`) ask. Where the outermost cloth along
 the normal n lies beneath such a point p, the cloth moves by the u with
 
     min u' H u / 2   subject to   n . sum_k w_k (x_k + u_k) = n . p + HEIGHT,

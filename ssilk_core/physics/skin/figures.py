@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shares of covered skin that show and that are bare, as figures; `collision.covered_skin` measures it."""
+"""The shares of covered skin that show and that are bare, as figures; `skin.covered_skin` measures it."""
 
 from __future__ import annotations
 

@@ -309,8 +309,8 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
 
     whole = dressed(scene, 0.7)
     points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)
-    x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3, 0.45)], dim=-1)
-    limbs = LimbPoser(limb_axes(whole), _body(whole)[0], CPU).pose(still(2, 3))
+    x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3)], dim=-1)
+    limbs = LimbPoser(limb_axes(whole), _body(whole)[0], CPU).pose(still(2, 2))
     piercing = Piercing(whole, vertex_samples(len(x)), device=CPU)
     counts, _, triangle = piercing._caster.crossings(limbs.start, limbs.end, x)
     asked = (each.to(DEVICE) for each in (limbs.start, limbs.end, x, piercing._caster.faces))
@@ -318,7 +318,7 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
     assert torch.equal(own_counts.cpu().long(), counts) and counts.any()
     assert torch.equal(own_triangle.cpu(), triangle)
     pierced = piercing.find(x, limbs)
-    planes = torch.zeros_like(x), torch.zeros(len(x), 3)
+    planes = torch.zeros_like(x), torch.zeros(len(x), 2)
     piercing.replace_planes(x, limbs, *planes)
     own = [torch.zeros_like(each, device=DEVICE) for each in planes]
     where = tuple(each.to(DEVICE) for each in (pierced.point, pierced.direction, pierced.tip, pierced.radius))
