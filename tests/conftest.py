@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 
 import pytest
 
@@ -23,3 +24,11 @@ def one_thread() -> None:
 def one_thread_again() -> None:
     """Compute a test with one thread, whatever a benchmark set before it."""
     _one_thread()
+
+
+@pytest.fixture(scope="module")
+def few_contacts() -> Iterator[None]:
+    """Cloth touches the body at vertices and at few points between, where contact itself is not what is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssilk_core.physics.collision.samples.MAX_SPACING", 0.1)
+        yield

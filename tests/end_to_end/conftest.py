@@ -105,11 +105,8 @@ def run(command: str, *more: str) -> int:
 
 
 @pytest.fixture(autouse=True, scope="module")
-def few_contacts() -> Iterator[None]:
-    """Cloth touches the body at vertices and at few points between: what is tested here are commands and files."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ssilk_core.physics.collision.samples.MAX_SPACING", 0.1)
-        yield
+def commands_have_few_contacts(few_contacts) -> None:
+    """What is tested here are commands and files."""
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -34,6 +34,8 @@ from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.validation import Validator
 from ssilk_core.training.windows import WindowSampler
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 JOINTS, INNER = np.arange(3), torch.tensor([False, True, True])
 CPU = torch.device("cpu")
 FABRIC = Fabric("toy", bending=1e-4, margin=0.02)

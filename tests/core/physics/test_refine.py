@@ -17,6 +17,8 @@ from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.scene.assets import PINNED
 from ssilk_core.scene.fabrics import Fabric
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
 FRAMES = 9
 

@@ -20,6 +20,8 @@ from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Garment, Mesh, Motion,
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 CPU = torch.device("cpu")
 G = 9.81
 EXACT = SolverOptions(tolerance=1e-7, iterations=200)

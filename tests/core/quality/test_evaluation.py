@@ -53,6 +53,8 @@ from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import motion_transforms, skin_points, skinning_matrices
 from ssilk_core.training.validation import Validator
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 FPS, JOINTS, CPU = 30.0, np.arange(3), torch.device("cpu")
 
 

@@ -18,6 +18,8 @@ from ssilk_core.scene.assets import Motion, Scene
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import motion_transforms, split_at_cuts
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 TINY = Effort(seconds=1.0, frames=0.02, steps=2, simulated=2, vertices=20)
 FABRIC = Fabric("toy", bending=1e-4)
 

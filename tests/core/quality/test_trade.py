@@ -34,6 +34,8 @@ from ssilk_core.quality.trade.variants import PRECISIONS, WHOLE, other_network, 
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.scene.kinematics import deform, resample, sample_motion
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 FPS = 30.0
 
 

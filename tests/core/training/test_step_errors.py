@@ -24,6 +24,8 @@ from ssilk_core.training.newton_steps import NewtonSteps
 from ssilk_core.training.step_errors import StepErrors
 from ssilk_core.training.validation import Score, Validator
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 CPU, FPS, FABRIC = torch.device("cpu"), 30.0, Fabric("toy", bending=1e-4, margin=0.02)
 
 

@@ -33,6 +33,8 @@ from ssilk_core.training.step import learning_rate
 
 from .test_training_run import SHORT, job  # noqa: F401  (a fixture)
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 PLAN = TrainConfig(
     iterations=1000, static_fraction=0.3, learning_rate_warmup=50, validate_every=100, ema_decay=0.998,
     batch=64, window=6, static_batch=64, pretraining_batch=1024,

@@ -55,6 +55,8 @@ from ssilk_core.training.validation import Score, Validator
 from ssilk_core.training.verdict import is_worse, shortcomings, worse_message
 from ssilk_core.training.windows import WindowSampler
 
+pytestmark = pytest.mark.usefixtures("few_contacts")
+
 SHORT = TrainConfig(
     iterations=14,
     static_fraction=0.3,
