@@ -15,6 +15,7 @@ import argparse
 import re
 import sys
 from collections.abc import Callable, Mapping
+from itertools import zip_longest
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -38,8 +39,12 @@ def written(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
     """Return a document with its tables as they are now.
 
     Raises:
-        KeyError: it names a table that does not exist.
+        KeyError: it names a table that does not exist, or does not end one before the next begins.
     """
+    begun = re.findall(r"<!-- (?:table: (\w+)|end) -->", text)  # a name, or "" for an end
+    for name, end in zip_longest(begun[::2], begun[1::2], fillvalue="?"):
+        if not name or end:
+            raise KeyError(f"{name or end} that begins and ends")
     return MARKED.sub(lambda found: f"{found[1]}{tables[found[2]]()}\n{found[3]}", text)
 
 

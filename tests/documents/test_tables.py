@@ -67,3 +67,9 @@ def test_every_result_file_is_read_and_small(tables, monkeypatch):
     assert not set(files) - read, f"no table reads {sorted(set(files) - read)}"
     assert not [name for name, size in files.items() if size > LARGEST_FILE]
     assert sum(files.values()) <= LARGEST_FOLDER
+
+
+@pytest.mark.parametrize("text", ["<!-- table: a -->\n", "<!-- table: a -->\n<!-- table: b -->\n<!-- end -->\n"])
+def test_a_table_that_does_not_end_is_refused(tables, text):
+    with pytest.raises(KeyError, match="begins and ends"):
+        tables.written(text, {"a": str, "b": str})
