@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ssilk_core.errors import fail
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.physics.skinning import Skinning
 from ssilk_core.scene.assets import PINNED, Ints, Scene
 
@@ -62,12 +63,14 @@ class Baseline(nn.Module, ABC):
         """Return the states (N, S) of poses without a past, from static descriptors (N, 9 J)."""
 
     @abstractmethod
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+    def roll(
+        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
+    ) -> list[Tensor]:
         """Return `states`, of which the last counts, followed by those of the next frames; each (batch, S).
 
         Args:
             states: those before the first of these frames.
-            rest: initial states of the frames, which no baseline needs.
+            rest: initial states of the frames; body: the character in them. No baseline needs these.
             pose: dynamic descriptors of the frames, shape (F, batch, D).
         """
 
@@ -103,7 +106,9 @@ class NCS(Baseline):
         code = self.posed(static)
         return torch.cat([code, torch.zeros_like(code)], dim=1)
 
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+    def roll(
+        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
+    ) -> list[Tensor]:
         still, moving, _ = split_features(pose)
         begun = states[-1][:, self.width :].contiguous()
         motion, _ = self.memory(self.gathered(self.moved(moving).flatten(2)), begun[None])
@@ -141,7 +146,9 @@ class SNUG(Baseline):
         seen = nn.functional.pad(static, (0, ROOT))
         return self._remembered(seen[None], seen.new_zeros(len(seen), self.depth * self.width))[0]
 
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+    def roll(
+        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
+    ) -> list[Tensor]:
         still, _, root = split_features(pose)
         return [*states, *self._remembered(torch.cat([still, root], dim=2), states[-1])]
 

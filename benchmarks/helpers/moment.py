@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.physics.collision import PosedBody
 from ssilk_core.training.step import Stepper
 
@@ -44,8 +45,8 @@ class Moment:
     def _decoded(self) -> None:
         self.target = self.targets()
         self.z = torch.cat([self.target[2 * self.batch :], self.model.initial(self.quiet)])
-        self.activation, self.turns = self.decoder._split(self.model.output(self.z))
-        self.matrices = self.decoder._matrices(self.turns, self.character)
+        self.activation, self.turns = self.decoder.split(self.model.output(self.z))
+        self.matrices = self.decoder.matrices(self.turns, self.character)
         self.offsets = self.blendshapes(self.activation)
         self.x = self.skinned(self.offsets, self.matrices)
 
@@ -76,10 +77,19 @@ class Moment:
     def targets(self) -> Tensor:
         return self.model.initial(self.static)
 
+    def body_frames(self) -> BodyFrames:
+        return self.bank.body(self.times.reshape(self.window, self.batch))
+
+    @torch.no_grad()
+    def seen(self) -> Tensor:
+        """What S sees of the cloth in all steps at once, from quasi-static states."""
+        before, now = self.target[: -2 * self.batch], self.target[self.batch : -self.batch]
+        return self.model.seen_from(before, now, self.bank.triples(self.times[2 * self.batch :]))
+
     @torch.no_grad()
     def rolled(self) -> Tensors:
         rest, pose = (value.reshape(self.window, self.batch, -1) for value in (self.target, self.pose))
-        return tuple(self.model.roll([rest[0], rest[1]], rest[2:], pose[2:])[2:])
+        return tuple(self.model.roll([rest[0], rest[1]], rest[2:], pose[2:], self.body_frames())[2:])
 
     @torch.no_grad()
     def decoded_first(self) -> Tensor:

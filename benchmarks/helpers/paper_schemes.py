@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's integration schemes, which its Figure 11 compares: Eqs. 3, 11 and 12.
 
-'ssilk' has none of them. A script that trains, loads or measures such models calls `register` first.
+In each S may see the cloth (Figure 2). 'ssilk' has none of them. A script that trains, loads or measures such models calls `register` first.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ssilk_core.network.settings import ModelConfig
 
 
 class Verlet(Integrator):
-    """z_t = zbar + S([zbar, z_{t-1}, pose]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
+    """z_t = zbar + S([zbar, z_{t-1}, pose, cloth]) with zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}) (Eqs. 2, 3).
 
     `config.max_latent_step` limits what S adds in a step.
     """
@@ -26,24 +26,25 @@ class Verlet(Integrator):
         # 1 would turn noise on the first two states into a steady drift; with 0.9 it decays within a second.
         self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
         _, pose = precomputed
         forward = self.alpha * now + self.beta * (now - before)
-        return forward + soft_clamp(stepper(torch.cat([forward, now, pose], dim=1)), self.config.max_latent_step)
+        added = stepper(torch.cat([forward, now, pose, seen], dim=1))
+        return forward + soft_clamp(added, self.config.max_latent_step)
 
 
 class Direct(Integrator):
-    """z_t = S([z_{t-2}, z_{t-1}, pose]) (Eq. 11)."""
+    """z_t = S([z_{t-2}, z_{t-1}, pose, cloth]) (Eq. 11)."""
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        return stepper(torch.cat([before, now, precomputed[1]], dim=1))
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
+        return stepper(torch.cat([before, now, precomputed[1], seen], dim=1))
 
 
 class DirectResidual(Integrator):
-    """z_t = z_{t-1} + S([z_{t-2}, z_{t-1}, pose]) (Eq. 12)."""
+    """z_t = z_{t-1} + S([z_{t-2}, z_{t-1}, pose, cloth]) (Eq. 12)."""
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
-        return now + stepper(torch.cat([before, now, precomputed[1]], dim=1))
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
+        return now + stepper(torch.cat([before, now, precomputed[1], seen], dim=1))
 
 
 PAPER_SCHEMES = {

@@ -69,7 +69,7 @@ def network_parts(at: Moment) -> list[Part]:
     before, now, rest = at.target[:-first], at.target[batch:-batch], at.target[first:]
     poses, pose = at.bank.static_descriptor(at.frames, at.direction), at.pose[first:]
     passes = 2 - model.integrator.scheme.bias  # SpringVerlet subtracts what S gives at rest
-    initial = tuple(model.initialiser.parameters())
+    seen, initial = at.seen(), tuple(model.initialiser.parameters())
     stepping = (*model.stepper.parameters(), *model.integrator.parameters())
     return [
         through("initialiser P", model.initialiser, lambda: model.initial(poses), (poses,), initial, (WARM,)),
@@ -77,8 +77,9 @@ def network_parts(at: Moment) -> list[Part]:
         through("initialiser P of single poses", model.initialiser, lambda: model.initial(at.quiet), (at.quiet,),
                 initial, (WINDOWS,)),
         through("stepper S frame by frame", model.stepper, at.rolled, (rest, pose), (), (WINDOWS,), passes),
-        through("stepper S on all frames", model.stepper, lambda: model.step(before, now, rest, pose),
-                (before, now, rest, pose), stepping, (WINDOWS,), passes),
+        through("what S sees of the cloth", model.output, at.seen, (before, now), (), (WINDOWS,), 3),
+        through("stepper S on all frames", model.stepper, lambda: model.step(before, now, rest, pose, seen),
+                (before, now, rest, pose, seen), stepping, (WINDOWS,), passes),
         through("decoder D", model.output, lambda: model.output(z), (z,), (z, *model.output.parameters())),
     ]  # fmt: skip
 
@@ -89,7 +90,7 @@ def garment_parts(at: Moment) -> list[Part]:
     offsets, matrices = leaf(at.offsets), leaf(at.matrices)
     first = (at.target[: 2 * at.batch], decoder.shapes)
     return [
-        Part(name="proxies", run=lambda: decoder._matrices(turns, at.character), leaves=(turns,),
+        Part(name="proxies", run=lambda: decoder.matrices(turns, at.character), leaves=(turns,),
              reads=(turns, at.character), operations=COMPOSE * len(turns) * at.count),
         Part(name="blendshapes", run=lambda: at.blendshapes(activation), leaves=(activation, decoder.shapes),
              reads=(activation, decoder.shapes), operations=2 * decoder.shapes.numel() * at.count),

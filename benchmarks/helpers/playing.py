@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ssilk_core.network.checkpoint import ModelFile, network
 from ssilk_core.network.model.batch import DOWN, motion_inputs
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.character import character_frames
@@ -66,7 +67,7 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
             motion.clip(frames.start - lookback, frames.stop), player.skeleton, player.file.joints, lookback
         )
         monitor.lap(DESCRIPTORS)
-        course = player.stepper.prepare(player.quasi_static(given.static), given.static, given.rates, before)
+        course = player.stepper.prepare(player.quasi_static(given.static), given, before)
         monitor.lap(REST)
         states = player.stepper.roll(course)
         before = states[-2:]
@@ -112,7 +113,9 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
     for frames in spans(motion.frame_count, chunk):
         rest, pose = given.rest[frames], given.pose[frames]
         starting = max(0, min(2 - frames.start, len(rest)))
-        states = model.roll([*states[-2:], *rest[:starting]], rest[starting:], pose[starting:])
+        seen = slice(max(0, frames.start + starting - 2), frames.stop)
+        body = BodyFrames(given.character[seen], given.bend[seen])
+        states = model.roll([*states[-2:], *rest[:starting]], rest[starting:], pose[starting:], body)
         monitor.lap(LATENTS)
         activations, transforms = model.pose(torch.cat(states[-len(rest) :]))
         monitor.lap(DECODER)

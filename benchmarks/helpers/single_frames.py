@@ -12,6 +12,7 @@ from baselines.evaluation import method_over
 from baselines.networks import Baseline
 from torch import Tensor
 
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.quality.evaluation.methods import Network, TakeSet
 from ssilk_core.training.motion_bank import LatentModel
@@ -44,7 +45,7 @@ def _frame(network: Network, frame: int) -> tuple[float, float]:
     direction = network.down.expand(1, 3)
     static, pose = bank.static_descriptor(index, direction), bank.dynamic_descriptor(index, direction)
     character, past = bank.character(index), [states[frame - 2 : frame - 1], states[frame - 1 : frame]]
-    advance, decode = _parts(model, past, static, pose)
+    advance, decode = _parts(model, past, static, pose, bank.triples(index))
     marks = [now(static.device)]
     z = advance()
     marks.append(now(static.device))
@@ -57,11 +58,11 @@ def _frame(network: Network, frame: int) -> tuple[float, float]:
 
 
 def _parts(
-    model: LatentModel, past: list[Tensor], static: Tensor, pose: Tensor
+    model: LatentModel, past: list[Tensor], static: Tensor, pose: Tensor, body: BodyFrames
 ) -> tuple[Callable[[], Tensor], Callable[[Tensor], Tensor]]:
     """Return what advances a network by a frame, and what it ends in."""
     if isinstance(model, GarmentModel):
-        return lambda: model.step(past[0], past[1], model.initial(static), pose), model.output
+        return lambda: model.roll(past, model.initial(static)[None], pose[None], body)[-1], model.output
     assert isinstance(model, Baseline), type(model)
     return lambda: model.roll(past[-1:], static, pose[None])[-1], model.code
 

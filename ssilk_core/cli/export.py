@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a trained model's network as ONNX, for engines that play it themselves.
 
-One call computes one frame of any number of characters. Inputs are the latents of the two previous frames, the
-descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py) and a flag for the first frame.
-Outputs are the new latents, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot.
-Where proxies move, their local translations follow. Blendshapes and skinning weights are those of any baked shot.
+One call computes one frame of any number of characters. Inputs are the states of the two previous frames, the
+descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py), a flag for the first two
+frames of a shot, the skinning matrices of the character's joints about its root, and the root's position less twice
+the last one plus the one before. Outputs are the new state, the weights of the blendshapes and the local rotations of
+the proxy joints, as in a shot. Where proxies move, their local translations follow. Blendshapes and skinning weights
+are those of any baked shot.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the network; report its inputs and outputs."""
     from ..network.checkpoint import load_model, network
-    from ..network.model.export import export_onnx
+    from ..network.model.export import FrameNetwork, export_onnx
     from ..network.parameters import descriptor_sizes
 
     output: Path = options.output
@@ -43,6 +45,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             {
                 "network": str(output),
                 "latents": file.config.latent,
+                "numbers in a state": FrameNetwork(model).state_size,
                 "static descriptors": static,
                 "dynamic descriptors": rates,
                 "weights": file.config.shapes + model.decoder.has_constant,

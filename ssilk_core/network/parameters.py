@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..scene.assets import PINNED, Ints, Scene
+from .feedback import feedback_size
 from .schemes import SCHEMES
 from .settings import ModelConfig
 
@@ -24,6 +25,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
     static, dynamic = descriptor_sizes(scene, joints)
     scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
+    inputs = scheme.states * z + static + dynamic + feedback_size(scene, config)
     reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
     return {
         "decoder.skin_offset": (free, scene.rig.skin.indices.shape[1]),
@@ -31,11 +33,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
         **(reduced if config.activations else {}),
         **{f"integrator.{name}": (z,) for name in scheme.parameters},
         **_layers("initialiser", (static, *widths, z)),
-        **(
-            _layers("stepper", (scheme.states * z + static + dynamic, *widths, z), scheme.bias)
-            if scheme.states
-            else {}
-        ),
+        **(_layers("stepper", (inputs, *widths, z), scheme.bias) if scheme.states else {}),
         **_layers("output", (z, *widths, config.activation_count + config.proxy_outputs * proxies)),
     }
 

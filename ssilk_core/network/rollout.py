@@ -16,6 +16,7 @@ from ..scene.assets import Floats, GarmentPose, Motion
 from ..scene.kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .descriptors import pose_features
 from .model.descriptors import gravity_features
+from .model.feedback import BodyFrames
 from .model.network import GarmentModel
 from .sampling import sample_pose
 from .settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
@@ -108,8 +109,9 @@ def _advance(
 
     The last `count` frames of `seen` are new, those before them are what descriptors look back on.
     """
-    parameter = next(model.parameters())
-    features = pose_features(seen, model.scene.character.skeleton, model.joints)
+    parameter, skeleton = next(model.parameters()), model.scene.character.skeleton
+    world = motion_transforms(seen, skeleton.parents)
+    features = pose_features(seen, skeleton, model.joints, world)
 
     def tensor(values: Floats) -> Tensor:
         return torch.as_tensor(values[-count:], dtype=parameter.dtype, device=parameter.device)
@@ -120,7 +122,8 @@ def _advance(
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     starting = min(max(0, HISTORY - start), count)
-    return _roll_and_recover(model, [*state, *rest[:starting]], rest[starting:], pose[starting:], diverged)
+    body = BodyFrames.of(world, skeleton, parameter)[max(0, seen.frame_count - count + starting - HISTORY) :]
+    return _roll_and_recover(model, [*state, *rest[:starting]], rest[starting:], pose[starting:], body, diverged)
 
 
 def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:
@@ -130,12 +133,12 @@ def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _roll_and_recover(
-    model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, diverged: Tensor
+    model: GarmentModel, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames, diverged: Tensor
 ) -> tuple[list[Tensor], Tensor]:
-    """Roll over the frames of `rest` and `pose`; after a diverged state the garment rests, then continues."""
+    """Roll over the frames of `rest`, `pose` and `body`; after a diverged state the garment rests, then continues."""
     done = 0
     while done < len(rest):
-        rolled = model.roll(states, rest[done:], pose[done:])[len(states) :]
+        rolled = model.roll(states, rest[done:], pose[done:], body[done:])[len(states) :]
         bad = _replace_diverged(torch.cat(rolled))[1].nonzero()
         good = int(bad[0]) if len(bad) else len(rolled)
         first, done = done + good, min(done + good + RECOVERY_FRAMES, len(rest))

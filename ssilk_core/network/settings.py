@@ -40,8 +40,9 @@ class ModelConfig:
         translations: whether proxies move as well as turn; in the paper they only turn.
         scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
             quasi-static state, "quasi_static" is that state itself.
-        latent_bound: soft bound on each latent dimension; zero for none, as in the paper.
+        latent_bound: bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
+        feedback_points: points of the decoded cloth that S sees (`network.feedback`); zero for none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
         velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
             and the rates of the pose allow (`model.integrators.SpringVerlet`).
@@ -56,6 +57,7 @@ class ModelConfig:
     scheme: str = "spring_verlet"
     latent_bound: float = 4.0
     max_latent_step: float = 1.0
+    feedback_points: int = 64
     stiffness: float = 0.2
     velocity_allowance: float = 0.9
     fps: float = 30.0
@@ -67,7 +69,7 @@ class ModelConfig:
             fail("model", f"widths = {self.widths}", f"each must be at least 1 and at most {MAX_SIZE}")
         need_between(self, 1, MAX_SIZE, "latent")
         need_between(self, 1, NO_BOUND, "fps")
-        need_between(self, 0, MAX_SIZE, "shapes", "activations")
+        need_between(self, 0, MAX_SIZE, "shapes", "activations", "feedback_points")
         need_between(self, 0, NO_BOUND, "latent_bound", "max_latent_step")
         need_between(self, 1e-6, 1, "stiffness")
         need_between(self, 0, 1, "velocity_allowance")

@@ -70,9 +70,10 @@ class Skinning(nn.Module):
         for name, values in constants.items():
             self.register_buffer(name, torch.from_numpy(values), persistent=False)
 
-    def dense(self, weights: Tensor) -> Tensor:
-        """Return weights (V, I) as a matrix (V, used joints)."""
-        return weights.new_zeros(len(weights), len(self.used)).scatter_add(1, self.columns, weights)
+    def dense(self, weights: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Return weights (V, I), of all vertices or of those in `rows`, as a matrix (V, used joints)."""
+        columns = self.columns if rows is None else self.columns[rows]
+        return weights.new_zeros(len(weights), len(self.used)).scatter_add(1, columns, weights)
 
     def forward(self, rest: Tensor, offsets: Tensor | None, weights: Tensor, matrices: Tensor) -> Tensor:
         """Return skinned points (V, 3, N), differentiable in all but the rest shape.

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..errors import fail
 from ..network.descriptors import pose_features
 from ..network.model.descriptors import gravity_features
+from ..network.model.feedback import BodyFrames
 from ..scene.assets import Motion, Skeleton
 from ..scene.kinematics import centred_matrices, resample, split_at_cuts
 
@@ -49,6 +50,15 @@ class MotionBank:
     def character(self, frames: Tensor) -> Tensor:
         """Return skinning matrices (J, 3, 4, N) of frame indices (N,)."""
         return self.matrices[frames].T.reshape(-1, 3, 4, len(frames))
+
+    def body(self, frames: Tensor) -> BodyFrames:
+        """Return the character in frames (F, N) of N clips, F consecutive ones of each, about each clip's origin."""
+        matrices = self.matrices[frames].reshape(*frames.shape, -1, 3, 4).permute(0, 2, 3, 4, 1)
+        return BodyFrames(matrices, matrices.new_zeros(len(frames), 3, frames.shape[1]))
+
+    def triples(self, frames: Tensor) -> BodyFrames:
+        """Return the character in the two frames before each of `frames` (N,) and in itself, F = 3."""
+        return self.body(frames + torch.arange(-2, 1, device=frames.device)[:, None])
 
     def static_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
         """Return static descriptors (N, S) of frames (N,) under unit gravity directions (N, 3)."""
@@ -121,7 +131,7 @@ class LatentModel(Protocol):
 
     def initial(self, static: Tensor) -> Tensor: ...
 
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]: ...
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames) -> list[Tensor]: ...
 
     def vertices(self, z: Tensor, character: Tensor, /) -> Tensor: ...
 
@@ -140,5 +150,5 @@ def roll_states(model: LatentModel, bank: MotionBank, clips: Sequence[range], do
     static = bank.static_descriptor(frames.reshape(-1), direction)
     pose = bank.dynamic_descriptor(frames.reshape(-1), direction)
     rest, pose = (values.reshape(*frames.shape, -1) for values in (model.initial(static), pose))
-    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:]))
+    states = torch.stack(model.roll([*rest[:2]], rest[2:], pose[2:], bank.body(frames)))
     return [states[: len(clip), index] for index, clip in enumerate(clips)]

@@ -137,15 +137,17 @@ class Objective:
         with torch.set_grad_enabled(not model.integrator.scheme.states):
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
+        body = bank.body(times.reshape(length, batch))
         with torch.set_grad_enabled(sampler.config.bptt):
-            z = model.roll([*(start + noise)], target[2:], pose[2:])
+            z = model.roll([*(start + noise)], target[2:], pose[2:], body)
         rolled = torch.cat(z[2:])
         if not sampler.config.bptt:
             # Repeat all steps at once, from states without gradients.
             states = torch.cat(z)
-            rolled = model.step(
-                states[: -2 * batch], states[batch:-batch], *(v[2:].flatten(0, 1) for v in (target, pose))
-            )
+            before, now = states[: -2 * batch], states[batch:-batch]
+            with torch.no_grad():
+                seen = model.seen_from(before, now, bank.triples(times[2 * batch :]))
+            rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
         quiet = model.initial(bank.static_descriptor(frames, direction))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))

@@ -13,6 +13,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody
@@ -32,7 +33,7 @@ from ssilk_core.scene.assets import (
     SkinWeights,
 )
 from ssilk_core.scene.fabrics import Fabric
-from ssilk_core.scene.kinematics import local_transforms, quaternion_from_matrix, rigid
+from ssilk_core.scene.kinematics import local_transforms, motion_transforms, quaternion_from_matrix, rigid
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
 
@@ -162,6 +163,19 @@ def patched_scene() -> Scene:
 @pytest.fixture(scope="session")
 def toy_motion() -> Callable[..., Motion]:
     return build_motion
+
+
+def build_body(scene: Scene, frames: int, motions: int) -> BodyFrames:
+    """The character in so many frames of motions that differ in their speed."""
+    skeleton, like = scene.character.skeleton, torch.zeros(())
+    every = [build_motion(scene, frames, speed=1 + number) for number in range(motions)]
+    parts = [BodyFrames.of(motion_transforms(motion, skeleton.parents), skeleton, like) for motion in every]
+    return BodyFrames(torch.cat([part.matrices for part in parts], -1), torch.cat([part.bend for part in parts], -1))
+
+
+@pytest.fixture(scope="session")
+def toy_body() -> Callable[..., BodyFrames]:
+    return build_body
 
 
 @pytest.fixture(scope="session")

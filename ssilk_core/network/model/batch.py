@@ -12,9 +12,10 @@ from torch import Tensor
 
 from ...errors import fail
 from ...scene.assets import Motion
-from ...scene.kinematics import motion_transforms, skinning_matrices, split_at_cuts
+from ...scene.kinematics import motion_transforms, split_at_cuts
 from ..descriptors import pose_features
 from .descriptors import gravity_features
+from .feedback import BodyFrames
 from .network import GarmentModel
 
 DOWN = (0.0, -1.0, 0.0)
@@ -29,6 +30,7 @@ class MotionInputs:
     Attributes:
         rest: quasi-static latents, shape (F, N, latent); pose: dynamic descriptors, shape (F, N, D).
         character: skinning matrices relative to each root, shape (F, J, 3, 4, N).
+        bend: second differences of the roots' positions [m], shape (F, 3, N), as `feedback.BodyFrames` has them.
         origins: positions of the roots [m], shape (F, 3, N), float64.
         begins: first frames of a shot and after a cut, in which the garment is at rest, shape (F, N, 1).
     """
@@ -36,6 +38,7 @@ class MotionInputs:
     rest: Tensor
     pose: Tensor
     character: Tensor
+    bend: Tensor
     origins: Tensor
     begins: Tensor
 
@@ -55,7 +58,7 @@ def motion_inputs(model: GarmentModel, motions: Sequence[Motion]) -> MotionInput
     parts = [map(torch.cat, zip(*spans)) for spans in shots]
     return MotionInputs(*(
         torch.stack([part[[*range(len(part)), *[-1] * (frames - len(part))]] for part in group], dim=axis)
-        for group, axis in zip(zip(*parts), (1, 1, -1, -1, 1))
+        for group, axis in zip(zip(*parts), (1, 1, -1, -1, -1, 1))
     ))  # fmt: skip
 
 
@@ -64,18 +67,17 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     skeleton, parameter = model.scene.character.skeleton, next(model.parameters())
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, model.joints, world)
-    origins = world[:, 0, :3, 3].copy()
-    world[..., :3, 3] -= origins[:, None]
+    body = BodyFrames.of(world, skeleton, parameter)
 
     def tensor(values: np.ndarray) -> Tensor:
         return torch.as_tensor(values).to(parameter)
 
     gravity = gravity_features(tensor(features.down), tensor(np.array(DOWN)).expand(motion.frame_count, 3))
     static = torch.cat([tensor(features.static), gravity], dim=1)
-    matrices = tensor(skinning_matrices(world, skeleton.bind_transforms)[:, :, :3])
     pose = torch.cat([static, tensor(features.dynamic)], dim=1)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
-    return model.initial(static), pose, matrices, torch.as_tensor(origins).to(parameter.device), begins
+    origins = torch.as_tensor(world[:, 0, :3, 3].copy()).to(parameter.device)
+    return model.initial(static), pose, body.matrices[..., 0], body.bend[..., 0], origins, begins
 
 
 class BatchPlayer:
@@ -90,7 +92,10 @@ class BatchPlayer:
     def __init__(self, model: GarmentModel, like: MotionInputs, *, vertices: bool = True) -> None:
         self.model, self.vertices = model, vertices
         self.rest, self.pose, self.character = like.rest[0].clone(), like.pose[0].clone(), like.character[0].clone()
+        self.bend = like.bend[0].clone()
         self.before, self.now = self.rest.clone(), self.rest.clone()
+        with torch.no_grad():  # of the last two frames
+            self.past = [model.decoded(self.rest, self.character) for _ in range(2)] if model.feedback.count else []
         self.begins = torch.ones_like(like.begins[0])
         self.network = torch.compile(self._network, dynamic=False) if self.rest.is_cuda else self._network
         self.advance = self._capture_graph() if self.rest.is_cuda else self._advance
@@ -106,19 +111,28 @@ class BatchPlayer:
     @torch.no_grad()
     def step(self, shots: MotionInputs, frame: int) -> Tensor:
         """Return the result of `play` for a frame; frames must be requested in order."""
-        for name in ("rest", "pose", "character", "begins"):
+        for name in ("rest", "pose", "character", "bend", "begins"):
             getattr(self, name).copy_(getattr(shots, name)[frame])
         return self.advance()
 
-    def _network(self) -> tuple[Tensor, Tensor]:
-        z = self.model.step(self.before, self.now, self.rest, self.pose)
+    def _network(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        model, past = self.model, self.past
+        seen = model.seen((past[0], past[1]) if past else None, BodyFrames(self.character[None], self.bend[None]))
+        z = model.step(self.before, self.now, self.rest, self.pose, seen)
         z = torch.where(self.begins, self.rest, z)
-        return z, self.model.output(z)
+        output = model.output(z)
+        points = model.feedback.decoded(model.decoder, output, self.character).points if past else None
+        return z, output, points
 
     def _advance(self) -> Tensor:
-        z, output = self.network()
+        z, output, points = self.network()
         self.before.copy_(self.now)
         self.now.copy_(z)
+        if points is not None:
+            self.past[0].output.copy_(self.past[1].output)
+            self.past[0].points.copy_(self.past[1].points)
+            self.past[1].output.copy_(output)
+            self.past[1].points.copy_(points)
         return self.model.decoder.vertices(output, self.character) if self.vertices else output
 
     @torch.no_grad()

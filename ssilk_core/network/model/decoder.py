@@ -118,10 +118,11 @@ class Decoder(nn.Module):
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + C P) into activations (K, N) in [-1, 1] and transforms (P, 3, 4, N)."""
-        activation, values = self._split(output)
+        activation, values = self.split(output)
         return activation, transform_of(values)
 
-    def _split(self, output: Tensor) -> tuple[Tensor, Tensor]:
+    def split(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """Split network output (N, K + C P) into activations (K, N) and values of `transform_of` (P, C, N)."""
         delta = output[:, self.activation_count :].T.reshape(self.proxy_count, self.proxy_outputs, output.shape[0])
         activation = torch.tanh(output[:, : self.activation_count].T)
         values = self.identity + self.scale * delta
@@ -136,6 +137,11 @@ class Decoder(nn.Module):
     def skin_weights(self) -> Tensor:
         """Return the weights as a matrix (V, used joints)."""
         return self.skin.dense(self._influence_weights())
+
+    def free_rest(self) -> Tensor:
+        """Return the shape in the middle of the blendshapes' range, of vertices that are not pinned (V', 3) [m]."""
+        rest = self.rest[self.free]
+        return rest + self.offset if self.is_reduced else rest
 
     def proxy_matrices(self, transforms: Tensor, character: Tensor) -> Tensor:
         """Forward kinematics: skinning matrices of all joints, (J + P, 3, 4, N).
@@ -152,7 +158,7 @@ class Decoder(nn.Module):
             matrices.append(compose(matrices[parent], turn))
         return torch.stack(matrices)
 
-    def _matrices(self, values: Tensor, character: Tensor) -> Tensor:
+    def matrices(self, values: Tensor, character: Tensor) -> Tensor:
         """Return skinning matrices of all joints (J + P, 3, 4, N) from the values (P, C, N) of `transform_of`."""
         if kernels.available(character.device):
             from ...physics.kernels.proxies import proxies_kernel
@@ -174,8 +180,8 @@ class Decoder(nn.Module):
 
     def vertices(self, output: Tensor, character: Tensor) -> Tensor:
         """Return vertices (V, 3, N) [m] from network output (N, K + C P) and character (J, 3, 4, N)."""
-        activation, values = self._split(output)
-        return self._skinned(activation, self._matrices(values, character))
+        activation, values = self.split(output)
+        return self._skinned(activation, self.matrices(values, character))
 
     def forward(self, activation: Tensor, transforms: Tensor, character: Tensor) -> Tensor:
         """Return vertices (V, 3, N) [m] from activations (K, N), transforms (P, 3, 4, N), character (J, 3, 4, N)."""

@@ -14,10 +14,12 @@ from torch import Tensor, nn
 
 from ...files import replacing
 from ..parameters import descriptor_sizes
+from .feedback import BodyFrames, DecodedState
 from .network import GarmentModel
 
 OPSET = 18
 INPUTS = ("before", "now", "static", "rates", "begins")
+BODY_INPUTS = ("matrices", "bend")  # where S sees the cloth
 OUTPUTS = ("state", "weights", "rotations", "translations")  # the last only where proxies move
 
 
@@ -38,22 +40,57 @@ class FrameNetwork(nn.Module):
         ):
             self.register_buffer(name, torch.tensor(values).float())
 
+    @property
+    def state_size(self) -> int:
+        """Numbers in a state: latents, and where S sees the cloth the outputs of D and the points that it sees."""
+        model = self.model
+        return model.config.latent + (model.decoder.output_count + 3 * model.feedback.count) * (
+            model.feedback.count > 0
+        )
+
+    def _decoded(self, state: Tensor) -> DecodedState:
+        """Return what S looks back on, from a state of this graph (N, state)."""
+        latent, outputs = self.model.config.latent, self.model.decoder.output_count
+        _, output, points = state.tensor_split([latent, latent + outputs], dim=1)
+        return DecodedState(output, points.T.reshape(self.model.feedback.count, 3, state.shape[0]))
+
+    def _step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, body: BodyFrames | None) -> Tensor:
+        model, latent = self.model, self.model.config.latent
+        seen = rest[:, :0] if body is None else model.seen((self._decoded(before), self._decoded(now)), body)
+        return model.step(before[:, :latent], now[:, :latent], rest, pose, seen)
+
     def forward(
-        self, before: Tensor, now: Tensor, static: Tensor, rates: Tensor, begins: Tensor
+        self,
+        before: Tensor,
+        now: Tensor,
+        static: Tensor,
+        rates: Tensor,
+        begins: Tensor,
+        matrices: Tensor | None = None,
+        bend: Tensor | None = None,
     ) -> tuple[Tensor, ...]:
-        """Return the new latents (N, latent), shape weights (N, K + 1) and local proxy rotations (N, P, 3, 3).
+        """Return the new state (N, state), shape weights (N, K + 1) and local proxy rotations (N, P, 3, 3).
 
         Where proxies move, return their local translations [m], too (N, P, 3).
 
         Args:
-            before, now: the two latents before this frame, (N, latent).
+            before, now: the two states before this frame, (N, state).
             static: static descriptors, gravity in each joint's frame included (N, S); rates: dynamic ones (N, R).
             begins: whether the garment is at rest in this frame, as in the first two frames of a shot (N, 1), bool.
+            matrices: skinning matrices of the character's joints about the root (N, J, 3, 4), where S sees the cloth.
+            bend: likewise the second difference of the root's position, r_t - 2 r_{t-1} + r_{t-2} (N, 3) [m].
         """
-        model = self.model
+        model, body = self.model, None
+        if matrices is not None and bend is not None:
+            body = BodyFrames(matrices.permute(1, 2, 3, 0)[None], bend.T[None])
         rest = model.initial(static)
-        z = torch.where(begins, rest, model.step(before, now, rest, torch.cat([static, rates], dim=1)))
-        activation, transforms = model.pose(z)
+        z = torch.where(begins, rest, self._step(before, now, rest, torch.cat([static, rates], dim=1), body))
+        output = model.output(z)
+        activation, transforms = model.decoder.activations(output)
+        state = z
+        if body is not None:
+            points = model.feedback.decoded(model.decoder, output, body.matrices[0]).points
+            state = torch.cat([z, output, points.flatten(0, 1).T], dim=1)
         weights = (activation.T + 1) / 2
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
@@ -61,22 +98,26 @@ class FrameNetwork(nn.Module):
         by_frame = transforms.permute(3, 0, 1, 2) if len(self.bind_rotations) else z.new_zeros(z.shape[0], 0, 3, 4)
         local = self.to_parent @ by_frame[..., :3] @ self.bind_rotations
         if not model.config.translations:
-            return z, weights.clamp(0, 1), local
-        return z, weights.clamp(0, 1), local, self.places + (self.to_parent @ by_frame[..., 3:])[..., 0]
+            return state, weights.clamp(0, 1), local
+        return state, weights.clamp(0, 1), local, self.places + (self.to_parent @ by_frame[..., 3:])[..., 0]
 
 
 def export_onnx(model: GarmentModel, path: str | Path) -> None:
     """Write the network as ONNX, atomically; the first dimension is a batch of any size."""
     network, config = FrameNetwork(model).eval(), model.config
     static, rates = descriptor_sizes(model.scene, model.joints)
-    sizes = (config.latent, config.latent, static, rates)
-    frame = (*(torch.zeros(3, size) for size in sizes), torch.zeros(3, 1, dtype=torch.bool))
+    sizes = (network.state_size, network.state_size, static, rates)
+    frame = (*(torch.zeros(5, size) for size in sizes), torch.zeros(5, 1, dtype=torch.bool))
+    inputs: tuple[str, ...] = INPUTS
+    if model.feedback.count:
+        joints = model.scene.character.skeleton.joint_count
+        frame, inputs = (*frame, torch.zeros(5, joints, 3, 4), torch.zeros(5, 3)), INPUTS + BODY_INPUTS
     characters = torch.export.Dim("characters", min=1)
-    shapes = {name: {0: characters} for name in INPUTS}
+    shapes = {name: {0: characters} for name in inputs}
     outputs = OUTPUTS if config.translations else OUTPUTS[:-1]
     with replacing(path) as temporary, _quietly():
         program = torch.onnx.export(
-            network, frame, dynamo=True, input_names=INPUTS, output_names=outputs, dynamic_shapes=shapes,
+            network, frame, dynamo=True, input_names=inputs, output_names=outputs, dynamic_shapes=shapes,
             opset_version=OPSET, verbose=False,
         )  # fmt: skip
         assert program is not None  # only the older exporter returns None

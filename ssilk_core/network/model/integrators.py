@@ -66,31 +66,52 @@ class Integrator(nn.Module, ABC):
         super().__init__()
         self.config, self.rates, self.scheme = config, rates, SCHEMES[config.scheme]
 
-    def forward(self, stepper: nn.Module, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
+    def forward(
+        self,
+        stepper: nn.Module,
+        before: Tensor,
+        now: Tensor,
+        rest: Tensor,
+        pose: Tensor,
+        seen: Tensor | None = None,
+    ) -> Tensor:
         """Return z_t, shape (batch, latent).
 
         Args:
-            stepper: the network S, from (batch, states * latent + pose) to (batch, latent).
+            stepper: the network S, from (batch, states * latent + pose + seen) to (batch, latent).
             before, now: z_{t-2} and z_{t-1}.
             rest: the quasi-static state P(theta_t) of the pose at t.
             pose: dynamic descriptor at t.
+            seen: what S sees of the cloth before t (`network.feedback`); None where it sees none.
         """
-        return self.step(stepper, before, now, self.precompute(stepper, rest, pose))
+        seen = now[:, :0] if seen is None else seen
+        return self.step(stepper, before, now, self.precompute(stepper, rest, pose, seen.shape[1]), seen)
 
-    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
-        """Return the inputs of `step` that depend on no state, for any number of frames at once."""
+    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor, features: int) -> tuple[Tensor, ...]:
+        """Return the inputs of `step` that depend on no state, for any number of frames at once.
+
+        Args:
+            features: number of those that S sees of the cloth.
+        """
         return rest, pose
 
-    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
-        """Return z_t, shape (batch, latent), from the two states before it and the `precompute`d values."""
-        return self.bound(self.advance(stepper, before, now, *precomputed))
+    def step(
+        self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor], seen: Tensor
+    ) -> Tensor:
+        """Return z_t, shape (batch, latent), from the two states before it, `precompute`d values and the cloth."""
+        return self.clamp(self.advance(stepper, before, now, seen, *precomputed))
 
-    def bound(self, z: Tensor) -> Tensor:
-        """Clamp states to `config.latent_bound`."""
-        return soft_clamp(z, self.config.latent_bound)
+    def bound(self, rest: Tensor) -> Tensor:
+        """Bound quasi-static states smoothly, so that P always has a gradient."""
+        return soft_clamp(rest, self.config.latent_bound)
+
+    def clamp(self, z: Tensor) -> Tensor:
+        """Clamp states to `config.latent_bound`; a quasi-static one stays as it is, and so remains at rest."""
+        bound = self.config.latent_bound
+        return z.clamp(-bound, bound) if bound else z
 
     @abstractmethod
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
         """Return z_t before it is clamped, shape (batch, latent)."""
 
 
@@ -109,10 +130,10 @@ class SpringVerlet(Integrator):
     p is the only equilibrium, whatever S has learned, because S gives at most half of what the spring gives, and
     more only while something moves, with a = `config.velocity_allowance`:
 
-        |u| <= |f| / 2 + a |v| + |rates of the pose| / 20
+        |u| <= |f| / 2 + a |v| + (|rates of the pose| + |what S sees of the cloth|) / 20
 
     So nothing rests elsewhere. A swing is not bounded by this: S may add energy while something moves, as learned.
-    Motion seldom reaches this limit. Eq. 2's alpha is one: a larger one would undo the spring.
+    Eq. 2's alpha is one: a larger one would undo the spring.
 
     S sees velocities and distances, scaled to order one. Given as states side by side they would be small
     differences of large inputs, which networks learn last. s is `OUTPUT_SCALE`.
@@ -128,21 +149,25 @@ class SpringVerlet(Integrator):
         self.beta = nn.Parameter(torch.full((config.latent,), 0.7))
         self.share = nn.Parameter(torch.logit(start / config.stiffness))
 
-    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor) -> tuple[Tensor, ...]:
+    def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor, features: int) -> tuple[Tensor, ...]:
         """Return the quasi-static state, the pose, the output of S at rest there, and |rates| / 20."""
         static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
-        zero = torch.zeros_like(rest)
-        at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates))
+        zero, unseen = torch.zeros_like(rest), rest.new_zeros(len(rest), features)
+        at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates), unseen)
         return rest, pose, at_rest, RATE_ALLOWANCE * length(rates)
 
-    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
+    def step(
+        self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor], seen: Tensor
+    ) -> Tensor:
         if torch.is_grad_enabled() or torch.compiler.is_compiling() or not kernels.supports(now):
-            return super().step(stepper, before, now, precomputed)
+            return super().step(stepper, before, now, precomputed, seen)
         from ...physics.kernels.spring import next_state_kernel, stepper_input_kernel
 
         rest, pose, at_rest, rate_allowance = precomputed
         scales = VELOCITY_SCALE, DISTANCE_SCALE
-        output = stepper(stepper_input_kernel(before, now, rest, pose, self.beta, scales))
+        inputs = torch.cat([pose, seen], dim=1)
+        output = stepper(stepper_input_kernel(before, now, rest, inputs, self.beta, scales))
+        rate_allowance = rate_allowance + RATE_ALLOWANCE * length(seen)
         limits = (
             self.config.stiffness,
             MAX_OUTPUT,
@@ -155,15 +180,16 @@ class SpringVerlet(Integrator):
         outputs, springs = (output, at_rest), (self.beta, self.share)
         return next_state_kernel((before, now), rest, outputs, rate_allowance, springs, limits)
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
         rest, pose, at_rest, rate_allowance = precomputed
         velocity = now - before
         forward = now + self.beta * velocity
         away = rest - forward
-        output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose)
+        output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose, seen)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
         allowance = SPRING_ALLOWANCE * length(spring) + self.config.velocity_allowance * length(velocity)
-        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance + rate_allowance)
+        allowance = allowance + rate_allowance + RATE_ALLOWANCE * length(seen)
+        learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance)
         return forward + soft_clamp(spring + learned, self.config.max_latent_step)
 
     def _evaluate(self, stepper: nn.Module, *inputs: Tensor) -> Tensor:
@@ -173,11 +199,8 @@ class SpringVerlet(Integrator):
 class QuasiStatic(Integrator):
     """z_t = P(theta_t), with no stepper and no earlier states, for garments without loose vertices."""
 
-    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, *precomputed: Tensor) -> Tensor:
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
         return precomputed[0]
-
-    def step(self, stepper: nn.Module, before: Tensor, now: Tensor, precomputed: Sequence[Tensor]) -> Tensor:
-        return self.advance(stepper, before, now, *precomputed)  # `rest` is already clamped
 
 
 def integrator(config: ModelConfig, rates: int = 0) -> Integrator:

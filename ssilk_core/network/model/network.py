@@ -15,6 +15,7 @@ from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
 from ..settings import ModelConfig
 from .decoder import Decoder
+from .feedback import BodyFrames, DecodedState, Feedback
 from .integrators import integrator
 
 
@@ -57,9 +58,11 @@ class GarmentModel(nn.Module):
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
-        scheme = self.integrator.scheme
-        seen = scheme.states * z + static + dynamic
-        self.stepper = mlp(seen, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
+        scheme, self.feedback = self.integrator.scheme, Feedback(scene, config, self.decoder)
+        inputs = scheme.states * z + static + dynamic + 3 * self.feedback.count
+        self.stepper = (
+            mlp(inputs, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
+        )
         # Small: training starts as linear blend skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
 
@@ -67,22 +70,49 @@ class GarmentModel(nn.Module):
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
         return self.integrator.bound(self.initialiser(static))
 
-    def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor) -> Tensor:
-        """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor."""
-        return self.integrator(self.stepper, before, now, rest, pose)
+    def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
+        """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor.
 
-    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor) -> list[Tensor]:
+        Args:
+            seen: what S sees of the cloth, as `seen` returns it.
+        """
+        return self.integrator(self.stepper, before, now, rest, pose, seen)
+
+    def decoded(self, z: Tensor, matrices: Tensor) -> DecodedState:
+        """Return latents (N, latent) as the feedback looks back on them, under a character (J, 3, 4, N)."""
+        return self.feedback.decoded(self.decoder, self.output(z), matrices)
+
+    def seen(self, past: tuple[DecodedState, DecodedState] | None, body: BodyFrames) -> Tensor:
+        """Return what S sees of the cloth in the frame of `body` (N, 3 M), from the two states before it."""
+        if past is None:
+            return body.bend.new_zeros(body.bend.shape[-1], 0)
+        return self.feedback.seen(self.decoder, past, body)
+
+    def seen_from(self, before: Tensor, now: Tensor, body: BodyFrames) -> Tensor:
+        """Return what S sees in the last of three frames of `body`, from the latents of the first two."""
+        if not self.feedback.count:
+            return self.seen(None, body[2:])
+        return self.seen((self.decoded(before, body.matrices[0]), self.decoded(now, body.matrices[1])), body[2:])
+
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames) -> list[Tensor]:
         """Return `states`, each (batch, latent), followed by those of the next frames.
 
         Args:
             states: at least the two before the first of these frames.
             rest: quasi-static latents of the frames, shape (F, batch, latent).
             pose: their dynamic descriptors, shape (F, batch, D).
+            body: the character in the two frames before and in these, F + 2.
         """
-        states = list(states)
-        precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1))
-        for frame in zip(*(values.unflatten(0, rest.shape[:2]) for values in precomputed)):
-            states.append(self.integrator.step(self.stepper, states[-2], states[-1], frame))
+        states, past = list(states), None
+        features = 3 * self.feedback.count
+        precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1), features)
+        if features and len(rest):
+            past = self.decoded(states[-2], body.matrices[0]), self.decoded(states[-1], body.matrices[1])
+        for frame, given in enumerate(zip(*(values.unflatten(0, rest.shape[:2]) for values in precomputed)), 2):
+            seen = self.seen(past, body[frame : frame + 1])
+            states.append(self.integrator.step(self.stepper, states[-2], states[-1], given, seen))
+            if past:
+                past = past[1], self.decoded(states[-1], body.matrices[frame])
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from ...scene.assets import Floats, Motion, Skeleton
 from ...scene.kinematics import motion_transforms, skinning_matrices
 from ..descriptors import pose_features
+from ..feedback import bends
+
+HISTORY = 2  # frames before others that their descriptors, and what S sees of the cloth, look back on
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,26 +23,43 @@ class CharacterFrames:
     Attributes:
         static: static descriptors, gravity included, shape (F, S), float32.
         rates: dynamic part of the descriptors, zero while the character holds still, shape (F, R), float32.
-        matrices: skinning matrices relative to the root, shape (J, 3, 4, F), float32.
-        origins: positions of the root [m], shape (F, 3).
+        all_matrices: skinning matrices relative to the root, of the two frames before and these, shape
+            (J, 3, 4, F + 2), float32; the first frame stands for those before a motion.
+        all_origins: positions of the root in these [m], shape (F + 2, 3).
     """
 
     static: NDArray
     rates: NDArray
-    matrices: NDArray
-    origins: Floats
+    all_matrices: NDArray
+    all_origins: Floats
+
+    @property
+    def matrices(self) -> NDArray:
+        """Skinning matrices relative to the root in the F frames, shape (J, 3, 4, F)."""
+        return self.all_matrices[..., HISTORY:]
+
+    @property
+    def origins(self) -> Floats:
+        """Positions of the root in the F frames [m], shape (F, 3)."""
+        return self.all_origins[HISTORY:]
+
+    @property
+    def bend(self) -> Floats:
+        """Second differences of the root's position in the F frames [m], shape (F, 3)."""
+        return bends(self.all_origins)[HISTORY:]
 
 
 def character_frames(motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0) -> CharacterFrames:
     """Return descriptors and skinning matrices of a motion at the model's rate, with gravity along -y.
 
-    The first `lookback` frames only serve the finite differences of the descriptors and are left out.
+    The first `lookback` frames, at most two, only serve what looks back, and are none of the F frames.
     """
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, joints, world)
     down = -features.down[..., 1].reshape(motion.frame_count, -1)
     static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
-    matrices, origins = _about_root(world[lookback:], skeleton)
+    missing = HISTORY - lookback
+    matrices, origins = _about_root(world[np.maximum(np.arange(-missing, len(world)), 0)], skeleton)
     return CharacterFrames(static[lookback:], features.dynamic[lookback:].astype(np.float32), matrices, origins)
 
 

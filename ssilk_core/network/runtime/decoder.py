@@ -35,8 +35,11 @@ class NumpyDecoder:
 
     def decode(self, z: NDArray) -> tuple[NDArray, NDArray]:
         """Return activations (K, F) in [-1, 1] and transforms (P, 3, 4, F) of latents (F, latent)."""
-        output = evaluate(self.layers, z.T)
-        delta = output[self.activation_count :].reshape(self.proxies, len(self.scale), len(z))
+        return self.pose_of(evaluate(self.layers, z.T))
+
+    def pose_of(self, output: NDArray) -> tuple[NDArray, NDArray]:
+        """Return activations and transforms of outputs of the decoder's network (outputs, F)."""
+        delta = output[self.activation_count :].reshape(self.proxies, len(self.scale), output.shape[1])
         activations = np.tanh(output[: self.activation_count])
         if self.readout is not None:
             activations = self.readout @ activations

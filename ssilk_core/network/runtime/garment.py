@@ -12,6 +12,7 @@ from ..checkpoint import ModelFile
 from ..parameters import descriptor_sizes
 from .decoder import NumpyDecoder
 from .deformer import deformer
+from .feedback import ClothPoints
 from .kinematics import ProxyKinematics
 from .networks import evaluate, layers
 from .skinning import tiles
@@ -35,13 +36,14 @@ class NumpyGarment:
                 "play it in PyTorch with ssilk_core.network.rollout, or train with one of these",
             )
         self.file, self.skeleton = file, scene.character.skeleton
-        static, _ = descriptor_sizes(scene, file.joints)
         self.initialiser = layers(file.parameters, "initialiser")
-        steps = config.scheme == "spring_verlet"
-        self.stepper = SpringStepper(config, file.parameters, static) if steps else None
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
+        self.stepper = None
+        if config.scheme == "spring_verlet":
+            points = ClothPoints(file, self.decoder, self.kinematics)
+            self.stepper = SpringStepper(config, file.parameters, *descriptor_sizes(scene, file.joints), points)
 
     def deformer(self) -> Deformer:
         """Return the trained garment's skin and shapes, as files and host applications hold them."""

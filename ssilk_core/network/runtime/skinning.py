@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.assets import PINNED, Floats, Scene
+from ...scene.assets import PINNED, Floats, Ints, Scene
 from .networks import Parameters
 
 TILE = 512  # vertices
@@ -93,6 +93,14 @@ def trained_weights(scene: Scene, parameters: Parameters) -> NDArray:
     factor[scene.classes != PINNED] = np.exp(offset - offset.max(axis=1, keepdims=True))
     weights = scene.rig.skin.weights * factor
     return weights / weights.sum(axis=1, keepdims=True)
+
+
+def weights_of_joints(scene: Scene, parameters: Parameters, rows: Ints) -> NDArray:
+    """Return the skinning weights of some vertices as a matrix over all joints (M, J + P)."""
+    dense = np.zeros((len(rows), len(scene.joint_names)))
+    indices = scene.rig.skin.indices[rows]
+    np.add.at(dense, (np.arange(len(rows))[:, None], indices), trained_weights(scene, parameters)[rows])
+    return dense
 
 
 def _tile(vertices: slice, shapes: NDArray, indices: NDArray, weights: NDArray) -> Tile:

@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from ...scene.assets import GarmentPose, Motion
 from ...scene.kinematics import run_up
-from .character import CharacterFrames, character_frames
+from .character import HISTORY, CharacterFrames, character_frames
 from .garment import NumpyGarment
-
-HISTORY = 2  # frames before a block that its descriptors look back on
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +83,7 @@ class RolledSpan:
         latents = player.quasi_static(character.static)
         if player.stepper:
             past = self.latents[done - 2 : done] if done else None
-            latents = player.stepper.roll(player.stepper.prepare(latents, character.static, character.rates, past))
+            latents = player.stepper.roll(player.stepper.prepare(latents, character, past))
         self.rolled = done + len(character.static)
         self.latents[done : self.rolled] = latents
 

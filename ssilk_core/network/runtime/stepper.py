@@ -4,9 +4,9 @@
 With p the quasi-static state, w = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in w and v
 plus a part that the pose alone decides, as it decides all of what S gives to a garment at rest:
 
-    z_t = p + f + soft_clamp(u - k f),    f = w + beta v,    u = s (S(w, v, pose) - S(0, 0, pose held still))
+    z_t = p + f + soft_clamp(u - k f),    f = w + beta v,    u = s (S(w, v, pose, m) - S(0, 0, pose held still, 0))
 
-with the norm of u clipped: |u| <= (|k f| + |v|) / 2 + |rates of the pose| / 20.
+with m what S sees of the cloth, and the norm of u clipped as there.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ from ..settings import (
     VELOCITY_SCALE,
     ModelConfig,
 )
-from .networks import Layer, Parameters, as_float32, evaluate_tail, layers
+from .character import CharacterFrames
+from .feedback import BodyCourse, ClothPoints, SeenCloth
+from .networks import Layer, LayerBuffers, Parameters, as_float32, evaluate_tail, layers
 
 MAX_SCALED_OUTPUT = OUTPUT_SCALE * MAX_OUTPUT
 SAFE_SQUARED_NORM = MAX_SCALED_OUTPUT**2  # a vector with a smaller one has no entry that needs clamping
@@ -62,30 +64,6 @@ class SoftClamp:
         np.add(inner, over, values)
 
 
-class LayerBuffers:
-    """A hidden layer for single frames, with preallocated buffers.
-
-    Args:
-        rows: weights (inputs, hidden); a last row of biases where these are not added otherwise.
-    """
-
-    def __init__(self, rows: NDArray) -> None:
-        self.rows, hidden = rows, rows.shape[1]
-        # Separate arrays: numpy treats neighbours in memory as overlapping, which makes its exponential 20 times
-        # slower.
-        self.active, self.scale = np.ones(hidden + 1, np.float32), np.empty(hidden, np.float32)
-        self.sums = self.active[:-1]  # the last entry stays 1 and multiplies the next layer's biases
-        self.one = np.ones_like(self.scale)  # adding an array of 512 is faster in numpy than adding a scalar
-
-    def activate(self) -> NDArray:
-        """Turn the sums into activations in place; return these, followed by a one."""
-        sums, scale = self.sums, self.scale
-        np.exp(sums, scale)
-        np.add(scale, self.one, scale)
-        np.divide(sums, scale, sums)
-        return self.active
-
-
 @dataclass(frozen=True, eq=False)
 class StepperInputs:
     """Inputs of the stepper for F frames.
@@ -95,6 +73,7 @@ class StepperInputs:
         pose_sums: contribution of the pose to the sums of S's first layer, shape (F, hidden).
         output_at_rest: s S(0, 0, pose held still), shape (F, latent).
         rate_allowance: limit of |u| due to the pose's rates, shape (F,).
+        course: the character as the points that S sees have it; None where it sees none.
         first: first frame that the stepper computes; the garment is at rest in earlier ones.
     """
 
@@ -102,6 +81,7 @@ class StepperInputs:
     pose_sums: NDArray
     output_at_rest: NDArray
     rate_allowance: NDArray
+    course: BodyCourse | None
     first: int
 
 
@@ -110,29 +90,35 @@ class SpringStepper:
 
     Args:
         config: sizes and bounds; parameters: of the whole network.
-        static: size of the static part of a dynamic descriptor.
+        static, rates: sizes of the parts of a dynamic descriptor.
+        points: of the cloth that S sees.
     """
 
-    def __init__(self, config: ModelConfig, parameters: Parameters, static: int) -> None:
+    def __init__(
+        self, config: ModelConfig, parameters: Parameters, static: int, rates: int, points: ClothPoints
+    ) -> None:
+        self.points = points
         beta, share = (parameters[f"integrator.{name}"] for name in ("beta", "share"))
         first, *hidden, last = layers(parameters, "stepper")
-        blocks = np.cumsum([config.latent] * 3 + [static])
-        of_now, of_speed, of_away, of_static, self.of_rates = np.split(first.weights, blocks, axis=1)
+        blocks = np.cumsum([config.latent] * 3 + [static, rates])
+        of_now, of_speed, of_away, of_static, self.of_rates, of_seen = np.split(first.weights, blocks, axis=1)
         speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
         self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
-        self.first = as_float32(np.hstack([of_now - away, speed - away * beta]).T)
+        self.first = as_float32(np.hstack([of_now - away, speed - away * beta, of_seen]).T)
         self.later = [*hidden, Layer(as_float32(OUTPUT_SCALE * last.rows))]
         self.beta = beta.astype(np.float32)
         self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
         self.config = config
 
-    def prepare(self, rest: NDArray, static: NDArray, rates: NDArray, before: NDArray | None) -> StepperInputs:
+    def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> StepperInputs:
         """Return the inputs of F frames.
 
         Args:
-            rest: quasi-static latents (F, latent); static, rates: descriptors (F, S) and (F, R).
+            rest: quasi-static latents (F, latent); character: in these frames.
             before: the two latents before the first frame (2, latent); None at the start of a motion, at rest.
         """
+        static, rates = character.static, character.rates
+        course = self.points.course(character.all_matrices, character.bend) if self.points.count else None
         still = self.of_still @ np.hstack([rest, static]).T + self.bias
         pose_sums = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
         output = evaluate_tail(self.later, still).T
@@ -142,9 +128,9 @@ class SpringStepper:
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, 2)
+            return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, course, 2)
         history[:2, 1] = before
-        return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, 0)
+        return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, course, 0)
 
     def roll(self, inputs: StepperInputs) -> NDArray:
         """Return the latents of all frames (F, latent), written into `inputs`."""
@@ -162,19 +148,21 @@ class SpringStepper:
     def _advance(self, inputs: StepperInputs, start: int) -> None:
         z, of_velocity, history = self.config.latent, self.config.velocity_allowance, inputs.history[start:]
         buffers = [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
-        differences = np.empty((2, z), np.float32)
+        state = np.zeros(len(self.first), np.float32)
+        differences, seen = state[: 2 * z].reshape(2, z), state[2 * z :]
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
-        state, (away, velocity) = differences.reshape(-1), differences
+        away, velocity = differences
         sums, last = buffers[0].sums, self.later[-1].rows
-        clamp_step, clamp_state = (
-            SoftClamp(self.config.max_latent_step, (z,)),
-            SoftClamp(self.config.latent_bound, (z,)),
-        )
+        clamp_step, clamp = SoftClamp(self.config.max_latent_step, (z,)), self.config.latent_bound or np.inf
         poses = inputs.pose_sums[start:], inputs.output_at_rest[start:], inputs.rate_allowance[start:].tolist()
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
         with np.errstate(over="ignore", invalid="ignore"):  # `roll` handles diverged states
+            cloth = inputs.course and SeenCloth(self.points, inputs.course, start, history[:2, 1], seen)
             for past, rest, now, new, pose_sum, at_rest, rate_limit in frames:
                 np.subtract(now, past, differences)
+                if cloth:
+                    cloth.look()
+                    rate_limit += RATE_ALLOWANCE * sqrt(seen.dot(seen))
                 np.dot(state, self.first, sums)
                 np.add(sums, pose_sum, sums)
                 hidden = buffers[0].activate()
@@ -198,4 +186,6 @@ class SpringStepper:
                 clamp_step(own)
                 np.add(own, along, own)
                 np.add(own, rest, new)
-                clamp_state(new)
+                np.clip(new, -clamp, clamp, new)
+                if cloth:
+                    cloth.keep(new)

@@ -92,7 +92,7 @@ def _next_state(before, now, rest, output, output_at_rest, rate_allowance, beta,
     longest = allowed / tl.where(size < 1e-12, 1e-12, size)
     added *= tl.where(longest > 1, 1.0, longest)  # unlike a maximum and a minimum these propagate NaN
     tl.store(
-        state + row * latent + at, _soft_clamp(forward + _soft_clamp(spring + added, max_step), bound), mask=here
+        state + row * latent + at, _hard_clamp(forward + _soft_clamp(spring + added, max_step), bound), mask=here
     )
 
 
@@ -111,6 +111,12 @@ def _clamped(values, bound):
     """Clamp values to a bound; NaN stays NaN."""
     values = tl.where(values > bound, bound, values)
     return tl.where(values < -bound, -bound, values)
+
+
+@triton.jit
+def _hard_clamp(values, bound):
+    """Clamp values to a bound; zero is none."""
+    return tl.where(bound > 0, _clamped(values, bound), values)
 
 
 @triton.jit

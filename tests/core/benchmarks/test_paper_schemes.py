@@ -108,23 +108,26 @@ def test_training_starts_from_verlet_without_a_stepper(scene, toy_model):
     with torch.no_grad():
         for value in (model.stepper[-1].weight, model.stepper[-1].bias):
             value.zero_()  # as a fresh model's
-        pose = torch.randn(6, model.stepper[0].in_features - 16)
-        stepped = model.step(before, now, now, pose)
+        seen = torch.randn(6, 3 * model.feedback.count)
+        pose = torch.randn(6, model.stepper[0].in_features - 16 - seen.shape[1])
+        stepped = model.step(before, now, now, pose, seen)
         expected = model.integrator.alpha * now + model.integrator.beta * (now - before)
     np.testing.assert_allclose(stepped, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("scheme", PAPER_SCHEMES)
-def test_networks_roll_as_they_step_and_have_the_parameters_of_their_sizes(scene, toy_model, scheme):
+def test_networks_roll_as_they_step_and_have_the_parameters_of_their_sizes(scene, toy_model, toy_body, scheme):
     model = toy_model(scene, scheme=scheme)
     found = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     assert parameter_shapes(scene, model.config, model.joints) == found
     pose = torch.randn(6, 3, sum(descriptor_sizes(scene, model.joints)), generator=torch.Generator().manual_seed(1))
     rest = model.initial(pose[..., : model.initialiser[0].in_features].flatten(0, 1)).unflatten(0, (6, 3))
     states = [rest[0], rest[0] + 0.1]
-    rolled = model.roll(states, rest, pose)
-    for still, seen in zip(rest, pose):
-        states.append(model.step(states[-2], states[-1], still, seen))
+    body = toy_body(scene, 8, 3)
+    rolled = model.roll(states, rest, pose, body)
+    for frame, (still, seen) in enumerate(zip(rest, pose)):
+        cloth = model.seen_from(states[-2], states[-1], body[frame : frame + 3])
+        states.append(model.step(states[-2], states[-1], still, seen, cloth))
     torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
 
 

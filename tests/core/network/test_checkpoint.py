@@ -137,7 +137,8 @@ def test_a_packed_model_is_what_it_was_to_16_bits(path, model, tmp_path):
             np.testing.assert_array_equal(found, mine)
         else:
             largest = np.abs(mine).max(axis=tuple(range(1, mine.ndim)), keepdims=True)
-            assert (np.abs(found - mine) <= 0.501 * largest / MAX_INTEGER + 1e-30).all(), name
+            # Half a step, and what single precision loses of a quotient of up to 32,767.
+            assert (np.abs(found - mine) <= 0.505 * largest / MAX_INTEGER + 1e-30).all(), name
     for mine, found in ((model.scene.lbs_skin, read.scene.lbs_skin), (model.scene.rig.skin, read.scene.rig.skin)):
         np.testing.assert_array_equal(found.indices, mine.indices)
         np.testing.assert_allclose(found.weights, mine.weights, rtol=0, atol=1e-7)

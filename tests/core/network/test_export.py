@@ -49,7 +49,8 @@ def exported(model, tmp_path_factory):
 def played(session, model, shots) -> list[np.ndarray]:
     """Play all shots at once; return weights (F, N, K + 1), rotations (F, N, P, 3, 3), translations (F, N, P, 3)."""
     static = descriptor_sizes(model.scene, model.joints)[0]
-    before = now = np.zeros((shots.pose.shape[1], model.config.latent), np.float32)
+    sizes = {each.name: each.shape[1] for each in session.get_inputs()}
+    before = now = np.zeros((shots.pose.shape[1], sizes["before"]), np.float32)
     names = [each.name for each in session.get_outputs()]
     frames = []
     for frame, pose in enumerate(shots.pose.numpy()):
@@ -61,6 +62,9 @@ def played(session, model, shots) -> list[np.ndarray]:
             "rates": pose[:, static:],
             "begins": begins,
         }
+        if model.feedback.count:
+            given["matrices"] = np.moveaxis(shots.character[frame].numpy(), -1, 0)
+            given["bend"] = shots.bend[frame].numpy().T
         state, *found = session.run(names, given)
         before, now = now, state
         frames.append(found)

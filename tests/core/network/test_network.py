@@ -27,9 +27,11 @@ def test_mlp_has_the_layers_asked_for_and_a_quiet_last_one():
 def test_training_starts_from_the_spring_alone_and_almost_from_lbs(scene):
     model = fresh(scene, latent_bound=0.0, max_latent_step=0.0)
     before, now, rest = torch.randn(3, 6, 8, generator=torch.Generator().manual_seed(0))
-    pose = torch.randn(6, model.stepper[0].in_features - 24, generator=torch.Generator().manual_seed(1))
+    seen = torch.randn(6, 3 * model.feedback.count, generator=torch.Generator().manual_seed(2))
+    size = model.stepper[0].in_features - 24 - seen.shape[1]
+    pose = torch.randn(6, size, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        stepped, own = model.step(before, now, rest, pose), model.integrator
+        stepped, own = model.step(before, now, rest, pose, seen), model.integrator
         forward = now + own.beta * (now - before)
         spring = model.config.stiffness * torch.sigmoid(own.share) * (rest - forward)
         np.testing.assert_allclose(stepped, forward + spring, atol=1e-6)
@@ -54,18 +56,20 @@ def test_every_scheme_builds_and_steps(scene, scheme):
     static = torch.randn(5, model.initialiser[0].in_features)
     pose = torch.randn(5, sum(descriptor_sizes(scene, model.joints)))
     rest = model.initial(static)
-    assert model.step(rest, rest, rest, pose).shape == (5, 8)
+    assert model.step(rest, rest, rest, pose, torch.randn(5, 3 * model.feedback.count)).shape == (5, 8)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model, scheme):
+def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model, toy_body, scheme):
     model = toy_model(scene, scheme=scheme)
     pose = torch.randn(6, 3, sum(descriptor_sizes(scene, model.joints)), generator=torch.Generator().manual_seed(1))
     rest = model.initial(pose[..., : model.initialiser[0].in_features].flatten(0, 1)).unflatten(0, (6, 3))
     states = [rest[0], rest[0] + 0.1]
-    rolled = model.roll(states, rest, pose)
-    for still, seen in zip(rest, pose):
-        states.append(model.step(states[-2], states[-1], still, seen))
+    body = toy_body(scene, 8, 3)
+    rolled = model.roll(states, rest, pose, body)
+    for frame, (still, seen) in enumerate(zip(rest, pose)):
+        cloth = model.seen_from(states[-2], states[-1], body[frame : frame + 3])
+        states.append(model.step(states[-2], states[-1], still, seen, cloth))
     torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
 
 

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation, Slerp
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.descriptors import pose_features
 from ssilk_core.network.model.descriptors import gravity_features
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.rollout import decode, garment_poses, resample_poses, roll
 from ssilk_core.scene.assets import GarmentPose, Motion
-from ssilk_core.scene.kinematics import deform, resample, run_up
+from ssilk_core.scene.kinematics import deform, motion_transforms, resample, run_up
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,8 @@ def gathered(poses) -> GarmentPose:
 def plain_loop(model, motion: Motion) -> list[torch.Tensor]:
     """States of a motion without cuts, one frame at a time over the descriptors of the whole motion."""
     features = pose_features(motion, model.scene.character.skeleton, model.joints)
+    world = motion_transforms(motion, model.scene.character.skeleton.parents)
+    body = BodyFrames.of(world, model.scene.character.skeleton, next(model.parameters()))
     count = motion.frame_count
     down = torch.tensor([0.0, -1, 0]).expand(count, 3)
     static, dynamic, turned = (
@@ -50,7 +53,10 @@ def plain_loop(model, motion: Motion) -> list[torch.Tensor]:
     for t in range(count):
         rest = model.initial(static[t : t + 1])
         seen = torch.cat([static[t : t + 1], dynamic[t : t + 1]], dim=1)
-        z.append(rest if t < 2 else model.step(z[-2], z[-1], rest, seen))
+        if t < 2:
+            z.append(rest)
+            continue
+        z.append(model.step(z[-2], z[-1], rest, seen, model.seen_from(z[-2], z[-1], body[t - 2 : t + 1])))
     return z
 
 

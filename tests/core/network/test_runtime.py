@@ -88,8 +88,8 @@ def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion)
 
 
 def test_s_is_limited_as_in_the_network(scene, toy_model, motion):
-    model = toy_model(scene, scale=0.3, velocity_allowance=0.0).eval()
-    free = toy_model(scene, scale=0.3, velocity_allowance=1.0).eval()
+    model = toy_model(scene, scale=0.2, velocity_allowance=0.0).eval()
+    free = toy_model(scene, scale=0.2, velocity_allowance=1.0).eval()
     assert np.abs(states_of(model, motion) - states_of(free, motion)).max() > 0.01  # the limit is met
     playback = player_of(model).play(motion)
     np.testing.assert_allclose(all_vertices(playback), expected_vertices(model, motion), atol=1e-4)

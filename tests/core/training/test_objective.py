@@ -73,7 +73,9 @@ def reference(objective: Objective, sampler: WindowSampler, noise: torch.Tensor,
         x = [at_frame(objective, z[t], frames[t], down)[0].detach() for t in range(2)]
         for t in range(2, length):
             past = z[-2:] if bptt else [v.detach() for v in z[-2:]]
-            z.append(model.step(*past, rest[t].detach(), bank.dynamic_descriptor(frames[t], down)))
+            with torch.set_grad_enabled(bptt):
+                seen = model.seen_from(*past, bank.triples(frames[t]))
+            z.append(model.step(*past, rest[t].detach(), bank.dynamic_descriptor(frames[t], down), seen))
             now, terms = at_frame(objective, z[-1], frames[t], down)
             terms["inertia"] = objective.energy.inertia(now, 2 * x[-1] - x[-2], objective.dt)
             carried = x[-1] + (bank.root[frames[t]] - bank.root[frames[t - 1]]).T

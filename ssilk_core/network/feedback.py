@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the stepper S sees of the decoded cloth (paper, Figure 2): where inertia would carry points of it.
+
+Latents are opaque, and live in the turning frame of the body. A few points of the cloth say the same in metres. With
+x_{t-1}, x_{t-2} their last two positions, and x^_t where the pose at t puts them if the outputs of D went on as they
+changed last,
+
+    m_t = R_t^T (2 x_{t-1} - x_{t-2} - x^_t)
+
+is how far the free flight of each point departs from what the latents would do without a force, in the root's frame
+R_t. It knows no position, no heading and no steady velocity. It is zero for a garment at rest on a body at rest, so
+that the quasi-static state stays an equilibrium. S sees m_t in `UNIT`, saturated at `LIMIT`; it knows gravity from
+the pose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..scene.assets import PINNED, Floats, Ints, Scene
+from .schemes import SCHEMES
+from .settings import ModelConfig
+
+UNIT, LIMIT = 0.05, 4.0  # [m] of a feature of one, and where features saturate
+
+
+def feedback_vertices(scene: Scene, config: ModelConfig) -> Ints:
+    """Return the vertices that S sees, spread over the cloth that is not pinned, shape (M,); empty without S.
+
+    The lowest one comes first, then always the one furthest from those before. Sums are taken in one order on every
+    machine, so that each finds the same vertices.
+    """
+    free = np.flatnonzero(scene.classes != PINNED)
+    count = min(config.feedback_points, len(free)) if SCHEMES[config.scheme].states else 0
+    points = scene.garment.mesh.points[free]
+    chosen: list[int] = []
+    nearest = np.full(len(free), np.inf)
+    while len(chosen) < count:
+        chosen.append(int(nearest.argmax()) if chosen else int(points[:, 1].argmin()))
+        x, y, z = (points - points[chosen[-1]]).T
+        nearest = np.minimum(nearest, x * x + y * y + z * z)
+    return free[chosen]
+
+
+def bends(origins: Floats) -> Floats:
+    """Return second differences o_t - 2 o_{t-1} + o_{t-2} of positions (F, 3), zero for the first two."""
+    found = np.zeros_like(origins)
+    found[2:] = origins[2:] - 2 * origins[1:-1] + origins[:-2]
+    return found
+
+
+def feedback_size(scene: Scene, config: ModelConfig) -> int:
+    """Return the number of features that S sees of the cloth: three for each vertex of `feedback_vertices`."""
+    free = int((scene.classes != PINNED).sum())
+    return 3 * min(config.feedback_points, free) if SCHEMES[config.scheme].states else 0

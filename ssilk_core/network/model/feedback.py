@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`network.feedback` in PyTorch: points of the decoded cloth as inputs of the stepper S."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ...physics.skinning import transform_points
+from ...scene.assets import Floats, Scene, Skeleton
+from ...scene.kinematics import skinning_matrices
+from ..feedback import LIMIT, UNIT, bends, feedback_vertices
+from ..settings import ModelConfig
+from .decoder import Decoder
+
+
+@dataclass(frozen=True, eq=False)
+class BodyFrames:
+    """What the feedback needs of a character in F frames of N motions.
+
+    Attributes:
+        matrices: skinning matrices, whose positions are relative to an origin of each frame, (F, J, 3, 4, N).
+        bend: second difference o_t - 2 o_{t-1} + o_{t-2} of these origins [m], (F, 3, N); unused in the first two.
+    """
+
+    matrices: Tensor
+    bend: Tensor
+
+    @classmethod
+    def of(cls, world: Floats, skeleton: Skeleton, like: Tensor) -> BodyFrames:
+        """Return one motion's frames from joint-to-world transforms (F, J, 4, 4), each about its own root.
+
+        Differences of roots are taken in double precision, so that single precision serves anywhere in the world.
+        """
+        origins, world = world[:, 0, :3, 3].copy(), world.copy()
+        world[..., :3, 3] -= origins[:, None]
+        matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
+        return cls(torch.as_tensor(matrices).to(like)[..., None], torch.as_tensor(bends(origins)).to(like)[..., None])
+
+    def __getitem__(self, frames: slice) -> BodyFrames:
+        return BodyFrames(self.matrices[frames], self.bend[frames])
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedState:
+    """A state as the feedback looks back on it: outputs of D (N, outputs), and points (M, 3, N) [m]."""
+
+    output: Tensor
+    points: Tensor
+
+
+class Feedback(nn.Module):
+    """Decodes the points that S sees.
+
+    Args:
+        scene: the garment; config: of the network.
+    """
+
+    rows: Tensor
+    places: Tensor
+
+    def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
+        super().__init__()
+        rows = torch.as_tensor(feedback_vertices(scene, config))
+        self.register_buffer("rows", rows, persistent=False)
+        # Of each chosen vertex among those that are not pinned, which alone have blendshapes.
+        self.register_buffer("places", torch.searchsorted(decoder.free, rows), persistent=False)
+
+    @property
+    def count(self) -> int:
+        """Points that S sees."""
+        return len(self.rows)
+
+    def decoded(self, decoder: Decoder, output: Tensor, matrices: Tensor) -> DecodedState:
+        """Return a state by its outputs (N, outputs), under a character (J, 3, 4, N)."""
+        activation, values = decoder.split(output)
+        rest, shapes = decoder.free_rest()[self.places], decoder.shapes[self.places]
+        points = rest[:, :, None] + torch.einsum("mak,kn->man", shapes, activation)
+        joints = decoder.matrices(values, matrices)[decoder.used]
+        weights = torch.softmax(decoder.logits[self.rows] + decoder.skin_offset[self.places], dim=1)
+        affine = decoder.skin.dense(weights, self.rows) @ joints.flatten(1)
+        return DecodedState(output, transform_points(affine.reshape(self.count, *joints.shape[1:]), points))
+
+    def seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames) -> Tensor:
+        """Return what S sees (N, 3 M) from the two states before a frame, the older one first.
+
+        Args:
+            body: the character in that frame alone, F = 1.
+        """
+        before, now = past
+        carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0])
+        away = 2 * now.points - before.points - carried.points - body.bend[0]
+        turn = body.matrices[0, 0, :, :3]  # of the root, but for a constant
+        own = torch.einsum("ban,mbn->man", turn, away)
+        return LIMIT * torch.tanh(own.flatten(0, 1).T / (UNIT * LIMIT))
