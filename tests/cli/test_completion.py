@@ -57,6 +57,7 @@ def test_settings_materials_and_files_are_completed(complete, tmp_path):
     (tmp_path / "hero.usdc").touch()
     assert complete("ssilk", "train", "--set", "iter") == {"iterations="}
     assert complete("ssilk", "train", "--material", "dr") == {"drag="}
+    assert "name=" not in complete("ssilk", "train", "--material", "na")
     assert complete("ssilk", "bake", "--stage", "he") == {"hero.usdc"}
     assert complete("ssilk", "bake", "--motion", "he") == {"hero.usdc"}
 
