@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.cli import VERBS, main, name_of
+from ssilk_core.cli import main
+from ssilk_core.cli.main import VERBS, name_of
 from ssilk_core.quality.levels import QUALITIES
 from ssilk_core.training.settings import PRESETS
 
