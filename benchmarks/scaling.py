@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from helpers.reports import table, write_results
 
-from ssilk_core.cli import parser as ssilk_parser
+from ssilk_core.cli.main import parser as ssilk_parser
 from ssilk_core.cli.train import training_job
 from ssilk_core.devices import device_name, select_device
 from ssilk_core.events import silent

@@ -7,11 +7,10 @@ A row is "| `name` | default | presets | what it does |"; its name and its last 
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from ssilk_core.network.settings import ModelConfig
+from ssilk_core.network.settings import ModelConfig, setting_names
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 from ssilk_core.training.settings import PRESETS, TrainConfig
 
@@ -23,9 +22,7 @@ def settings() -> dict[str, tuple[str, str]]:
     """Return the default of each setting by its name, and which presets have another value."""
     models = {name: preset.model for name, preset in PRESETS.items()}
     trainings = {name: preset.train for name, preset in PRESETS.items()}
-    found = _cells(ModelConfig(), models) | _cells(TrainConfig(), trainings) | _cells(Fabric("default"), FABRICS)
-    del found["name"]  # of a fabric
-    return found
+    return _cells(ModelConfig(), models) | _cells(TrainConfig(), trainings) | _cells(Fabric("default"), FABRICS)
 
 
 def written(page: str) -> str:
@@ -41,7 +38,7 @@ def written(page: str) -> str:
 
 def _cells(default: Any, presets: dict[str, Any]) -> dict[str, tuple[str, str]]:
     cells = {}
-    for name in (item.name for item in fields(default)):
+    for name in setting_names(default):
         usual = getattr(default, name)
         values = {preset: getattr(config, name) for preset, config in presets.items()}
         others = [f"{preset} {_word(value)}" for preset, value in values.items() if value != usual]

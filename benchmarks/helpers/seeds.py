@@ -11,7 +11,7 @@ from statistics import mean, stdev
 from baselines.evaluation import open_network
 
 from ssilk_core.cli import evaluate as verb
-from ssilk_core.cli import parser
+from ssilk_core.cli.main import parser
 from ssilk_core.errors import fail
 from ssilk_core.events import silent
 from ssilk_core.quality.evaluation.run import EvaluationOptions

@@ -3,5 +3,6 @@
 
 A command comes in; progress and a result go out. Open `work.py` first for one piece of work, and `jobs.py` for
 trainings that outlive Blender: `runner.py` runs each, in the Python that has ssilk. `python` finds that Python, and
-`probe` and `demo_motions` are scripts that it runs. `report` and `wording` put what was said into an artist's words.
+`probe` and `demo_motions` are scripts that it runs. `training_report` and `wording` put what was said into an
+artist's words.
 """

@@ -9,7 +9,8 @@ from __future__ import annotations
 from .classes import ClassesPanel
 from .garment import FabricPanel, GarmentPanel
 from .playback import BakingPanel, PlaybackPanel
-from .quality import FindingList, PreflightPanel, QualityPanel
+from .preflight import FindingList, PreflightPanel
+from .quality import QualityPanel
 from .rig import RigPanel
 from .training import EnergiesPanel, MotionList, TrainingPanel
 

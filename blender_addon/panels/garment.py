@@ -7,7 +7,7 @@ import bpy
 
 from ..errors import SetupError
 from ..operators import make_it_move, tasks
-from ..outside.report import improvement
+from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
 from ..scene.garment import armature_of, garments_of, unusable

@@ -9,7 +9,7 @@ from ..arrays.curves import series
 from ..errors import SetupError
 from ..motions.sources import FILE
 from ..outside.jobs import JobState
-from ..outside.report import findings, progress
+from ..outside.training_report import findings, progress
 from ..playback.models import TrainingProgress, progress_of
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of, unusable

@@ -3,4 +3,5 @@
 
 In: a character and a garment. Out: a rigged `Scene`, and findings with what to do about them.
 Open `setup/prepare.py` first: it makes what an artist has not made. `preflight/inspection.py` lists all checks.
+Public: no package; `ssilk rig` and `ssilk inspect` are the ways in, and `preflight.repair` is what `ssilk_usd` takes.
 """

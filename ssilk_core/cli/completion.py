@@ -16,20 +16,19 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from ..errors import EXIT_OK
 from ..events import Reporter
-from ..network.settings import ModelConfig
+from ..network.settings import ModelConfig, setting_names
 from ..scene.fabrics import Fabric
 from ..training.settings import TrainConfig
 
 SHELLS = ("bash", "zsh", "fish")
 ASSIGNED = {
-    "settings": [field.name for config in (ModelConfig, TrainConfig) for field in fields(config)],
-    "material": [field.name for field in fields(Fabric)],
+    "settings": [*setting_names(ModelConfig), *setting_names(TrainConfig)],
+    "material": setting_names(Fabric),
 }
 """What stands before the = of an option's value, by the name under which the option is parsed."""
 

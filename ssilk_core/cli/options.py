@@ -15,7 +15,7 @@ from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
 from ..files import need_not_input, need_writable
-from ..network.settings import apply_overrides
+from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
@@ -62,7 +62,7 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help=f"change a property of the fabric (repeatable): {', '.join(Fabric.__dataclass_fields__)}",
+        help=f"change a property of the fabric (repeatable): {', '.join(setting_names(Fabric))}",
     )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, silent
-from ..network.settings import ModelConfig, apply_overrides
+from ..network.settings import ModelConfig, apply_overrides, setting_names
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
 from . import options as shared
@@ -156,11 +156,11 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
 
 def _settings(settings: list[str], model: ModelConfig, train: TrainConfig) -> tuple[ModelConfig, TrainConfig]:
     """Apply "name=value" settings to whichever of the two has the name."""
-    known = [*ModelConfig.__dataclass_fields__, *TrainConfig.__dataclass_fields__]
+    known = [*setting_names(ModelConfig), *setting_names(TrainConfig)]
     for setting in settings:
         name, where = setting.partition("=")[0], f"--set {setting}"
         if name not in known:
             fail_unknown(where, "no such setting", name, known)
-    own = [setting for setting in settings if setting.partition("=")[0] in ModelConfig.__dataclass_fields__]
+    own = [setting for setting in settings if setting.partition("=")[0] in setting_names(ModelConfig)]
     others = [setting for setting in settings if setting not in own]
     return apply_overrides(model, own), apply_overrides(train, others)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeVar
 
 from ..errors import fail, fail_unknown
@@ -94,18 +94,28 @@ def _converted(kind: type, text: str) -> Any:
 Config = TypeVar("Config")
 
 
+def setting_names(config: object) -> list[str]:
+    """Return what can be set of a configuration or of its class: what has a default.
+
+    A fabric's name has none: it says which fabric it is.
+    """
+    return [item.name for item in fields(config) if item.default is not MISSING]  # type: ignore[arg-type]
+
+
 def apply_overrides(config: Config, assignments: list[str]) -> Config:
     """Return `config` with "name=value" assignments applied, each converted to the type of its field.
 
     Raises:
-        SsilkError: a name is unknown, or a value cannot be converted.
+        SsilkError: a name is no setting's, or a value cannot be converted.
     """
-    types = {item.name: type(getattr(config, item.name)) for item in fields(config)}  # type: ignore[arg-type]
+    types = {name: type(getattr(config, name)) for name in setting_names(config)}
     changes: dict[str, Any] = {}
     for assignment in assignments:
         name, _, text = assignment.partition("=")
         if name not in types:
-            fail_unknown(f"option '{assignment}'", "no such setting", name, types)
+            label = f"'{name}' is a label, not a setting"
+            found = label if hasattr(config, name) else "no such setting"
+            fail_unknown(f"option '{assignment}'", found, name, types)
         try:
             changes[name] = (
                 tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)

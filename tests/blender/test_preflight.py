@@ -296,7 +296,7 @@ def test_a_fix_is_undone(ready, skirt):
 
 def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
     from blender_addon.panels.base import lines
-    from blender_addon.panels.quality import PreflightPanel, line
+    from blender_addon.panels.preflight import PreflightPanel, line
 
     assert drawn(PreflightPanel, ready.context) == ["ssilk.inspect"]
     spoil(ready, skirt, loose_vertex)
@@ -311,7 +311,7 @@ def test_the_panel_lists_findings_with_their_buttons(ready, skirt):
 def told(code: str, elements: str, indices: list[int]) -> str:
     from types import SimpleNamespace
 
-    from blender_addon.panels.quality import line
+    from blender_addon.panels.preflight import line
 
     return line(SimpleNamespace(code=code, elements=elements, indices=indices))
 
@@ -337,7 +337,7 @@ def test_each_body_is_told_its_own_holes():
 
 def test_what_was_mended_by_hand_goes_and_the_rest_says_that_it_is_old(ready, skirt):
     from blender_addon.operators.training import watch
-    from blender_addon.panels.quality import PreflightPanel
+    from blender_addon.panels.preflight import PreflightPanel
 
     spoil(ready, skirt, loose_vertex)
     spoil(ready, skirt, loose_vertex)

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.cli import VERBS, main, name_of
+from ssilk_core.cli import main
+from ssilk_core.cli.main import VERBS, name_of
 from ssilk_core.quality.levels import QUALITIES
 from ssilk_core.training.settings import PRESETS
 
@@ -57,6 +58,7 @@ def test_settings_materials_and_files_are_completed(complete, tmp_path):
     (tmp_path / "hero.usdc").touch()
     assert complete("ssilk", "train", "--set", "iter") == {"iterations="}
     assert complete("ssilk", "train", "--material", "dr") == {"drag="}
+    assert "name=" not in complete("ssilk", "train", "--material", "na")
     assert complete("ssilk", "bake", "--stage", "he") == {"hero.usdc"}
     assert complete("ssilk", "bake", "--motion", "he") == {"hero.usdc"}
 

@@ -7,7 +7,8 @@ import re
 
 import pytest
 
-from ssilk_core.cli import VERBS, main, name_of
+from ssilk_core.cli import main
+from ssilk_core.cli.main import VERBS, name_of
 
 
 def printed(capsys, *words: str) -> str:

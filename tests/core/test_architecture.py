@@ -7,7 +7,7 @@ import ast
 import importlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 CORE, USD, ADDON = ROOT / "ssilk_core", ROOT / "usd" / "ssilk_usd", ROOT / "blender_addon"
 DOCUMENT = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-JOIN_CORE_AND_USD = {"delivery.bake", "cli"}
+JOIN_CORE_AND_USD = [("delivery", "bake"), ("cli",)]
 LOOSE_MODULES = ["errors", "events", "files", "devices", "work_record"]
 IN_PARTS = {"scene", "physics", "network", "authoring", "quality", "delivery"}  # the table names all their parts
 
@@ -26,9 +26,9 @@ def section(title: str) -> str:
     return DOCUMENT.partition(f"## {title}\n")[2].partition("\n## ")[0]
 
 
-def rows(title: str) -> list[list[str]]:
-    """Return the names in backticks in the first column of a section's table, row by row."""
-    lines = [line for line in section(title).splitlines() if line.startswith("| `")]
+def rows(title: str, without: str = "|||") -> list[list[str]]:
+    """Return the names in backticks in the first column of a section's table, row by row, of rows without a text."""
+    lines = [line for line in section(title).splitlines() if line.startswith("| `") and without not in line]
     return [re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in lines]
 
 
@@ -41,6 +41,7 @@ def table(title: str) -> dict[str, list[str]]:
 ROOMS = table("Rooms of the core")
 ORDER = [*LOOSE_MODULES, *ROOMS, "__main__"]
 USED_BY_USD = {name for row in rows("What ssilk_usd takes from the core") for name in row}
+RUN_BY_USD = {name for row in rows("What ssilk_usd takes from the core", "for type checking alone") for name in row}
 PUBLIC = [name for row in rows("Public packages") for name in row]
 
 
@@ -49,24 +50,33 @@ def modules(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return [(path, path.relative_to(folder.parent).parts[:-1]) for path in sorted(folder.rglob("*.py"))]
 
 
-def imports(path: Path, package: tuple[str, ...], *, types: bool = False) -> Iterator[tuple[str, ...]]:
-    """Yield what a module imports anywhere in its code, as dotted parts; for `types` alone too if asked."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree) if types else executed(tree):
-        if isinstance(node, ast.Import):
-            yield from (tuple(alias.name.split(".")) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = package[: len(package) + 1 - node.level] if node.level else ()
-            start = (*base, *(node.module.split(".") if node.module else ()))
-            yield from ((*start, alias.name) for alias in node.names)
-
-
 def executed(node: ast.AST) -> Iterator[ast.AST]:
     """Yield all nodes except those under `if TYPE_CHECKING`."""
     yield node
     for child in ast.iter_child_nodes(node):
         if not (isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"):
             yield from executed(child)
+
+
+def loaded(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield the nodes that run when a module is imported: no functions, nothing under `if TYPE_CHECKING`."""
+    inner = (child for child in executed(node) if isinstance(child, ast.FunctionDef))
+    skipped = {id(each) for function in inner for each in ast.walk(function)}
+    yield from (each for each in executed(node) if id(each) not in skipped)
+
+
+Nodes = Callable[[ast.AST], Iterator[ast.AST]]
+
+
+def imports(path: Path, package: tuple[str, ...], nodes: Nodes = executed) -> Iterator[tuple[str, ...]]:
+    """Yield what a module imports, as dotted parts; `nodes` picks the code that counts, all that runs by default."""
+    for node in nodes(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (tuple(alias.name.split(".")) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            start = (*base, *(node.module.split(".") if node.module else ()))
+            yield from ((*start, alias.name) for alias in node.names)
 
 
 def public_classes(folder: Path) -> Iterator[tuple[str, str]]:
@@ -94,15 +104,29 @@ def resolved(target: tuple[str, ...], home: Path) -> tuple[str, ...]:
     raise AssertionError(target)
 
 
-def graph(home: Path) -> dict[str, set[str]]:
-    """Return the modules of a package, and which others of it each imports anywhere, for types alone too."""
+def graph(home: Path, nodes: Nodes = ast.walk) -> dict[str, set[str]]:
+    """Return the modules of a package, and which others of it each imports, by default anywhere in its code."""
     found: dict[str, set[str]] = {}
     for path, package in modules(home):
         own = (*package, path.stem)
-        targets = imports(path, package, types=True)
+        targets = imports(path, package, nodes)
         names = {resolved(target, home) for target in targets if target[0] == home.name}
         found[".".join(own)] = {".".join(name) for name in names - {own}}
     return found
+
+
+def between_folders(found: dict[str, set[str]]) -> dict[str, set[str]]:
+    """Return which folders and loose modules of a package import which others, from the graph of its modules."""
+    joined: dict[str, set[str]] = defaultdict(set)
+    for name, targets in found.items():
+        own = name.split(".")[1]
+        joined[own] |= {target.split(".")[1] for target in targets} - {own}
+    return joined
+
+
+def need_no_circle(found: dict[str, set[str]]) -> None:
+    """Raise `CycleError`, which tells the circle, where one imports itself by way of others."""
+    TopologicalSorter(found).prepare()
 
 
 def test_the_core_has_the_rooms_and_parts_of_the_document():
@@ -121,12 +145,13 @@ def test_a_room_says_at_its_door_what_is_in_it(room):
     assert 3 <= len(text.strip().splitlines()) <= 9
     opened = re.search(r"Open `([\w/.]+)` first", text)
     assert opened and (CORE / room / opened.group(1)).is_file()
+    assert re.search(r"^Public: ", text, re.MULTILINE)
 
 
 @pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
 def test_the_core_imports_from_inner_rooms_and_parts_alone(path, package):
     own, *inner = path.relative_to(CORE).with_suffix("").parts
-    joins = ".".join((own, *inner)).startswith(tuple(JOIN_CORE_AND_USD))
+    joins = any((own, *inner)[: len(part)] == part for part in JOIN_CORE_AND_USD)
     named = ROOMS.get(own, [])
     for target in imports(path, package):
         assert target[0] not in ("pxr", "bpy"), target
@@ -141,17 +166,34 @@ def test_the_core_imports_from_inner_rooms_and_parts_alone(path, package):
 
 @pytest.mark.parametrize("home", [CORE, USD, ADDON, ROOT / "benchmarks"], ids=lambda home: home.name)
 def test_no_modules_import_each_other_in_a_circle(home):
-    TopologicalSorter(graph(home)).prepare()  # raises CycleError, with the circle
+    need_no_circle(graph(home))
 
 
-def test_circles_are_found(tmp_path):
+@pytest.mark.parametrize("home", [CORE, USD, ADDON], ids=lambda home: home.name)
+def test_no_folders_import_each_other_in_a_circle(home):
+    """When they are loaded: a function may ask for a folder that needs its own, as drawing the preferences does."""
+    need_no_circle(between_folders(graph(home, loaded)))
+
+
+def circle(found: dict[str, set[str]]) -> set[str]:
+    """Return the names of a circle; none where there is no circle."""
+    try:
+        need_no_circle(found)
+    except CycleError as error:
+        return set(error.args[1])
+    return set()
+
+
+def test_circles_of_modules_and_of_folders_are_found(tmp_path):
     package = tmp_path / "house"
-    package.mkdir()
-    codes = {"a": "from .b import one", "b": "def f():\n    from .c import one", "c": "from .b import f"}
-    for name, code in codes.items():
+    for name, code in (("a/x", "from ..b.y import one"), ("a/z", ""), ("b/y", "from ..a import z")):
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
         (package / f"{name}.py").write_text(f"{code}\n")
-    with pytest.raises(CycleError, match=r"house\.b.*house\.c|house\.c.*house\.b"):
-        TopologicalSorter(graph(package)).prepare()
+    assert not circle(graph(package)) and circle(between_folders(graph(package))) == {"a", "b"}
+    for head in ("if TYPE_CHECKING", "def f()"):
+        (package / "b" / "y.py").write_text(f"{head}:\n    from ..a import x\n")
+        assert circle(graph(package)) == {"house.a.x", "house.b.y"}
+        assert not circle(between_folders(graph(package, loaded)))
 
 
 @pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
@@ -163,9 +205,10 @@ def test_imports_within_the_core_are_relative(path, package):
 
 @pytest.mark.parametrize(("path", "package"), modules(USD), ids=lambda value: getattr(value, "stem", None))
 def test_usd_needs_little_of_the_core(path, package):
-    for target in imports(path, package):
-        assert target[0] not in ("torch", "bpy"), target
-        assert target[0] != "ssilk_core" or target[1] in USED_BY_USD, target
+    for nodes, allowed in ((ast.walk, USED_BY_USD), (executed, RUN_BY_USD)):
+        for target in imports(path, package, nodes):
+            assert target[0] not in ("torch", "bpy"), target
+            assert target[0] != "ssilk_core" or allowed & {target[1], ".".join(target[1:3])}, target
 
 
 def test_baking_needs_no_training():

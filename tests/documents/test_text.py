@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
-from ssilk_core.cli import parser
+from ssilk_core.cli.main import parser
 from ssilk_core.network.schemes import SCHEMES
 from ssilk_core.network.settings import ModelConfig, apply_overrides
 from ssilk_core.scene.fabrics import Fabric

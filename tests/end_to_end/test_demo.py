@@ -17,7 +17,8 @@ from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
 from ssilk_usd.writing.files import write_garment, write_motion
 
-from ssilk_core.cli import demo, main, parser, view
+from ssilk_core.cli import demo, main, view
+from ssilk_core.cli.main import parser
 from ssilk_core.cli.options import load_scene
 from ssilk_core.delivery.bake import BakeRequest, load_rollout
 from ssilk_core.delivery.view.shots import Look

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from pxr import Gf, Sdf, Usd, UsdSkel
 
-from ssilk_core.cli import main, parser
+from ssilk_core.cli import main
+from ssilk_core.cli.main import parser
 from ssilk_core.cli.options import NumberRange
 from ssilk_core.delivery.farm.job import numbers
 from ssilk_core.errors import SsilkError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.cli import parser
+from ssilk_core.cli.main import parser
 
 PYTHON = "python"
 

@@ -57,9 +57,9 @@ class Decoder(nn.Module):
     Args:
         scene: garment, rig and character.
         config: number of blendshapes K; whether proxies move; and the number of activations that the network
-            outputs, where it is more than K. Fixed linear combinations of these, `readout` (K, activations) with rows
-            whose absolute values sum to one, then weight the blendshapes, relative to the mean displacement `offset`
-            (V', 3) [m] of vertices that are not pinned.
+            outputs, where it is more than K. Fixed linear combinations of these, `readout` (K, activations), held
+            within [-1, 1], then weight the blendshapes, relative to the mean displacement `offset` (V', 3) [m] of
+            vertices that are not pinned.
         generator: source of the initial blendshapes.
     """
 
@@ -128,7 +128,7 @@ class Decoder(nn.Module):
         values = self.identity + self.scale * delta
         if values.shape[1] > 6:
             values = torch.cat([values[:, :6], limited(values[:, 6:], self.reach)], dim=1)
-        return self.readout @ activation if self.is_reduced else activation, values
+        return (self.readout @ activation).clamp(-1, 1) if self.is_reduced else activation, values
 
     def _influence_weights(self) -> Tensor:
         """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""

@@ -42,7 +42,7 @@ class NumpyDecoder:
         delta = output[self.activation_count :].reshape(self.proxies, len(self.scale), output.shape[1])
         activations = np.tanh(output[: self.activation_count])
         if self.readout is not None:
-            activations = self.readout @ activations
+            activations = (self.readout @ activations).clip(-1, 1)
         values = self.identity + self.scale * delta
         if self.moves:
             values[:, 6:] = limited(values[:, 6:], self.reach)

@@ -12,6 +12,7 @@ from ...scene.assets import Floats
 
 RIDGE = 1e-3  # of the mean variance of activations: keeps few frames from being learnt by heart
 MIN_RELATIVE_SHARE = 1e-14  # of the largest share: modes with less are rounding
+REACH = 4  # times the largest value of a mode in any frame: activations are held there
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +24,7 @@ class Modes:
         fields: shape (V, 3, K) [m]; readings: shape (K, K); the activation of each field has a variance of one.
         shares: reduction of the mean squared displacement by each field, weighted by mass, shape (K,) [m2].
         total: mean squared displacement about the mean [m2].
+        reached: largest absolute value of reading_i a in any frame, shape (K,).
     """
 
     mean: Floats
@@ -31,6 +33,7 @@ class Modes:
     readings: Floats
     shares: Floats
     total: float
+    reached: Floats
 
     def error(self, count: int) -> float:
         """Return the RMS displacement that the first `count` fields miss [m]."""
@@ -62,7 +65,8 @@ def modes(shapes: NDArray, more: NDArray, activations: NDArray, mass: Floats) ->
         weight @ (np.einsum("vk,vk->v", given, together + along) + np.einsum("vf,vf->v", rest, rest) / frames)
     )
     mean = shapes @ middle + beyond
-    return Modes(mean, middle, fields.reshape(*mean.shape, -1), readings, shares, total)
+    reached = np.abs(readings @ activations).max(axis=1, initial=0)
+    return Modes(mean, middle, fields.reshape(*mean.shape, -1), readings, shares, total, reached)
 
 
 def _components(linear: Floats, variance: Floats, weight: Floats) -> tuple[Floats, Floats]:
@@ -79,11 +83,10 @@ def _components(linear: Floats, variance: Floats, weight: Floats) -> tuple[Float
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """Blendshapes in the form of a model file: displacement = offset + shapes (readout a).
+    """Blendshapes in the form of a model file: displacement = offset + shapes clip(readout a), which is in [-1, 1].
 
     Attributes:
-        offset: shape (V, 3) [m]; shapes: (V, 3, R) [m].
-        readout: shape (R, K); the absolute values of a row sum to one, so that no activation leaves [-1, 1].
+        offset: shape (V, 3) [m]; shapes: (V, 3, R) [m]; readout: shape (R, K).
     """
 
     offset: Floats
@@ -92,7 +95,11 @@ class Basis:
 
 
 def basis(found: Modes, count: int, readout: Floats) -> Basis:
-    """Return the first `count` modes as blendshapes.
+    """Return the first `count` modes as blendshapes, an activation of one being `REACH` times what was seen.
+
+    A row of `combined` adds up to what a mode is where all activations are at an end of their range at once. That is
+    some hundred times what occurs. Shapes of that size are tens of metres long and cancel each other, and single
+    precision, in which readers add them up, then misses their sum by more than a verification allows.
 
     Args:
         readout: map from the network's activations to those of the modes, shape (K, K').
@@ -100,5 +107,5 @@ def basis(found: Modes, count: int, readout: Floats) -> Basis:
     fields, readings = found.fields[:, :, :count], found.readings[:count]
     offset = found.mean - fields @ (readings @ found.middle)
     combined = readings @ readout
-    largest = np.abs(combined).sum(axis=1) + 1e-30
+    largest = np.minimum(np.abs(combined).sum(axis=1), REACH * found.reached[:count]) + 1e-30
     return Basis(offset, fields * largest, combined / largest[:, None])

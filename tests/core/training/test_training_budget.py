@@ -9,7 +9,7 @@ from math import inf
 import pytest
 import torch
 
-from ssilk_core.cli import parser
+from ssilk_core.cli.main import parser
 from ssilk_core.cli.train import configured
 from ssilk_core.devices import default_preset
 from ssilk_core.errors import SsilkError

@@ -10,7 +10,7 @@ import pytest
 
 from blender_addon.arrays.curves import COLORS, GROUND, picture, series
 from blender_addon.outside.jobs import JobState
-from blender_addon.outside.report import findings, improvement, progress
+from blender_addon.outside.training_report import findings, improvement, progress
 
 SCORE = {"total": 0.6, "collisions": 0.0123, "dynamics": 0.023}
 CURVE = {"lbs": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCORE}]}
