@@ -24,14 +24,13 @@ from ssilk_core.events import format_seconds
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.quality.charts import COLOURS, ChartPanel, write_chart
 from ssilk_core.training.curve import curve_path
-from ssilk_core.training.verdict import curve_lbs
 
 NESTED = {
     "shows": ("shown_skin", "mean"),
     "limbs": ("shown_skin", "pierced"),
     "step energy": ("step_errors", "energy"),
     "step distance": ("step_errors", "distance"),
-}  # parts of a validation, which earlier versions did not have
+}  # parts of a validation, where measured
 PANELS = ("total", *TERMS, "collisions", "dynamics", *NESTED)
 UNITS = {
     "collisions": "share of vertices",
@@ -91,7 +90,7 @@ def read_run(text: str) -> Run:
         measured = [(point["validation"].get(part) or {}).get(figure) for point in points]
         values[key] = np.zeros(0) if None in measured else np.array(measured)
     iterations, seconds = (np.array([point[key] for point in points]) for key in ("iteration", "seconds"))
-    return Run(name or Path(model).stem, iterations, seconds, values, curve_lbs(document)["total"])
+    return Run(name or Path(model).stem, iterations, seconds, values, document["lbs"]["total"])
 
 
 def bounds(values: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
-from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS, curve_lbs
+from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS
 
 from .jobs import JobState
 
@@ -55,7 +55,7 @@ def improvement(state: JobState, curve: Mapping[str, Any]) -> list[str]:
     best = next((each for each in points if each.get("iteration") == state.checkpoint), points[-1])["validation"]
     shown, first = ((score.get("shown_skin") or {}).get("mean") for score in (best, points[0]["validation"]))
     if shown is None:
-        said = compared(best["total"], curve_lbs(curve)["total"])[0]
+        said = compared(best["total"], curve["lbs"]["total"])[0]
     else:
         before = f", {first:.2%} at first" if first is not None and first != shown else ""
         said = f"{shown:.2%} of the covered skin shows{before}"
@@ -73,7 +73,7 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
     """
     if not curve.get("points"):
         return [("No validation yet: too early to say what is being learned", False)] if state.alive else []
-    score, lbs = curve["points"][-1]["validation"], curve_lbs(curve)
+    score, lbs = curve["points"][-1]["validation"], curve["lbs"]
     found = [
         compared(score["total"], lbs["total"]),
         (f"{score['collisions']:.2%} of the vertices inside the body", False),
@@ -82,8 +82,7 @@ def findings(state: JobState, curve: Mapping[str, Any], *, moves: bool) -> list[
         found.append(
             (f"{shown['mean']:.2%} of the covered skin shows, {shown['worst']:.2%} in the worst frame", False)
         )
-        if shown.get("bare") is not None:
-            found.append((f"{shown['bare']:.2%} of it is bare: no cloth is near", False))
+        found.append((f"{shown['bare']:.2%} of it is bare: no cloth is near", False))
     if moves:
         found.append(dynamics(score["dynamics"]))
     if state.checkpoint is not None:

@@ -25,7 +25,7 @@ def recall(folder: Path) -> dict[str, str]:
     """Return the names that were kept in a folder; none where there are none."""
     try:
         document = json.loads((folder / NAMES).read_text(encoding="utf-8"))
-    except (OSError, ValueError):  # of an older version, or gone
+    except (OSError, ValueError):  # nothing was kept, or it is gone
         return {}
     return {str(made): str(name) for made, name in document.items()} if isinstance(document, dict) else {}
 

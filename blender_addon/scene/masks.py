@@ -32,8 +32,7 @@ def masked(garment: bpy.types.Object) -> list[bpy.types.Object]:
 def _masks_under(garment: bpy.types.Object, thing: bpy.types.Object) -> list[str]:
     """Return the names of the modifiers that hide skin of an object under a garment."""
     names = [modifier.name for modifier in thing.modifiers if modifier.type == "MASK"]
-    # Earlier versions told garments by name alone.
-    return [name for name in names if (thing[name] == garment if name in thing else name == _name(garment))]
+    return [name for name in names if thing.get(name) == garment]
 
 
 def show(garment: bpy.types.Object) -> int:

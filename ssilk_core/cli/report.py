@@ -18,7 +18,7 @@ from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
 from ..files import replacing
 from ..physics.skin.figures import ShownSkin
-from ..scene.fabrics import Fabric, fabric_of_file
+from ..scene.fabrics import Fabric
 from .options import check_output
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
         return Fabric("default")
     known = {item.name for item in fields(Fabric)}
     numbers: dict[str, Any] = {name: value for name, value in record.parameters.items() if name in known}
-    return fabric_of_file({"name": record.fabric, **numbers})
+    return Fabric(record.fabric, **numbers)
 
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:

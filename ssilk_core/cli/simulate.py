@@ -15,7 +15,7 @@ import argparse
 import shutil
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,15 +129,13 @@ class _Shot:
         if not self.output.is_file():
             return False
         found = read_provenance(self.output).get("simulated")
-        if isinstance(found, Mapping):
-            found = {"points": True, **found}  # earlier versions wrote points alone
-            if found == {**self.provenance, "points": True} and not self.provenance["points"]:
-                fail(
-                    str(self.output),
-                    "it holds the points of this simulation",
-                    "joints and blendshapes would replace them",
-                    "give --points or another output; 'ssilk skin' makes joints and blendshapes of points",
-                )
+        if found == {**self.provenance, "points": True} and not self.provenance["points"]:
+            fail(
+                str(self.output),
+                "it holds the points of this simulation",
+                "joints and blendshapes would replace them",
+                "give --points or another output; 'ssilk skin' makes joints and blendshapes of points",
+            )
         return found == self.provenance
 
 

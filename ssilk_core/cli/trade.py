@@ -99,9 +99,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_TASKS if failed else EXIT_OK
 
 
-MEASUREMENT = 2  # raised when points of earlier versions cannot be compared with new ones
-
-
 class Bench:
     """The scene and the motions that all models of a sweep are measured on.
 
@@ -144,7 +141,6 @@ class Bench:
             "stage": sha256(options.stage),
             "clips": list(self.clips),
             "frames": self.frames,
-            "measurement": MEASUREMENT,
             "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
             "ssilk": __version__,
         }

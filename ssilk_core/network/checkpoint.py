@@ -21,7 +21,7 @@ from .. import __version__
 from ..errors import SsilkError, fail
 from ..files import is_usd, replacing
 from ..scene.assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
-from ..scene.fabrics import Fabric, fabric_of_file
+from ..scene.fabrics import Fabric
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
 from .settings import ModelConfig
@@ -30,7 +30,7 @@ from .tensors import pack_tensors, read_tensors
 if TYPE_CHECKING:
     from .model.network import GarmentModel
 
-FORMAT = 6  # the first that was released
+FORMAT = 6  # of the models that ship; files of another are refused
 HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
@@ -227,7 +227,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
-        fabric_of_file(document["fabric"]),
+        Fabric(**document["fabric"]),
         joints.astype(np.int64),
         _parameters(tensors, scene.garment.mesh.path),
         document["provenance"],

@@ -3,7 +3,7 @@
 
 A file has the length of the header (8 bytes, little endian), the header (JSON with the type, shape and byte range of
 each tensor), and the tensors without gaps [huggingface.co/docs/safetensors]. Its metadata holds the SHA-256 of header
-and tensors, with zeros in place of this checksum. Files of earlier versions have none, and are read without a word.
+and tensors, with zeros in place of this checksum. Files that another program rewrote may lack it, and are read.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, NoReturn
+from typing import NoReturn
 
 from ..errors import fail, fail_unknown
 from .assets import PLATE_THICKNESS, SurfaceMaterial
@@ -151,14 +151,6 @@ def fabric_named(name: str) -> Fabric:
     if name not in FABRICS:
         fail_unknown(f"fabric '{name}'", "no such preset", name, FABRICS)
     return FABRICS[name]
-
-
-def fabric_of_file(values: dict[str, Any]) -> Fabric:
-    """Return the fabric that a file states; what older files do not state did not act then."""
-    absent: dict[str, Any] = {"contact_model": "vertex", "thickness": 0.0, "tether": 0.0, "stitch": 0.0}
-    if "contact" in values:
-        absent = {"tether": 0.0, "stitch": 0.0, "loose_contact": values["contact"]}
-    return Fabric(**(absent | values))
 
 
 def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:

@@ -21,7 +21,6 @@ from ..errors import SsilkError, fail
 from ..files import replacing
 from ..network.tensors import pack_tensors, read_tensors
 from ..scene.assets import Scene
-from ..scene.fabrics import fabric_of_file
 from .curve import CurvePoint
 from .settings import TrainConfig
 from .step import Stepper
@@ -188,7 +187,7 @@ def _document(state: RunState) -> dict[str, Any]:
 
 
 def _state_of(path: Path, document: dict[str, Any]) -> RunState:
-    if (found := document.pop("format", FORMAT)) != FORMAT:
+    if (found := document.pop("format")) != FORMAT:
         fail(
             str(path),
             f"a training state of format {found}",
@@ -217,7 +216,7 @@ def _name_damage(path: Path) -> Iterator[None]:
 
 
 def _need_possible(state: RunState) -> None:
-    """Raise `ValueError` unless a run can have reached this state; files of earlier versions have no checksum."""
+    """Raise `ValueError` unless a run can have reached this state, which no checksum can tell."""
     asked, scored = state.asked["train"], [each for each in (state.best, *state.curve) if each]
     last = state.planned or asked["iterations"]
     _need_counts("planned", 0, inf, [state.planned, state.validations])
@@ -251,8 +250,6 @@ def _need_finite(tensors: Tensors) -> None:
 
 def _need_same(path: Path, asked: dict[str, Any], before: dict[str, Any]) -> None:
     differing: list[str] = []
-    if "fabric" in before:
-        before = {**before, "fabric": asdict(fabric_of_file(before["fabric"]))}
     asked, before = _located(asked, asked), _located(before, asked)
     for key, value in asked.items():
         old = before.get(key)

@@ -52,8 +52,8 @@ class Score:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
-        """Return a score from its JSON document; earlier versions measured neither skin nor steps."""
-        shown, steps = document.get("shown_skin"), document.get("step_errors")
+        """Return a score from its JSON document."""
+        shown, steps = document["shown_skin"], document["step_errors"]
         parts = {"shown_skin": shown and ShownSkin(**shown), "step_errors": steps and StepErrors(**steps)}
         return cls(**{**document, **parts})
 

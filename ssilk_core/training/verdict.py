@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from math import ceil, isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..events import Message
 from ..physics.skin.figures import MOST_MEAN, MOST_WORST
@@ -19,12 +18,6 @@ NO_DYNAMICS = 2e-3  # [m]
 WORSE = 1e-3
 FEW = 0.5  # share of the iterations that were asked for, below which more minutes are advised
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
-
-
-def curve_lbs(curve: Mapping[str, Any]) -> Mapping[str, float]:
-    """Return the score of linear blend skinning in a learning curve; earlier versions named it "plain"."""
-    found: Mapping[str, float] = curve["plain"] if "plain" in curve else curve["lbs"]
-    return found
 
 
 def lower_by(score: Score, lbs: Score) -> float:

@@ -73,13 +73,6 @@ def test_skin_under_a_renamed_garment_is_found_again(bpy, skirt, pillar):
     assert shown_faces(bpy, pillar) == whole and not [key for key in pillar.keys() if "Under" in key]  # noqa: SIM118
 
 
-def test_skin_hidden_by_an_earlier_version_is_shown_by_its_name(bpy, skirt, pillar):
-    whole = shown_faces(bpy, pillar)
-    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
-    del pillar[NAME]
-    assert bpy.ops.ssilk.show_covered() == {"FINISHED"} and shown_faces(bpy, pillar) == whole
-
-
 def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}

@@ -48,9 +48,12 @@ def test_validations_say_what_is_learned():
         ("Dynamics are being learned: 23 mm of motion of its own", False),
         ("Best model: from iteration 5; play it live or bake it to see it on your shot", False),
     ]
-    shown = {**CURVE["points"][0]["validation"], "shown_skin": {"mean": 0.0078, "worst": 0.02}}
+    shown = {**CURVE["points"][0]["validation"], "shown_skin": {"mean": 0.0078, "worst": 0.02, "bare": 0.5}}
     told = findings(running, {**CURVE, "points": [{"iteration": 5, "validation": shown}]}, moves=True)
-    assert told[2] == ("0.78% of the covered skin shows, 2.00% in the worst frame", False)
+    assert told[2:4] == [
+        ("0.78% of the covered skin shows, 2.00% in the worst frame", False),
+        ("50.00% of it is bare: no cloth is near", False),
+    ]
     stiff = {**CURVE, "points": [{"iteration": 5, "validation": {**SCORE, "total": 1.5, "dynamics": 0.0019}}]}
     told = findings(running, stiff, moves=True)
     assert ("50.0% more energy than linear blend skinning", True) in told

@@ -13,7 +13,6 @@ from ...files import relative_path, sha256
 from .opened import provenance_of
 from .record import RECORD
 from .request import BakeRequest
-from .result import SHOT_SHAPES
 from .rollout import BakeRollout
 
 
@@ -77,26 +76,14 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
     except (TypeError, ValueError) as error:
         fail(str(shot), f"the file does not say how it was baked as this version does ({error})", allowed,
              "bake it again")  # fmt: skip
-    refined = provenance.get("refined")
-    if isinstance(refined, Mapping) and SHOT_SHAPES not in refined:
-        if provenance["request"].get("refined_output", "points") != "points":
-            fail(
-                str(shot),
-                "an earlier version fitted it to the joints and shapes of its model",
-                "refined shots have shapes of their own now",
-                "bake it again",
-            )
-        stored = replace(stored, refined_output="points")  # the default of earlier versions
-    beside = provenance.get("beside")  # earlier versions stored paths as they were given, and these here
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
     found: dict[str, str] = {}
     for name, path in stored.inputs.items():
-        near = str(beside[name]) if isinstance(beside, Mapping) and name in beside else path
-        found[name] = str(elsewhere.get(name) or _existing(shot, name, near, Path(path), hashes.get(name)))
+        found[name] = str(elsewhere.get(name) or _existing(shot, name, path, hashes.get(name)))
     return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
 
 
-def _existing(shot: Path, name: str, near: str, then: Path, held: object) -> Path:
+def _existing(shot: Path, name: str, near: str, held: object) -> Path:
     """Return the place of an input where there is a file.
 
     It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
@@ -108,7 +95,7 @@ def _existing(shot: Path, name: str, near: str, then: Path, held: object) -> Pat
     """
     parts = Path(near).parts
     tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
-    places = [shot.parent / near, then, Path(tail), *(above / tail for above in shot.absolute().parents)]
+    places = [shot.parent / near, Path(near), Path(tail), *(above / tail for above in shot.absolute().parents)]
     there = [path for path in places if _file(path).is_file() and not _is_baked(_file(path), shot)]
     if not there:
         fail(str(shot), f"the {name} that it was baked from is not at {near}", f"--{name} gives its present path")

@@ -15,7 +15,6 @@ from ...quality.stress.outcome import HEADER, CaseOutcome
 from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
 from ...training.step_errors import StepErrors
-from ...training.verdict import curve_lbs
 from .page import Section, facts, flattened, table
 from .terms import SHARE, SHOWN
 
@@ -107,7 +106,7 @@ def records(found: Sequence[Mapping[str, Any]]) -> str:
 
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the section of the learning curve that a training writes beside its model."""
-    points, lbs = document["points"], curve_lbs(document)
+    points, lbs = document["points"], document["lbs"]
     best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))

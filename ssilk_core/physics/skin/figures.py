@@ -17,7 +17,7 @@ class ShownSkin:
         frames: that were counted.
         covered: points that the garment covers.
         mean, worst: mean share over frames, and that of the worst frame.
-        bare, worst_bare: the same of skin with no cloth within reach; None where an earlier version counted.
+        bare, worst_bare: the same of skin with no cloth within reach.
         clip, frame: the worst frame, of several equal ones the first: of a shot its time code, of a motion that was
             evaluated the motion's, and of a validation in training the frame from the clip's start, at the model's
             rate.
@@ -33,8 +33,8 @@ class ShownSkin:
     clip: str
     frame: float
     regions: dict[str, float]
-    bare: float | None = None
-    worst_bare: float | None = None
+    bare: float
+    worst_bare: float
     pierced: float | None = None
     limbs: dict[str, float] = field(default_factory=dict)
 
@@ -60,8 +60,8 @@ class ShownSkin:
             "covered skin that shows": f"{self.mean:.3%}",
             **(worst if self.worst else {}),
             **({"most at": self.where} if self.where else {}),
-            **({} if self.bare is None else {"bare": f"{self.bare:.2%}"}),
-            **({} if self.worst_bare is None else {"bare in its worst frame": f"{self.worst_bare:.2%}"}),
+            "bare": f"{self.bare:.2%}",
+            "bare in its worst frame": f"{self.worst_bare:.2%}",
             **({} if self.pierced is None else {"frames with limbs through the cloth": self._limbs}),
         }
 
@@ -77,7 +77,7 @@ class ShownSkin:
 
     def __str__(self) -> str:
         worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
-        bare = "" if self.bare is None else f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
+        bare = f", {self.bare:.2%} is bare ({self.worst_bare:.2%} at most)"
         most = f", {self.worst:.2%} in the worst frame ({worst})" if self.worst else ""
         through = f"; a limb is through the cloth in {self._limbs} of the frames" if self.pierced else ""
         return f"{self.mean:.3%} of the covered skin shows{most}{bare}{through}"

@@ -76,7 +76,7 @@ def _energies(f: Figures) -> list[str]:
 
 
 def _shown_skin(f: ShownSkin) -> list[str]:
-    bare = " / ".join(_percent(share) for share in (f.bare, f.worst_bare) if share is not None)
+    bare = " / ".join(_percent(share) for share in (f.bare, f.worst_bare))
     worst = (f.clip, f"{f.frame:g}") if f.worst else ("", "")
     return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), *worst, f.where, bare]
 

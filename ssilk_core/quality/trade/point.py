@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import dataclass, fields
 from math import nan
 from typing import Any
 
@@ -31,11 +31,11 @@ class TradePoint:
         total: the paper's L_tot [J].
         excess: difference of `total` from the model as trained [J].
         collisions: share of the vertices inside the body.
-        shown_skin: share of the covered skin that shows; None where the garment covers nothing, or where an earlier
-            version did not measure it.
+        shown_skin: share of the covered skin that shows; None where the garment covers nothing.
         position, velocity: RMS errors against the full model [m], [m/s].
     """
 
+    garment: str
     model: str
     swept: str
     variant: str
@@ -57,9 +57,8 @@ class TradePoint:
     collisions: float
     position: float
     velocity: float
-    shown_skin: ShownSkin | None = None
-    solving: float | None = None
-    garment: str = ""
+    shown_skin: ShownSkin | None
+    solving: float | None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> TradePoint:
@@ -68,10 +67,9 @@ class TradePoint:
         Raises:
             KeyError: a value is missing.
         """
-        values = {item.name: document[item.name] for item in fields(cls) if item.default is MISSING}
-        shown = document.get("shown_skin")
-        later = {name: document[name] for name in ("solving", "garment") if name in document}
-        return cls(**values, shown_skin=ShownSkin(**shown) if shown else None, **later)
+        values = {item.name: document[item.name] for item in fields(cls)}
+        shown = values["shown_skin"]
+        return cls(**{**values, "shown_skin": ShownSkin(**shown) if shown else None})
 
     @property
     def making(self) -> float:

@@ -35,10 +35,7 @@ class Results:
     points: list[TradePoint] = field(default_factory=list)
 
     def resume(self, report: Reporter) -> None:
-        """Read the points that an earlier run of the same sweep measured.
-
-        Points of earlier versions, which told no garment and the time of the solver otherwise, are measured again.
-        """
+        """Read the points that an earlier run of the same sweep measured."""
         if self.path is None or not self.path.exists():
             return
         try:
@@ -47,9 +44,7 @@ class Results:
             same = document["asked"] == json.loads(json.dumps(self.asked))
         except (ValueError, TypeError, KeyError) as error:
             raise SsilkError(f"{self.path}: not results of 'ssilk trade' ({error}); name another file.") from error
-        self.points = [
-            point for point in points if same and point.garment and (point.solving is not None or not point.refine)
-        ]
+        self.points = points if same else []
         if self.points:
             report(Message(f"{len(self.points)} variants were measured before and are reused"))
 

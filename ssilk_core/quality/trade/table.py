@@ -63,7 +63,7 @@ def _cells(p: TradePoint, best: list[str]) -> list[str]:
         f"{p.collisions:.2%}",
         f"{p.shown_skin.mean:.3%}" if p.shown_skin else "",
         f"{p.shown_skin.worst:.2%}" if p.shown_skin else "",
-        f"{p.shown_skin.bare:.2%}" if p.shown_skin and p.shown_skin.bare is not None else "",
+        f"{p.shown_skin.bare:.2%}" if p.shown_skin else "",
         f"{1000 * p.position:.3g}",
         f"{1000 * p.velocity:.3g}",
         ", ".join(best),

@@ -110,7 +110,8 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
 
 def test_a_verdict_tells_what_is_wrong_where_and_when():
     values = {SHOWN: np.array([0.0, 0.0, 0.8]), STRETCH: np.array([3.0, 21.0, 4.0]), SHARE: np.zeros(3)}
-    skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, clip="c", frame=13, regions={"LeftArm": 1.0})
+    skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, bare=0.0, worst_bare=0.0, clip="c", frame=13,
+                     regions={"LeftArm": 1.0})  # fmt: skip
     body = verdict("Cape", values, skin, [11, 12, 13], 30.0).body
     assert "Look at Cape: skin shows through and the cloth stretches." in body
     assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
@@ -124,10 +125,11 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
 
 
 def test_figures_are_printed_in_words():
-    skin = asdict(ShownSkin(frames=3, covered=100, mean=0.0, worst=0.0, clip="c", frame=1, regions={}))
+    figures = dict.fromkeys(("mean", "worst", "bare", "worst_bare"), 0.0)
+    skin = asdict(ShownSkin(frames=3, covered=100, clip="c", frame=1, regions={}, **figures))
     told = _told({"Cape": {"shown_skin": skin, "non-finite frames": 2}, "Belt": {"non-finite frames": 0}})
     assert told == {
-        "Cape": "0.000% of the covered skin shows",
+        "Cape": "0.000% of the covered skin shows, 0.00% is bare (0.00% at most)",
         "Cape: frames that are not finite": 2,
         "Belt": "it covers no skin",
     }
@@ -180,10 +182,11 @@ OUTCOME = {
     },
 }  # fmt: skip
 POINT = {
-    "model": "m", "swept": "shapes", "variant": "16 blendshapes", "shapes": 16, "joints": 2, "influences": 4,
-    "precision": "float32", "fps": 30.0, "refine": 0, "milliseconds": 0.5, "high": 0.6, "torch": None,
-    "operations": 10, "memory": 10, "model_bytes": 1000, "shot_bytes": 1000.0, "total": 1.5, "excess": 0.0,
-    "collisions": 0.0, "position": 0.002, "velocity": 0.0,
+    "garment": "g", "model": "m", "swept": "shapes", "variant": "16 blendshapes", "shapes": 16, "joints": 2,
+    "influences": 4, "precision": "float32", "fps": 30.0, "refine": 0, "milliseconds": 0.5, "high": 0.6,
+    "torch": None, "operations": 10, "memory": 10, "model_bytes": 1000, "shot_bytes": 1000.0,
+    "total": 1.5, "excess": 0.0, "collisions": 0.0, "position": 0.002, "velocity": 0.0,
+    "shown_skin": None, "solving": None,
 }  # fmt: skip
 FIGURES = {
     "Extremes": ({"ssilk": "1", "outcomes": [OUTCOME]}, "breaks"),
@@ -205,7 +208,7 @@ def test_figures_become_sections_by_what_they_hold(tmp_path, title):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("{", "not a JSON file"), ("[1]", "not figures of a known kind"), ('{"points": [{}]}', "incomplete ('model')"),
+    [("{", "not a JSON file"), ("[1]", "not figures of a known kind"), ('{"points": [{}]}', "incomplete ('garment')"),
      ('{"outcomes": [{"name": 1}]}', "incomplete ('measured')")],
 )  # fmt: skip
 def test_other_files_are_refused(tmp_path, text, said):
@@ -228,6 +231,8 @@ def test_a_learning_curve_marks_its_best(tmp_path):
         "covered": 80,
         "mean": 0.01,
         "worst": 0.02,
+        "bare": 0.25,
+        "worst_bare": 0.5,
         "clip": "walk",
         "frame": 3,
         "regions": {"Hips": 1.0},

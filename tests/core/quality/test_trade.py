@@ -213,18 +213,6 @@ def test_points_that_joints_cannot_reach_are_counted_as_points(meter, bench, mon
     assert found.shot_bytes == 6000 + 300 * (60 + 12 * vertices) and found.solving > 0
 
 
-def test_refined_points_of_earlier_versions_are_measured_again(points, tmp_path):
-    results = Results(tmp_path / "t.json", {"a": 1})
-    for name in ("int16", "1 iterations"):
-        results.add(points[name])
-    document = json.loads((tmp_path / "t.json").read_text())
-    for point in document["points"]:
-        del point["solving"]
-    (tmp_path / "t.json").write_text(json.dumps(document))
-    results.resume(lambda event: None)
-    assert [point.variant for point in results.points] == ["int16"]
-
-
 def test_between_frames_of_a_shot_poses_are_interpolated(meter, bench, model):
     reducer, dressed, take_set = bench
     motion = take_set.takes[0].motion

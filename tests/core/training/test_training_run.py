@@ -297,15 +297,6 @@ def test_a_state_without_checksum_that_no_run_can_have_reached_is_refused(job, u
     assert state_path(resumed.output).read_bytes() == before and not resumed.output.exists()
 
 
-def test_a_state_of_an_earlier_version_has_no_checksum_and_is_resumed(job, uninterrupted):
-    resumed = job("before", resume=True)
-    with safe_open(state_path(uninterrupted.output), "pt") as stream:
-        tensors = {name: stream.get_tensor(name) for name in stream.keys()}  # noqa: SIM118
-        words = {"ssilk_state": stream.metadata()["ssilk_state"]}
-    save_file(tensors, state_path(resumed.output), words)
-    assert train(resumed, silent).finished
-
-
 def test_the_best_model_is_kept(job, monkeypatch):
     """Validation totals are replaced by ones that fall, then rise."""
     totals, score = iter([3.0, 1.0, 2.0, 5.0]), validation.Validator.score
@@ -432,14 +423,6 @@ def test_a_skipped_step_is_reported_by_term_and_iteration_and_counted_across_res
         "3 steps in total were skipped.",
     ]
     assert load_state(state_path(spoiled.output), spoiled.identity())[0].skipped == 3
-
-
-def test_a_run_of_before_stitches_resumes_where_none_hold_anything(job):
-    asked = job("older", replace(SHORT, iterations=1, static_fraction=0.0)).identity()
-    before = {**asked, "fabric": {name: value for name, value in asked["fabric"].items() if name != "stitch"}}
-    _need_same(Path("older"), asked, before)
-    with pytest.raises(SsilkError, match="another drag"):
-        _need_same(Path("older"), asked, {**before, "fabric": {**before["fabric"], "drag": 9.0}})
 
 
 @pytest.fixture
@@ -802,12 +785,12 @@ def test_a_validation_counts_the_skin_that_shows_in_frames_spread_over_all_clips
     assert found.mean > 0.01 > validator.lbs_score().shown_skin.mean
     document = json.loads(json.dumps(asdict(validator.score(model))))
     assert Score.of(document).shown_skin == found
-    del document["shown_skin"]  # as earlier versions wrote it
-    assert Score.of(document).shown_skin is None
 
 
 def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goes_on(tmp_path, monkeypatch, capsys):
-    skin = ShownSkin(frames=3, covered=100, mean=0.043, worst=0.102, clip="c", frame=3, regions={})
+    skin = ShownSkin(
+        frames=3, covered=100, mean=0.043, worst=0.102, bare=0.0, worst_bare=0.0, clip="c", frame=3, regions={}
+    )
     shows, holds = (
         Score({"stretch": 0.1}, 0.0, shown_skin=each) for each in (skin, replace(skin, mean=4e-4, worst=4e-3))
     )
