@@ -72,6 +72,7 @@ def language_is_replaced_once() -> Iterator[None]:
         patch.setattr(interpreter.GridExecutor, "__call__", run_anew)
         yield
 
+
 ROWS, COLUMNS = 12, 5
 JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])
 PROXIES = np.array([[0.0, 1.15, -0.15], [0.02, 0.95, -0.15]])
