@@ -97,7 +97,7 @@ def train(bpy: ModuleType, garment: Any) -> Path:
 
     activate(bpy, garment)
     assert bpy.ops.ssilk.train() == {"FINISHED"}
-    state = ended(garment)
+    state = ended(garment, seconds=600)  # it validates on the CPU, which others may use
     assert state.state == "done", state
     return model_of(garment)
 

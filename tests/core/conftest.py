@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -39,6 +41,38 @@ from ssilk_core.training.objective import Objective
 
 if not torch.cuda.is_available():
     os.environ["TRITON_INTERPRET"] = "1"  # kernels then run, slowly, on the CPU; read when Triton is imported
+
+
+@pytest.fixture(scope="session", autouse=True)
+def language_is_replaced_once() -> Iterator[None]:
+    """Let Triton's interpreter replace the language once for a kernel, not for each call of a function by it."""
+    if not find_spec("triton"):
+        yield
+        return
+    from triton.runtime import interpreter
+
+    replaced_for, run, done = interpreter._patch_lang, interpreter.GridExecutor.__call__, set()
+    languages = interpreter.tl, interpreter.tl.core
+
+    @cache
+    def visible(function: Callable) -> frozenset[int]:
+        """Which of the language's modules a function knows; each needs its own replacements."""
+        return frozenset(id(value) for value in function.__globals__.values() if any(value is x for x in languages))
+
+    def replaced_once(function: Callable) -> object:
+        known = visible(function) in done
+        done.add(visible(function))
+        return None if known else replaced_for(function)
+
+    def run_anew(self, *args: object, **options: object) -> None:  # a kernel, which takes its own back at its end
+        done.clear()
+        run(self, *args, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(interpreter, "_patch_lang", replaced_once)
+        patch.setattr(interpreter.GridExecutor, "__call__", run_anew)
+        yield
+
 
 ROWS, COLUMNS = 12, 5
 JOINTS = np.array([[0.0, 1.0, 0.0], [0.0, 1.3, 0.02], [0.3, 1.5, 0.0]])

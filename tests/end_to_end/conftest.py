@@ -62,8 +62,9 @@ def skirt(columns: int = 24, rows: int = 13) -> tuple[np.ndarray, np.ndarray]:
 
 def write_hero(path: Path) -> Path:
     """A pillar 1.7 m high, in metres, y up, with a skirt that nobody has rigged yet."""
-    body = trimesh.creation.cylinder(0.15, 1.7, sections=24).subdivide().subdivide()
-    points = body.vertices[:, [0, 2, 1]] * [1, 1, -1] + [0, 0.85, 0]
+    side = [(0.15, height) for height in np.linspace(0, 1.7, 16)]  # long triangles are near much of the cloth
+    body = trimesh.creation.revolve([(0, 0), *side, (0, 1.7)], sections=16)
+    points = body.vertices[:, [0, 2, 1]] * [1, 1, -1]
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, "Y")

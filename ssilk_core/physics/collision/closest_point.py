@@ -32,7 +32,7 @@ def triangle_patches(points: Floats, faces: Ints) -> Ints:
     """
     triangles = faces[compact_blocks(points[faces].mean(axis=1), PATCH_SIZE)]
     corners = np.concatenate([triangles, triangles[..., :1]], axis=-1)
-    return corners.transpose(0, 2, 1).reshape(len(triangles), -1).astype(np.int32)
+    return corners.transpose(0, 2, 1).reshape(len(triangles), 4 * PATCH_SIZE).astype(np.int32)
 
 
 def closest_on_faces(

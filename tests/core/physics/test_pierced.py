@@ -47,19 +47,20 @@ def arm() -> tuple[Body, Skeleton]:
     return Body(Mesh("/arm", points, shape.faces), skin), joints((0, 0, 0), (LENGTH / 2, 0, 0), parents=(-1, 0))
 
 
-def sheet(at: float, kind: int = LOOSE) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sheet(at: float, kind: int, half: float, rows: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A sheet across the arm at a place along x: points, faces, classes."""
-    grid = np.linspace(-SHEET, SHEET, 22)  # an even number, so that no vertex or edge lies on the axis
+    assert rows % 2 == 0, "no vertex or edge lies on the axis"
+    grid = np.linspace(-half, half, rows)
     y, z = (each.reshape(-1) for each in np.meshgrid(grid, grid + 0.003, indexing="ij"))
-    number = np.arange(22 * 22).reshape(22, 22)
+    number = np.arange(rows * rows).reshape(rows, rows)
     a, b, c, d = (part.reshape(-1) for part in (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]))
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
     return np.stack([np.full_like(y, at), y, z], axis=1), faces, np.full(len(y), kind)
 
 
-def dressed(scene: Scene, rest: float, kind: int = LOOSE) -> Scene:
+def dressed(scene: Scene, rest: float, kind: int = LOOSE, half: float = SHEET, rows: int = 22) -> Scene:
     body, skeleton = arm()
-    points, faces, classes = sheet(rest, kind)
+    points, faces, classes = sheet(rest, kind, half, rows)
     skin = SkinWeights("/sheet", np.zeros((len(points), 1), dtype=int), np.ones((len(points), 1)))
     garment = replace(scene.garment, mesh=Mesh("/sheet", points, faces), skin=skin, classes=classes)
     no_joints = {"joint_names": (), "parents": np.zeros(0, dtype=int), "bind_transforms": np.zeros((0, 4, 4))}
@@ -307,10 +308,15 @@ def test_crossings_are_those_that_solving_finds():
 def test_kernels_find_and_push_as_the_reference_does(scene):
     from ssilk_core.physics.kernels.crossings import crossings_kernel, replace_planes_kernel
 
-    whole = dressed(scene, 0.7)
+    whole = dressed(scene, 0.7, half=0.12, rows=8)  # 98 triangles, in two programs: the interpreter is slow
+    body, skeleton = with_board(whole)
+    axes, character = body_axes(body, skeleton), still(3, 4)
+    turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # the board beside the arm, its axis along x as well
+    character[2, :, :3, :3], character[2, :, 3, :3] = turn[..., None], torch.tensor([[0.2], [0.0], [2.07]])
     points = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)
-    x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3)], dim=-1)
-    limbs = LimbPoser(limb_axes(whole), _body(whole)[0], CPU).pose(still(2, 2))
+    x = torch.stack([points - torch.tensor([by, 0, 0]) for by in (0.0, 0.3, -0.2, 0.3)], dim=-1)
+    limbs = LimbPoser(axes, body, CPU).pose(character)
+    assert (len(axes.tips), len(character), x.shape[2], len(limbs.start)) == (2, 3, 4, 5)  # no two of them alike
     piercing = Piercing(whole, vertex_samples(len(x)), device=CPU)
     counts, _, triangle = piercing._caster.crossings(limbs.start, limbs.end, x)
     asked = (each.to(DEVICE) for each in (limbs.start, limbs.end, x, piercing._caster.faces))
@@ -318,10 +324,14 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
     assert torch.equal(own_counts.cpu().long(), counts) and counts.any()
     assert torch.equal(own_triangle.cpu(), triangle)
     pierced = piercing.find(x, limbs)
-    planes = torch.zeros_like(x), torch.zeros(len(x), 2)
+    hand = axes.tips.tolist().index(1)
+    found = pierced.radius > 0
+    assert found[hand].tolist() == [False, True, False, True]
+    assert found[1 - hand].tolist() == [True, True, False, False]
+    planes = torch.zeros_like(x), torch.zeros(len(x), 4)
     piercing.replace_planes(x, limbs, *planes)
     own = [torch.zeros_like(each, device=DEVICE) for each in planes]
     where = tuple(each.to(DEVICE) for each in (pierced.point, pierced.direction, pierced.tip, pierced.radius))
     replace_planes_kernel(piercing._rest.to(DEVICE), piercing._loose.to(DEVICE), where, SLOPE, *own)
     for mine, theirs in zip(own, planes):
-        assert torch.equal(mine.cpu(), theirs)
+        assert torch.equal(mine.cpu(), theirs) and theirs[..., 1].any() and theirs[..., 0].any()

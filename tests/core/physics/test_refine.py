@@ -32,10 +32,17 @@ def rollout(scene, toy_model, toy_motion):
     return motion, points
 
 
+KEPT: dict[tuple[object, ...], tuple[object, ...]] = {}  # with what it is of, whose place in memory is in the key
+
+
 def refined(scene, motion, points, **options):
-    """Refined vertices (F, V, 3) and what was changed in each frame."""
-    frames = list(Refiner(scene, CLOTH, RefineOptions(**options), fps=motion.fps).frames(motion, points))
-    return np.stack([frame.points for frame in frames]), [frame.change for frame in frames]
+    """Refined vertices (F, V, 3) and what was changed in each frame; what several tests ask for is computed once."""
+    key = id(scene), id(motion), id(points), clearing.ROUNDS, *sorted(options.items())
+    if key not in KEPT:
+        frames = list(Refiner(scene, CLOTH, RefineOptions(**options), fps=motion.fps).frames(motion, points))
+        changed = np.stack([frame.points for frame in frames]), [frame.change for frame in frames]
+        KEPT[key] = (*changed, scene, motion, points)
+    return KEPT[key][:2]
 
 
 def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
@@ -48,7 +55,7 @@ def test_no_frame_gains_energy_with_more_iterations(scene, rollout) -> None:
 
 
 def test_vertices_come_out_of_the_body(scene, rollout) -> None:
-    _, changes = refined(scene, *rollout, iterations=8)
+    _, changes = refined(scene, *rollout, iterations=9)
     summary = RefinementMeans(changes).figures()
     assert summary["inside the body before"] > 0.01 and summary["inside the body"] < 0.002
     assert summary["energy [J]"] < summary["energy before [J]"]
@@ -127,8 +134,8 @@ def test_a_cut_is_not_looked_back_over(scene, rollout) -> None:
     moved[5:, 0] += [20.0, 0.0, 0.0]
     points = points + np.where(np.arange(FRAMES) >= 5, 20.0, 0.0)[:, None, None] * [1, 0, 0]
     cut = replace(motion, translations=moved)
-    found, _ = refined(scene, cut, points, iterations=3, feedback=True)
-    after, _ = refined(scene, cut.clip(5, FRAMES), points[5:], iterations=3, feedback=True)
+    found, _ = refined(scene, cut, points, iterations=2, feedback=True, tolerance=0.05)
+    after, _ = refined(scene, cut.clip(5, FRAMES), points[5:], iterations=2, feedback=True, tolerance=0.05)
     np.testing.assert_allclose(found[5:], after, atol=1e-9)
 
 
@@ -156,4 +163,4 @@ def test_with_feedback_a_network_state_that_is_not_finite_is_refused(scene, roll
     broken = points.copy()
     broken[3, np.flatnonzero(scene.classes != PINNED)[0]] = np.nan  # the simulator's own starts are finite there
     with pytest.raises(SsilkError, match="first state of 1 of 1 frames has no finite energy"):
-        refined(scene, motion, broken, iterations=1, feedback=True)
+        refined(scene, motion, broken, iterations=1, feedback=True, tolerance=0.05)

@@ -48,7 +48,7 @@ def smoothing(mesh: Mesh, shapes: nn.Parameter, length: float = LENGTH) -> Shape
 )
 def test_a_wave_is_damped_as_its_length_says(shape, axis, wavelength):
     """S cos(k x) = cos(k x) / (1 + (k l)^2) in the middle of a sheet, far from its borders, whatever its mesh."""
-    mesh = sheet(61, 61, shape)
+    mesh = sheet(41, 41, shape)
     shapes = nn.Parameter(torch.zeros(mesh.vertex_count, 3, 1, dtype=torch.float64))
     away = mesh.points - mesh.points.mean(axis=0)
     middle = np.argmin(np.hypot(away[:, 0], away[:, 1]))
