@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's integration schemes, which its Figure 11 compares: Eqs. 3, 11 and 12.
 
-In each S may see the cloth (Figure 2). 'ssilk' has none of them. A script that trains, loads or measures such models calls `register` first.
+In each, S may see the cloth (Figure 2). 'ssilk' has none of them. A script that trains, loads or measures such models
+calls `register` first.
 """
 
 from __future__ import annotations

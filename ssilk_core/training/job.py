@@ -9,7 +9,10 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import fail
+from ..network.checkpoint import ModelFile
 from ..network.settings import ModelConfig
 from ..scene.assets import LOOSE, PINNED, Motion, Scene
 from ..scene.fabrics import Fabric
@@ -19,6 +22,8 @@ from .recombine import recombine_motions
 from .settings import TrainConfig
 from .state import json_round_trip, scene_digest
 
+STEPPER_SETTINGS = ("scheme", "max_latent_step", "feedback_points", "stiffness", "velocity_allowance")
+SAME = 1e-4  # [m], and without unit; model files may store single precision
 MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extra motions are left out for it
 
 
@@ -34,6 +39,8 @@ class TrainJob:
         output: the model file to write; the run's other files go to the same folder.
         inputs: hashes of the input files by name, for the provenance.
         minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
+        base: a trained model of the same scene, whose initialiser and decoder stay as they are while a new stepper
+            learns; None to train all.
     """
 
     scene: Scene
@@ -47,8 +54,15 @@ class TrainJob:
     resume: bool = False
     inputs: dict[str, str] | None = None
     minutes: float | None = None
+    base: ModelFile | None = None
 
     def __post_init__(self) -> None:
+        if self.base:
+            _need_same_scene(self.base, self.scene)
+            own = {name: getattr(self.model, name) for name in STEPPER_SETTINGS}
+            object.__setattr__(self, "model", replace(self.base.config, **own))
+            # There is no P to train on single poses.
+            object.__setattr__(self, "train", replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1))
         if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
         if self.model.scheme == "quasi_static":  # there are no previous states to vary
@@ -107,6 +121,33 @@ class TrainJob:
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
             }
+        )
+
+
+def _need_same_scene(base: ModelFile, scene: Scene) -> None:
+    """Raise `SsilkError` unless a model was trained on this garment, with this rig and skeleton."""
+    own = base.scene
+    alike = own.joint_names == scene.joint_names and all(
+        np.array_equal(mine, theirs)
+        for mine, theirs in (
+            (own.garment.mesh.faces, scene.garment.mesh.faces),
+            (own.classes, scene.classes),
+            (own.parents, scene.parents),
+        )
+    )
+    alike = alike and all(
+        np.allclose(mine, theirs, atol=SAME)
+        for mine, theirs in (
+            (own.garment.mesh.points, scene.garment.mesh.points),
+            (own.bind_transforms, scene.bind_transforms),
+        )
+    )
+    if not alike:
+        fail(
+            scene.garment.mesh.path,
+            "another garment, rig or skeleton than the given model was trained on",
+            "a stepper is trained for the initialiser and decoder of the same scene",
+            "train a whole model",
         )
 
 

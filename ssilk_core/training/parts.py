@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..events import Message, Reporter, format_count, silent
+from ..network.checkpoint import ModelFile
 from ..network.model.network import GarmentModel, model_joints
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
 from ..physics.energy import GarmentEnergy
@@ -98,9 +99,12 @@ def build_parts(
     every = [*motions, *job.held_out]
     report(Message(f"the body is posed in {format_count(len(every), 'motions')}, to find what the garment can touch"))
     reach = reachable_body(scene, every)
-    joints = model_joints(scene, reach.joints)
+    joints = job.base.joints if job.base else model_joints(scene, reach.joints)
     report(Message(f"the network and its inputs are built on {device}"))
-    model = GarmentModel(scene, job.model, joints, job.train.seed).to(device)
+    model = GarmentModel(scene, job.model, joints, job.train.seed)
+    if job.base:
+        _keep_all_but_the_stepper(model, job.base)
+    model = model.to(device)
     bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
     held = build_bank(job.held_out, skeleton, joints, fps, device)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, scene.classes, device=device)
@@ -112,7 +116,16 @@ def build_parts(
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, fps)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
-    smoothing = ShapeSmoothing.of(model, job.train.shape_smoothing)
+    smoothing = None if job.base else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
     return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)
+
+
+def _keep_all_but_the_stepper(model: GarmentModel, base: ModelFile) -> None:
+    """Give a network the initialiser and decoder of a trained one, and no gradients to them."""
+    learns = ("stepper.", "integrator.")
+    kept = {name: torch.from_numpy(value.copy()) for name, value in base.parameters.items()}
+    model.load_state_dict({name: value for name, value in kept.items() if not name.startswith(learns)}, strict=False)
+    for name, parameter in model.named_parameters():
+        parameter.requires_grad_(name.startswith(learns))

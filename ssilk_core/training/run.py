@@ -241,7 +241,7 @@ class TrainingRun:
             reason = "" if self.job.has_loose else "no vertex is loose; "
             self.report(Message(f"{path}: {reason}the garment is quasi-static and gets no stepper."))
         rough = self.parts.smoothing is None and self.parts.model.decoder.shapes.numel() > 0
-        if self.config.shape_smoothing and rough:
+        if self.config.shape_smoothing and rough and not self.job.base:
             text = f"{path}: steps of blendshapes of more than {MOST_SMOOTHED_VERTICES:,} vertices are not smoothed."
             self.report(Message(text))
         detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}

@@ -201,6 +201,8 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
     }
     parts: dict[str, list[nn.Parameter]] = {name: [] for name in scales}
     for name, value in model.named_parameters():
+        if not value.requires_grad:
+            continue
         if name.startswith("integrator."):
             parts["integrator"].append(value)
         elif "skin_offset" in name:

@@ -152,7 +152,8 @@ class SpringVerlet(Integrator):
     def precompute(self, stepper: nn.Module, rest: Tensor, pose: Tensor, features: int) -> tuple[Tensor, ...]:
         """Return the quasi-static state, the pose, the output of S at rest there, and |rates| / 20."""
         static, rates = pose.tensor_split([pose.shape[1] - self.rates], dim=1)
-        zero, unseen = torch.zeros_like(rest), rest.new_zeros(len(rest), features)
+        # Not `len`, which would be a constant of an exported graph.
+        zero, unseen = torch.zeros_like(rest), rest.new_zeros(rest.shape[0], features)
         at_rest = self._evaluate(stepper, rest, zero, zero, static, torch.zeros_like(rates), unseen)
         return rest, pose, at_rest, RATE_ALLOWANCE * length(rates)
 
