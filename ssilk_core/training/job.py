@@ -62,7 +62,8 @@ class TrainJob:
             own = {name: getattr(self.model, name) for name in STEPPER_SETTINGS}
             object.__setattr__(self, "model", replace(self.base.config, **own))
             # There is no P to train on single poses.
-            object.__setattr__(self, "train", replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1))
+            train = replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1)
+            object.__setattr__(self, "train", train)
         if not self.has_loose:
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
         if self.model.scheme == "quasi_static":  # there are no previous states to vary
