@@ -6,6 +6,7 @@ stored as the network's frames are, as joints and blendshapes.
 """
 
 from .options import LatentOptions
+from .roller import LatentRoller, frames_to_solve
 from .solver import LatentSolution, LatentSolver
 
-__all__ = ["LatentOptions", "LatentSolution", "LatentSolver"]
+__all__ = ["LatentOptions", "LatentRoller", "LatentSolution", "LatentSolver", "frames_to_solve"]
