@@ -87,6 +87,11 @@ class _State:
     distance: SmoothedDistance | None
     energy: Tensor
 
+    def select(self, frames: Tensor) -> _State:
+        """Return the state of the frames with indices (M,)."""
+        distance = self.distance and self.distance.select(frames)
+        return _State(self.z[frames], self.x[..., frames], distance, self.energy[frames])
+
     def where(self, chosen: Tensor, other: _State) -> _State:
         """Return the state with the frames `chosen` (N,) of another one."""
         distance = self.distance
@@ -166,22 +171,33 @@ class LatentSolver:
         hessian = potential.hessian(state.x, inputs, state.distance)
         return decoded, NormalEquations.of(decoded.jacobian, gradient, hessian, self.free_mass / inputs.dt**2)
 
-    def _state(
-        self, z: Tensor, character: Tensor, inputs: StepInputs, distance: SmoothedDistance | None = None
-    ) -> _State:
-        """Return the state of latents, at given distances instead of their own where there are any."""
+    def _state(self, z: Tensor, character: Tensor, inputs: StepInputs, near: _State | None = None) -> _State:
+        """Return the state of latents; one that is `near`, of the same frames, saves time."""
         x = self.decode(z, character, inputs)
-        distance = distance or self.potential.body_distance(x, inputs)
+        if near is None:
+            distance = self.potential.body_distance(x, inputs)
+        else:
+            distance = self.potential.body_distance_nearby(x, inputs, near.distance, near.x)
+        return self._with_energy(z, x, inputs, distance)
+
+    def _on_planes(self, z: Tensor, character: Tensor, inputs: StepInputs, of: _State) -> _State:
+        """Return the state of latents with the distances to the body's planes at another state, without a query."""
+        return self._with_energy(z, self.decode(z, character, inputs), inputs, of.distance)
+
+    def _with_energy(self, z: Tensor, x: Tensor, inputs: StepInputs, distance: SmoothedDistance | None) -> _State:
         energy = self.potential.energy(x, inputs, distance)
         return _State(z, x, distance, energy.nan_to_num(nan=torch.inf))
 
     def _best(self, starts: Sequence[Tensor], character: Tensor, inputs: StepInputs) -> _State:
-        best: _State | None = None
-        for start in starts:
-            z = start.to(self.potential.dtype).clamp(-self.bound, self.bound)
-            state = self._state(z, character, inputs)
-            best = state if best is None else best.where(state.energy < best.energy, state)
-        assert best is not None
+        first, *others = (start.to(self.potential.dtype).clamp(-self.bound, self.bound) for start in starts)
+        best = self._state(first, character, inputs)
+        for z in others:
+            if not self.options.exact_contact:
+                lower = self._on_planes(z, character, inputs, best).energy < best.energy
+                if not bool(lower.any()):
+                    continue
+            state = self._state(z, character, inputs, best)
+            best = best.where(state.energy < best.energy, state)
         return best
 
 
@@ -214,7 +230,7 @@ class _LatentSearch:
         found, trial = self._least(steps)
         lower = wanted & (found.energy < self.state.energy)
         if not self.solver.options.exact_contact:
-            found = self.solver._state(found.z, self.character, self.inputs)
+            found = self.solver._state(found.z, self.character, self.inputs, self.state)
             lower &= found.energy < self.state.energy
         self.state, self.stale = self.state.where(lower, found), bool(lower.any())
         self.failed, self.iterations = wanted & ~lower, self.iterations + lower
@@ -229,14 +245,11 @@ class _LatentSearch:
         z = (self.state.z + (lengths * steps).to(self.state.z.dtype)).clamp(-solver.bound, solver.bound)
         every = torch.arange(frames, device=z.device).repeat(count)
         character, inputs = self.character[..., every], self.inputs.select(every)
-        distance = None
-        if not solver.options.exact_contact and self.state.distance is not None:
-            distance = self.state.distance.select(every)
-        tried = solver._state(z.flatten(0, 1), character, inputs, distance)
+        here, z = self.state.select(every), z.flatten(0, 1)
+        tried = (solver._state if solver.options.exact_contact else solver._on_planes)(z, character, inputs, here)
         best = tried.energy.reshape(count, frames).argmin(0)
         at = best * frames + every[:frames]
-        distance = tried.distance and tried.distance.select(at)
-        return _State(tried.z[at], tried.x[..., at], distance, tried.energy[at]), best
+        return tried.select(at), best
 
     def _held(self, gradient: Tensor) -> Tensor:
         """Return which latents lie on the bound, with a force that presses them against it, shape (N, m)."""

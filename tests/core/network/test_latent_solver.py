@@ -19,6 +19,7 @@ from ssilk_core.network.latent_solver.slopes import limited_slopes, mlp_slopes
 from ssilk_core.network.latent_solver.warm_start import FrameDescriptors, network_step
 from ssilk_core.network.model.decoder import limited
 from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.physics.collision import SmoothedDistance, contacts
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.simulator import StepHistory
@@ -168,6 +169,29 @@ def test_with_many_iterations_nothing_pulls_any_more(frames, exact) -> None:
     assert bool(result.converged.all()) and not bool(result.failed.any())
     assert float(after.abs().max()) < 1e-6 * float(before.abs().max())
     assert bool((result.left_share < 1e-9).all())
+
+
+@pytest.mark.parametrize("moved", [1e-4, 3e-3, 0.05])
+def test_distances_found_nearby_give_the_same_energy_and_derivatives(frames, monkeypatch, moved) -> None:
+    found = frames()
+    potential, inputs = found.potential, found.inputs
+    at = inputs.skinned + torch.tensor([0.0, 0.0, 0.02]).double()[:, None]  # it touches the ball
+    known = potential.body_distance(at, inputs)
+    x = at + moved * torch.randn(at.shape, generator=torch.Generator().manual_seed(4)).double()
+    queried, query = [], contacts.smoothed_planes
+
+    def counted(x: Tensor, *args: object, **options: object) -> SmoothedDistance:
+        queried.append(len(x))
+        return query(x, *args, **options)
+
+    monkeypatch.setattr(contacts, "smoothed_planes", counted)
+    near, full = potential.body_distance_nearby(x, inputs, known, at), potential.body_distance(x, inputs)
+    assert moved > 0.01 or sum(queried[:-2]) < 0.8 * sum(queried[-2:])
+    assert float(potential.collision(x, full).sum()) > 1e-6
+    torch.testing.assert_close(potential.energy(x, inputs, near), potential.energy(x, inputs, full))
+    torch.testing.assert_close(potential.gradient(x, inputs, near), potential.gradient(x, inputs, full))
+    blocks = (potential.hessian(x, inputs, distance).blocks for distance in (near, full))
+    torch.testing.assert_close(*blocks)
 
 
 class LinearDecoder:
