@@ -112,7 +112,7 @@ class FreeDecoder(nn.Module):
         jacobian = self._by_proxies(rest, self.chain.slopes(own, d_own, matrices))
         if len(self.shapes) and self.shapes.shape[-1]:
             turned_shapes = torch.einsum("uabn,ubk->nuak", affine[:, :, :3], self.shapes).flatten(1, 2)
-            jacobian = torch.baddbmm(jacobian, turned_shapes, self._read(d_activation, dim=1))
+            jacobian = jacobian.baddbmm_(turned_shapes, self._read(d_activation, dim=1))
         return DecodedPoints(transform_points(affine, rest), jacobian)
 
     def _values(self, delta: Tensor) -> Tensor:

@@ -29,7 +29,7 @@ class LatentOptions:
     iterations: int = 2
     first_iterations: int = 20
     tolerance: float = 1e-2
-    damping: float = 0.03
+    damping: float = 0.1
     exact_contact: bool = False
 
     def __post_init__(self) -> None:

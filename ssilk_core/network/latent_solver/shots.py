@@ -27,7 +27,7 @@ from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
 from .options import LatentOptions
 from .solver import LatentSolution, LatentSolver
-from .warm_start import FrameDescriptors, network_step
+from .warm_start import FrameDescriptors, warm_starts
 
 DOWN = (0.0, -1.0, 0.0)
 LOOK_BACK = 2  # earlier frames that descriptors need
@@ -154,7 +154,7 @@ class LatentShots:
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
         else:
-            starts, iterations = [network_step(self.model, past.before, past.now, seen), past.now], None
+            starts, iterations = warm_starts(self.model, past.before, past.now, seen), None
         found = self.solver.solve(starts, poses.matrices, inputs, iterations)
         lost = ~(found.energy.isfinite() & found.z.isfinite().all(1))
         recovering = torch.zeros_like(found.iterations) if past is None else past.recovering

@@ -27,7 +27,7 @@ from .free_decoder import DecodedPoints, FreeDecoder
 from .normal_equations import NormalEquations, reduce_forces
 from .options import LatentOptions
 
-TRIALS = ((1.0, 1.0), (30.0, 1.0), (30.0, 0.25))  # factors of a frame's damping, and lengths of the steps
+TRIALS = ((1.0, 1.0), (20.0, 1.0), (20.0, 0.25))  # factors of a frame's damping, and lengths of the steps
 RELAXED, TIGHTENED = 0.3, 100.0  # factors of a frame's damping once the first trial was best, or none was good
 DAMPING_RANGE = (1e-6, 1e9)
 ROUNDING = 8  # units in the last place of an energy that are not told apart
@@ -132,7 +132,7 @@ class LatentSolver:
         """Minimise each frame from the start with the least energy.
 
         Args:
-            starts: latents, each (N, m).
+            starts: latents, each (N, m); it takes the least time where the first is the best.
             character: skinning matrices of the character's joints, in the coordinates of `inputs`, (J, 3, 4, N).
             inputs: of the energy, with the garment under linear blend skinning.
             iterations: those of the options by default.

@@ -132,7 +132,8 @@ class Contacts:
             return self.smoothed(x, body)
         distance, moved = known.distance(at), (x - at).norm(dim=1)
         sure = ((1 - SMOOTHED_BELOW) * distance - moved > within) & (known.distance(x) > within)
-        sure &= distance + moved < MAX_DEPTH  # what is deeper than that inside the body looks as if it were outside
+        # What is deeper than that inside the body touches nothing, and has the distance of what is outside.
+        sure &= (distance + moved < MAX_DEPTH) | (distance - moved > MAX_DEPTH)
         sure &= known.normal.square().sum(1) > SHORT_GRADIENT**2
         near = ~sure.all(1)
         found = SmoothedDistance(*(values.clone() for values in known.tensors()))
