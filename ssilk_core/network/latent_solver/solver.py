@@ -27,8 +27,11 @@ from .free_decoder import DecodedPoints, FreeDecoder
 from .normal_equations import NormalEquations, reduce_forces
 from .options import LatentOptions
 
-TRIALS = ((1.0, 1.0), (20.0, 1.0), (20.0, 0.25))  # factors of a frame's damping, and lengths of the steps
-RELAXED, TIGHTENED = 0.3, 100.0  # factors of a frame's damping once the first trial was best, or none was good
+# Factors of a frame's damping, each of which is tried, and the length of the step. States curve: more damping often
+# finds less energy than a shorter step.
+TRIALS = ((1.0, 1.0), (0.1, 1.0), (10.0, 1.0), (100.0, 1.0), (100.0, 0.25))
+ADAPTED = 0.5  # the exponent of the best trial's factor, by which a frame's damping changes
+TIGHTENED = 100.0  # the factor where no trial was good
 DAMPING_RANGE = (1e-6, 1e9)
 ROUNDING = 8  # units in the last place of an energy that are not told apart
 
@@ -221,9 +224,10 @@ class _LatentSearch:
         if self.stale:
             self.decoded, self.model = self.solver._model(self.state, self.character, self.inputs)
             self.stale = False
-        factors = self.damping.new_tensor([factor for factor, _ in TRIALS])[:, None] * self.damping
+        factors = self.damping.new_tensor([factor for factor, _ in TRIALS])
         usual = torch.full_like(self.damping, self.solver.options.damping)
-        steps, promised = self.model.steps(torch.cat([factors, usual[None]]), self._held(self.model.gradient))
+        dampings = torch.cat([factors[:, None] * self.damping, usual[None]])
+        steps, promised = self.model.steps(dampings, self._held(self.model.gradient))
         steps, wanted = steps[:-1], promised[-1] > self.allowed
         if not bool(wanted.any()):
             return False
@@ -234,7 +238,7 @@ class _LatentSearch:
             lower &= found.energy < self.state.energy
         self.state, self.stale = self.state.where(lower, found), bool(lower.any())
         self.failed, self.iterations = wanted & ~lower, self.iterations + lower
-        change = torch.where(lower, torch.where(trial == 0, RELAXED, 1.0), TIGHTENED)
+        change = torch.where(lower, factors[trial] ** ADAPTED, TIGHTENED)
         self.damping = torch.where(wanted, (self.damping * change).clamp(*DAMPING_RANGE), self.damping)
         return True
 

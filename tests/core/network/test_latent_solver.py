@@ -249,6 +249,12 @@ def test_shots_that_are_solved_together_come_out_as_each_by_itself(scene, toy_mo
             torch.testing.assert_close(frame.solution.x[..., shot], alone.solution.x[..., 0], rtol=0, atol=1e-5)
 
 
+def test_a_garment_without_a_stepper_is_solved_for_too(scene, toy_model, toy_motion) -> None:
+    made = LatentShots(toy_model(scene, scheme="quasi_static"), CLOTH, LatentOptions(), precision="float32")
+    found = [frame.solution for frame in made.frames([toy_motion(scene, 4)])]
+    assert all(bool((each.energy < each.start_energy).all()) for each in found)
+
+
 def test_a_state_presses_against_the_bound_and_does_not_pass_it(frames) -> None:
     found = frames(latent_bound=0.3)
     result = found.solver.solve([found.z], found.character, found.inputs)
