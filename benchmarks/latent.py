@@ -91,7 +91,8 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     character, file = read_character(demo_body_path()), load_model(shipped_path(options.garment))
     scene, device = replace(file.scene, character=character), select_device(options.device)
-    model, found = network(file, scene).to(device), []
+    model = network(file, scene).to(device)
+    found: list[tuple[str, ...]] = []
     for name in options.motion:
         whole = build_motion(name, character.skeleton)
         starts = range(options.first, options.first + options.shots)

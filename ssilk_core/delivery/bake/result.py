@@ -160,7 +160,7 @@ class LatentSummary:
     Attributes:
         iterations: of the solver in each frame, at most; the first of a shot has more.
         frames: that were solved.
-        energy_before_j, energy_j: mean energies of the network's step and of the solution [J].
+        energy_before_j, energy_j: mean energies of the best of the starts and of the solution [J].
         left: mean share of the energy that the solver's model still promised, of that and what was gained.
         unconverged: frames with more left than the tolerance.
         failed: frames among them whose last line search found nothing lower.
