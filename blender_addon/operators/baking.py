@@ -45,6 +45,7 @@ ABOUT = {
     "crowd": "For many characters, far away: few shapes and proxies, four influences",
     "game": "For real time: some shapes and proxies, four influences",
     "film": "What cannot be told from the whole model",
+    "latent": "The model's own bones and shapes, with motion from a solver; takes a while",
     "hero": "Carried on by a solver, on bones and shape keys of this shot's own; takes long",
 }
 QUALITY_ITEMS = [

@@ -8,6 +8,10 @@ stage for each shot. Layers that are current are left alone.
 A file that fails verification (exit code 3) is not kept, and an older file of its name stays as it was. --lbs bakes
 the same garments under linear blend skinning, to compare with.
 
+--latent-iterations replaces the network's step by a solver in the model's own latents: in every frame it lowers the
+simulator's energy, from where the network would step to. What is written has the size of the network's shot, and no
+shape that the model lacks. The result says how many frames have not converged.
+
 --refine continues from the network with the simulator's solver in every frame: it lowers the energy of each frame,
 and adds wrinkles that no blendshape of the model has. The course of the cloth stays the network's. With --feedback
 each frame goes on from what the last ones became, and the cloth follows the solver; with enough iterations this is

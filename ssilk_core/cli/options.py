@@ -197,6 +197,13 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         help="refined frames look back on refined ones: the garment follows the solver, not the network",
     )
     verb.add_argument(
+        "--latent-iterations",
+        type=NumberRange(0, MAX_REFINE, int),
+        default=0,
+        metavar="N",
+        help="iterations of a solver in the model's latents in each frame, instead of the network's step (default 0)",
+    )
+    verb.add_argument(
         "--refined-output",
         choices=REFINED_OUTPUTS,
         default=REFINED_OUTPUTS[0],
@@ -250,6 +257,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             lbs=options.lbs,
             refine=options.refine,
             feedback=options.feedback,
+            latent_iterations=options.latent_iterations,
             refined_output=options.refined_output,
             hide_covered=options.hide_covered,
             device=options.device,

@@ -28,6 +28,7 @@ STILL_THRESHOLD = 1e-7  # [rad, m]; a character that moves less holds still
 REST_THRESHOLD = 3e-5  # change of a latent in one frame below which it is at rest
 
 OnRecovery = Callable[[range], None]
+Roller = Callable[[Motion], Iterator["RolloutBlock"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,19 +174,22 @@ def garment_poses(
     on_recovery: OnRecovery = ignore_recovery,
     *,
     pre_roll: float = 0.0,
+    roller: Roller | None = None,
 ) -> Iterator[GarmentPose]:
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
     The model rolls at its own rate; where the shot's differs, rotations are interpolated by slerp and weights by
     lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment restarts from
     the initialiser, `pre_roll` seconds before (see `roll`), and nothing is interpolated across it. `on_recovery` is
-    told the shot's frames of which `roll_blocks` had to take the rest state.
+    told the shot's frames of which `roll_blocks` had to take the rest state. `roller` takes the place of `roll`, with
+    a run-up of its own: it yields blocks of a motion without cuts, at the model's rate.
     """
+    rolled = roller or (lambda span: roll(model, span, chunk, pre_roll=pre_roll))
     first = source_frame = 0
     for span in split_at_cuts(motion):
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
-        steps = roll(model, resample(span, model.config.fps, cover=True), chunk, pre_roll=pre_roll)
+        steps = rolled(resample(span, model.config.fps, cover=True))
         poses = _file_poses(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
         for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
             yield replace(pose, start=first + pose.start)

@@ -28,6 +28,8 @@ class Quality:
         fps: highest frame rate of a shot [1/s]; None for that of its motion.
         refine: solver iterations per frame, starting from the network's state.
         feedback: refined frames look back on refined ones.
+        latent_iterations: iterations per frame of the solver in the model's latents, which takes the place of the
+            network's own steps; 0 for these.
         about: one-line description.
     """
 
@@ -38,6 +40,7 @@ class Quality:
     fps: float | None = None
     refine: int = 0
     feedback: bool = False
+    latent_iterations: int = 0
     about: str
 
     @property
@@ -55,6 +58,7 @@ QUALITIES = {
         Quality(name="crowd", shapes=12, joints=8, influences=4, fps=15.0, about="many characters, far away"),
         Quality(name="game", shapes=32, joints=16, influences=4, fps=30.0, about="real time, four influences"),
         Quality(name="film", shapes=48, about="no visible difference from the full model"),
+        Quality(name="latent", latent_iterations=2, about="the full model, its states solved for: slow, no larger"),
         Quality(name="hero", refine=8, feedback=True, about="the full model, carried on by the solver"),
     )
 }

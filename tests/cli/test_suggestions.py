@@ -51,7 +51,7 @@ def test_names_that_resemble_none_get_no_suggestion(capsys):
         "error: ssilk bake: no such option '--xyzzy'; 'ssilk bake --help' lists what is allowed."
     )
     line = told(capsys, f"{BAKE} --quality q")
-    assert "'q'; it is one of crowd, game, film, hero" in line and "did you mean" not in line
+    assert "'q'; it is one of crowd, game, film, latent, hero" in line and "did you mean" not in line
 
 
 def test_an_option_that_is_missing_is_named_where_no_other_is_mistyped(capsys):

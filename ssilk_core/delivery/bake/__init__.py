@@ -13,7 +13,7 @@ from .character import on_character
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
-from .result import BakeResult, FrameSpan, RefinementSummary, Verification
+from .result import BakeResult, FrameSpan, LatentSummary, RefinementSummary, Verification
 from .rollout import BakeRollout
 from .sizing import shot_bytes, stored_bytes
 from .task import BakeTask, plan_layers
@@ -22,8 +22,8 @@ from .verification import verify
 from .write import bake
 
 __all__ = [
-    "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LayerFolder", "LoadedGarment",
-    "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment", "load_rollout",
-    "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories", "stored_bytes",
-    "trained_deformer", "verify", "with_model",
+    "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
+    "LoadedGarment", "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment",
+    "load_rollout", "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories",
+    "stored_bytes", "trained_deformer", "verify", "with_model",
 ]  # fmt: skip

@@ -16,6 +16,7 @@ from ...work_record import is_file
 from ..targets import check_influences
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
+from .latents import solved
 from .load import LoadedGarment, load_garment
 from .names_used import GarmentUse, UsedNames, need_distinct_case, write_use
 from .origin import shot_metadata
@@ -263,7 +264,7 @@ def _write_layer(
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
     from ssilk_usd.shots import layers
 
-    rollout = refined(rollout, report, add_shapes=True)
+    rollout = refined(solved(rollout, report), report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
     meter = ShownSkinMeter(rollout)
     common: dict[str, Any] = {

@@ -23,10 +23,16 @@ def shot_metadata(rollout: BakeRollout, output: Path, shown_skin: Mapping[str, o
         shown_skin: figures of the covered skin that shows.
     """
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
+    solved = {"solved in latents": rollout.latents.summary.to_metadata()} if rollout.latents else {}
     request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
     return {
-        **rollout.provenance, "request": request, "recovered": rollout.recovered, "shown_skin": shown_skin, **refined
-    }  # fmt: skip
+        **rollout.provenance,
+        "request": request,
+        "recovered": rollout.recovered,
+        "shown_skin": shown_skin,
+        **solved,
+        **refined,
+    }
 
 
 def _from_folder(location: str, folder: Path) -> str:

@@ -47,6 +47,8 @@ class BakeRequest:
         refine: iterations of the simulator's solver in each frame, from the network's state; 0 for none.
         feedback: refined frames look back on refined frames, one after the other; else inertia holds each where the
             network has it.
+        latent_iterations: iterations per frame of the solver in the model's latents, which takes the place of the
+            network's own steps (`network.latent_solver`); 0 for these.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
@@ -71,6 +73,7 @@ class BakeRequest:
     lbs: bool = False
     refine: int = 0
     feedback: bool = False
+    latent_iterations: int = 0
     refined_output: str = "joints"
     hide_covered: bool = False
     keep: ModelSize | None = None
@@ -96,6 +99,12 @@ class BakeRequest:
             fail("--fps", f"{self.fps:g} frames per second", ALLOWED_FPS)
         if not 0 <= self.refine <= MAX_REFINE or int(self.refine) != self.refine:
             fail("--refine", f"{self.refine:g} iterations", f"1 to {MAX_REFINE} are allowed, or 0 for none")
+        if not 0 <= self.latent_iterations <= MAX_REFINE or int(self.latent_iterations) != self.latent_iterations:
+            found = f"{self.latent_iterations:g} iterations"
+            fail("--latent-iterations", found, f"1 to {MAX_REFINE} are allowed, or 0 for none")
+        if self.lbs and self.latent_iterations:
+            found = "linear blend skinning has no latents"
+            fail("--latent-iterations", found, "only the network has them", "leave one of them out")
         if self.feedback and not self.refine:
             found, allowed = "no --refine", "it says what refined frames look back on"
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")

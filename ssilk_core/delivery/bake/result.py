@@ -154,6 +154,40 @@ class RefinementSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
+class LatentSummary:
+    """How well states were solved for in latents, at the model's rate, run-up included.
+
+    Attributes:
+        iterations: of the solver in each frame, at most; the first of a shot has more.
+        frames: that were solved.
+        energy_before_j, energy_j: mean energies of the best of the starts and of the solution [J].
+        left: mean share of the energy that the solver's model still promised, of that and what was gained.
+        unconverged: frames with more left than the tolerance.
+        failed: frames among them whose last line search found nothing lower.
+    """
+
+    iterations: int
+    frames: int
+    energy_before_j: float
+    energy_j: float
+    left: float
+    unconverged: int
+    failed: int
+
+    def to_metadata(self) -> dict[str, float]:
+        """Return figures of four digits, as a shot stores them."""
+        return {
+            "iterations": self.iterations,
+            "frames": self.frames,
+            "energy before [J]": float(f"{self.energy_before_j:.4g}"),
+            "energy [J]": float(f"{self.energy_j:.4g}"),
+            "left of the gain": float(f"{self.left:.4g}"),
+            "frames not converged": self.unconverged,
+            "line searches that failed": self.failed,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
 class BakeResult:
     """A written shot, or a layer of one.
 
@@ -167,6 +201,7 @@ class BakeResult:
         verification: None where none was asked for.
         reduction: what was kept of the model, where less than all.
         refinement: what the solver changed, where it was asked to.
+        latent: how well states were solved for in latents, where that was asked for.
         shapes: how the vertices of another simulator became joints and blendshapes; None where nothing was fitted.
         hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
@@ -184,6 +219,7 @@ class BakeResult:
     verification: Verification | None = None
     reduction: SizeReduction | None = None
     refinement: RefinementSummary | None = None
+    latent: LatentSummary | None = None
     shapes: ShotShapes | None = None
     hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
@@ -195,6 +231,7 @@ class BakeResult:
         if self.current:
             return {kind: str(self.path), "current": True}
         refined = self.refinement.figures() if self.refinement else {}
+        latent = self.latent.to_metadata() if self.latent else {}
         return {
             kind: str(self.path),
             "frames": self.frames,
@@ -204,6 +241,7 @@ class BakeResult:
             "blendshapes": self.blendshapes,
             "bytes": self.size_bytes,
             **(self.reduction.to_metadata() if self.reduction else {}),
+            **{f"latents: {name}": value for name, value in latent.items()},
             **{f"refined: {name}": value for name, value in refined.items()},
             **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary("time code") if self.shown_skin else {}),

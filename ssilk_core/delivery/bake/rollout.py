@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -16,13 +16,14 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import deform, lbs_poses, slerp, split_at_cuts
 from .inputs import InputHashes
 from .request import BakeRequest
-from .result import FrameSpan, RefinementSummary
+from .result import FrameSpan, LatentSummary, RefinementSummary
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
     from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
 
+    from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
 
 CHUNK = 256  # frames in memory at once
@@ -44,6 +45,14 @@ class Refinement:
 
 
 @dataclass(frozen=True, eq=False)
+class SolvedLatents:
+    """The poses of states that were solved for in latents, all in memory: 4 MB for 1,000 frames; and how it went."""
+
+    poses: tuple[GarmentPose, ...]
+    summary: LatentSummary
+
+
+@dataclass(frozen=True, eq=False)
 class BakeRollout:
     """A garment over a motion at the rate of the shot's samples.
 
@@ -61,6 +70,7 @@ class BakeRollout:
         record: how the garment's model was made.
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
+        latents: the network's poses, once `solved` has found them in latents.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
     """
@@ -81,6 +91,7 @@ class BakeRollout:
     frames: FrameRange | None = None
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
+    latents: SolvedLatents | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
 
     @property
@@ -100,26 +111,54 @@ class BakeRollout:
         else:
             yield from self.refinement.poses
 
-    def network_poses(self) -> Iterator[GarmentPose]:
-        """Yield the network's poses, some frames at a time."""
+    def network_poses(self, roller: LatentRoller | None = None) -> Iterator[GarmentPose]:
+        """Yield the network's poses, some frames at a time.
+
+        Args:
+            roller: solves for them, where the request says so; one of its own by default.
+        """
+        if self.latents is not None:
+            yield from self.latents.poses
+            return
         if self.model is None:
             yield from lbs_poses(self.motion.frame_count)
             return
+        if roller is None and self.request.latent_iterations:
+            roller = self.latent_roller()
         from ...network.rollout import garment_poses
 
         self.recovered.clear()
         rate, pre_roll = self.motion.fps, self.request.pre_roll
-        driver = _from_fraction(self.source, self._source_frame(-self.lead))
+        driver = self._driver()
         stop = self.lead + self.motion.frame_count
-        for pose in garment_poses(self.model, driver, rate, CHUNK, self._note, pre_roll=pre_roll):
+        for pose in garment_poses(self.model, driver, rate, CHUNK, self._note, pre_roll=pre_roll, roller=roller):
             shown = slice(max(self.lead - pose.start, 0), max(stop - pose.start, 0))
             part = pose.part(shown)
             if part.frame_count:
                 yield replace(part, start=part.start - self.lead)
 
+    def latent_roller(self, advanced: Callable[[], object] = lambda: None) -> LatentRoller:
+        """Return what solves for the network's states in latents; `advanced` is called after each frame."""
+        from ...network.latent_solver import LatentOptions, LatentRoller
+
+        assert self.model is not None
+        options = LatentOptions(iterations=self.request.latent_iterations)
+        return LatentRoller(self.model, self.fabric, options, pre_roll=self.request.pre_roll, advanced=advanced)
+
+    def latent_frames(self) -> int:
+        """Return how many frames a solver in latents has to solve, at the model's rate."""
+        from ...network.latent_solver import frames_to_solve
+
+        assert self.model is not None
+        return frames_to_solve(self._driver(), self.model.config.fps, self.request.pre_roll)
+
+    def _driver(self) -> Motion:
+        """Return the motion that is rolled over, from the first sample of the lead on, at its own rate."""
+        return _from_fraction(self.source, self._source_frame(-self.lead))
+
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
-        return replace(self, motion=self.whole, lead=0, recovered=[])
+        return replace(self, motion=self.whole, lead=0, latents=None, recovered=[])
 
     def _source_frame(self, sample: int) -> float:
         """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""

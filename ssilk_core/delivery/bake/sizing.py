@@ -60,7 +60,7 @@ def load_sized(
     size = size_at(quality, reducer.whole)
     size = replace(size, influences=min(size.influences, most))
     if budget:
-        at_fps = load_rollout(request)
+        at_fps = load_rollout(replace(request, latent_iterations=0))  # solved states take as many bytes
 
         def size_bytes(file: ModelFile) -> float:
             found = shot_bytes(with_model(at_fps, file), suffix, include_body=include_body)
@@ -81,7 +81,12 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
         )
     if quality:
         level = quality_named(quality)
-        request = replace(request, refine=request.refine or level.refine, feedback=request.feedback or level.feedback)
+        request = replace(
+            request,
+            refine=request.refine or level.refine,
+            feedback=request.feedback or level.feedback,
+            latent_iterations=request.latent_iterations or level.latent_iterations,
+        )
     if budget and request.refine:
         fail(
             "--budget",

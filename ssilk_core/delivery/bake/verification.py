@@ -107,8 +107,8 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     """Check a file and compare it, re-skinned by its format's rules alone, with the rollout that it should hold.
 
     Points of an earlier refinement are compared by energy (`verify_energies`), unless the rollout has its own. Joints
-    of one are compared with the refined points, with the tolerance that they were fitted with. Of one with feedback
-    only the number of frames and vertices is checked, and that these are finite.
+    of one are compared with the refined points, with the tolerance that they were fitted with. Of one with feedback,
+    and of an earlier solve in latents, only the number of frames and vertices is checked, and that these are finite.
 
     Raises:
         VerificationError: a check fails, or a vertex is further off than allowed.
@@ -118,9 +118,11 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     need_valid(path, report)
     shot, samples = open_shot(path), rollout.request.samples_per_frame
     times = shot.sample_times(samples)
+    if rollout.request.latent_iterations and rollout.latents is None:
+        return _verify_extent(shot, times, path, rollout, report, "solved in latents")
     if rollout.request.refine and rollout.refinement is None:
         if rollout.request.feedback:
-            return _verify_extent(shot, times, path, rollout, report)
+            return _verify_extent(shot, times, path, rollout, report, "refined with feedback")
         if not shot.is_skinned:
             return verify_energies(rollout, map(shot.garment_points, times), report)
         if not rollout.request.writes_points:
@@ -137,11 +139,12 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
 
 
 def _verify_extent(
-    shot: PosedGarment, times: Sequence[float], path: Path, rollout: BakeRollout, report: Reporter
+    shot: PosedGarment, times: Sequence[float], path: Path, rollout: BakeRollout, report: Reporter, made: str
 ) -> Verification:
-    """Check that a shot has all frames and vertices of a rollout.
+    """Check that a shot has all frames and vertices of a rollout that a solver `made`.
 
-    Refined with feedback a frame depends on all before it, and on another machine other last digits grow with each.
+    Where a solver goes on from its own states, a frame depends on all before it, and on another machine other last
+    digits grow with each.
     """
     if len(times) != rollout.motion.frame_count:
         raise VerificationError(f"{path}: it has {len(times)} samples; {rollout.motion.frame_count} are needed.")
@@ -152,7 +155,7 @@ def _verify_extent(
             raise VerificationError(
                 f"{path}: its garment at time code {time:g} is not {count} finite points; bake it again."
             )
-    report(Message(f"{path}: refined with feedback; its vertices are not compared with the solver's again"))
+    report(Message(f"{path}: {made}; its vertices are not compared with the solver's again"))
     return Verification(frames=len(times))
 
 

@@ -13,6 +13,7 @@ from ...files import need_not_input, need_writable, replacing
 from ..targets import GLB
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
+from .latents import solved
 from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
@@ -58,7 +59,7 @@ def bake(
     )
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
-    rollout = refined(rollout, report)
+    rollout = refined(solved(rollout, report), report)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
@@ -90,6 +91,7 @@ def result_of(
         verification=verification,
         reduction=rollout.reduction,
         refinement=rollout.refinement.summary if rollout.refinement else None,
+        latent=rollout.latents.summary if rollout.latents else None,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
         shown_skin=meter.shown(),

@@ -158,6 +158,13 @@ def blocked_pairs(x: Tensor, search_radius: Tensor, points: Tensor, faces: Tenso
 
     The sphere of a block holds those that its queries search.
     """
+    asking = (search_radius >= 0).any(1)
+    if not bool(asking.all()):
+        rows = asking.nonzero()[:, 0]
+        if not len(rows):
+            return rows, rows, rows
+        row, frame, face = blocked_pairs(x[rows], search_radius[rows], points, faces)
+        return rows[row], frame, face
     centre, radius = bounding_spheres(points, faces)
     size = max(1, min(QUERY_BLOCK, len(x)))
     blocks = torch.from_numpy(compact_blocks(np.nan_to_num(x[..., 0].detach().numpy()), size)).long()

@@ -80,11 +80,13 @@ class PosedCharacters:
         root: position of the first joint [m], float64, shape (3, N).
         body: relative to the root.
         lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
+        matrices: skinning matrices of the character's joints, relative to the root, shape (J, 3, 4, N).
     """
 
     root: Tensor
     body: PosedBody
     lbs: Tensor
+    matrices: Tensor
 
 
 class CharacterPoser:
@@ -114,4 +116,5 @@ class CharacterPoser:
             torch.as_tensor(root.T.copy(), device=self.rest.device),
             self.body.pose(character.float(), exact=True),
             lbs,
+            character,
         )

@@ -104,6 +104,8 @@ def other_network(whole: ModelSize, fps: float) -> Iterator[Variant]:
 
 def _levels(base: Variant, *, solved: bool) -> Iterator[Variant]:
     for level in QUALITIES.values():
+        if level.latent_iterations:
+            continue  # shots are played with numpy here, which has no solver
         if solved or not level.refine:
             kept, fps = level.size.within(base.size), level.rate(base.fps)
             reduced = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models

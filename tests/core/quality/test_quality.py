@@ -65,7 +65,7 @@ def test_levels_keep_more_and_more():
     assert levels[-1].size.within(whole) == whole
     assert quality_named("crowd").rate(60) == 15 and quality_named("crowd").rate(12) == 12
     assert quality_named("film").rate(60) == 60
-    with pytest.raises(SsilkError, match="'best': no such level; it is one of crowd, game, film, hero"):
+    with pytest.raises(SsilkError, match="'best': no such level; it is one of crowd, game, film, latent, hero"):
         quality_named("best")
 
 

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time the solver in latents on a garment that ships, in motions of the demo, with growing numbers of iterations.
+
+    OMP_NUM_THREADS=1 python benchmarks/latent.py --garment cape --threads 1
+
+All shots of a motion are solved at once, each a frame later in the motion than the one before. Times are those of a
+frame of one shot: medians over frames, without the first two. Energies are means over frames and shots, of the best
+start, and as solved; each row has its own past, so rows differ in these. "Left" is the share of the gain that the
+solver's own prediction has still left. The first row of a motion is the network. With --simulate the simulator goes
+through the first shot, and RMS distances from it are told; a frame of a cape takes it seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from helpers.reports import table
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.stages import demo_body_path
+
+from ssilk_core.demo.motions import MOTIONS, build_motion
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.devices import select_device
+from ssilk_core.network.checkpoint import ModelFile, load_model, network
+from ssilk_core.network.latent_solver import LatentOptions
+from ssilk_core.network.latent_solver.roller import LatentTally
+from ssilk_core.network.latent_solver.shots import LatentShots
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.rollout import decode, garment_poses
+from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.scene.assets import Floats, Motion
+
+HEADER = ("motion", "iterations", "ms a frame and shot", "energy before [J]", "energy [J]", "left",
+          "not converged", "failed", "from the simulator [mm]")  # fmt: skip
+
+
+def rms(points: Floats, reference: Floats | None) -> str:
+    """Return the RMS distance of vertices from the simulator's [mm], where there are any."""
+    if reference is None:
+        return ""
+    return f"{1000 * float(np.sqrt(((points - reference) ** 2).sum(axis=-1).mean())):.0f}"
+
+
+def rows(
+    model: GarmentModel, file: ModelFile, shots: Sequence[Motion], iterations: Sequence[int], reference: Floats | None
+) -> Iterator[tuple[str, ...]]:
+    """Yield the network's row, then one for each number of iterations."""
+    name, first = shots[0].path, shots[0]
+    played = np.concatenate([decode(model, first, pose) for pose in garment_poses(model, first, first.fps)])
+    yield name, "network", "", "", "", "", "", "", rms(played, reference)
+    for count in iterations:
+        solver, tally = LatentShots(model, file.fabric, LatentOptions(iterations=count)), LatentTally()
+        points, ends = [], []
+        for frame in solver.frames(shots):
+            tally.add(frame)
+            at = slice(frame.number, frame.number + 1)
+            root = solver.simulator.poser.pose(first.rotations[at], first.translations[at]).root[:, 0]
+            points.append((frame.solution.x[..., 0].double() + root).cpu().numpy())
+            ends.append(time.perf_counter())
+        pace = 1000 * float(np.median(np.diff(ends[1:]))) / len(shots)
+        yield (
+            name,
+            str(count),
+            f"{pace:.1f}",
+            f"{tally.mean('start_energy'):.4f}",
+            f"{tally.mean('energy'):.4f}",
+            f"{tally.mean('left_share'):.3f}",
+            f"{tally.unconverged} of {tally.frames}",
+            str(tally.failed),
+            rms(np.stack(points), reference),
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--garment", default="cape", help="garment that ships (default cape)")
+    parser.add_argument("--motion", nargs="+", choices=MOTIONS, default=["walk", "cartwheel"], help="of the demo")
+    parser.add_argument("--first", type=int, default=20, help="first frame of the first shot (default 20)")
+    parser.add_argument("--frames", type=int, default=30, help="of each shot (default 30)")
+    parser.add_argument("--shots", type=int, default=1, help="solved at once (default 1)")
+    parser.add_argument("--iterations", type=int, nargs="+", default=[1, 2, 4], help="of the solver (default 1 2 4)")
+    parser.add_argument("--simulate", action="store_true", help="tell distances from the simulator")
+    parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
+    parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    character, file = read_character(demo_body_path()), load_model(shipped_path(options.garment))
+    scene, device = replace(file.scene, character=character), select_device(options.device)
+    model = network(file, scene).to(device)
+    found: list[tuple[str, ...]] = []
+    for name in options.motion:
+        whole = build_motion(name, character.skeleton)
+        starts = range(options.first, options.first + options.shots)
+        shots = [whole.clip(start, start + options.frames) for start in starts]
+        shots = [replace(shot, path=name) for shot in shots if shot.frame_count == options.frames]
+        reference = None
+        if options.simulate:
+            reference = simulate(scene, file.fabric, shots[:1], SimulationOptions(fps=shots[0].fps), device=device)[0]
+        found.extend(rows(model, file, shots, options.iterations, reference))
+    print(table(HEADER, found))
+
+
+if __name__ == "__main__":
+    main()
