@@ -23,6 +23,7 @@ from ...scene.assets import Floats, Motion
 from ...scene.fabrics import Fabric
 from ..descriptors import pose_features
 from ..model.descriptors import gravity_features
+from ..model.feedback import BodyFrames
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
 from .options import LatentOptions
@@ -56,17 +57,27 @@ class _Past:
     Attributes:
         before, now: latents two frames and one frame ago, shape (N, m).
         cloth: positions.
+        matrices: skinning matrices of the character in both frames, about its root, shape (2, J, 3, 4, N).
+        roots: its positions there [m], float64, shape (2, 3, N).
         recovering: frames for which a lost shot still rests, shape (N,).
     """
 
     before: Tensor
     now: Tensor
     cloth: StepHistory
+    matrices: Tensor
+    roots: Tensor
     recovering: Tensor
 
     def first(self, count: int) -> _Past:
         """Return those of the first shots."""
-        return _Past(self.before[:count], self.now[:count], self.cloth.first(count), self.recovering[:count])
+        own = self.before[:count], self.now[:count], self.cloth.first(count)
+        return _Past(*own, self.matrices[..., :count], self.roots[..., :count], self.recovering[:count])
+
+    def followed_by(self, poses: PosedCharacters) -> BodyFrames:
+        """Return the character in both frames and in the next one."""
+        bend = poses.root - 2 * self.roots[1] + self.roots[0]
+        return BodyFrames(torch.cat([self.matrices, poses.matrices[None]]), bend.expand(3, -1, -1))
 
 
 class LatentShots:
@@ -154,7 +165,8 @@ class LatentShots:
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
         else:
-            starts, iterations = warm_starts(self.model, past.before, past.now, seen), None
+            body = past.followed_by(poses)
+            starts, iterations = warm_starts(self.model, past.before, past.now, seen, body), None
         found = self.solver.solve(starts, poses.matrices, inputs, iterations)
         lost = ~(found.energy.isfinite() & found.z.isfinite().all(1))
         recovering = torch.zeros_like(found.iterations) if past is None else past.recovering
@@ -162,8 +174,9 @@ class LatentShots:
         lost = recovering > 0
         if bool(lost.any()):
             found = found.where(lost, self.solver.given(rest, poses.matrices, inputs))
-        cloth = StepHistory(
-            found.x.double() + poses.root, past.cloth.last if past else None, poses.root, poses.lbs
-        )
-        before = found.z if past is None else past.now
-        return LatentFrame(number, found, lost), _Past(before, found.z, cloth, (recovering - 1).clamp_min(0))
+        cloth = StepHistory(found.x.double() + poses.root, past.cloth.last if past else None, poses.root, poses.lbs)
+        before, earlier, root = found.z, poses.matrices, poses.root
+        if past:
+            before, earlier, root = past.now, past.matrices[1], past.roots[1]
+        course = torch.stack([earlier, poses.matrices]), torch.stack([root, poses.root])
+        return LatentFrame(number, found, lost), _Past(before, found.z, cloth, *course, (recovering - 1).clamp_min(0))

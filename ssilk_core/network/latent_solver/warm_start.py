@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..model.feedback import BodyFrames
 from ..model.network import GarmentModel
 
 
@@ -25,13 +26,23 @@ class FrameDescriptors:
 
 
 @torch.no_grad()
-def network_step(model: GarmentModel, before: Tensor, now: Tensor, seen: FrameDescriptors) -> Tensor:
-    """Return the network's state (N, m) after two states (N, m) of any precision. Nothing else here steps it."""
+def network_step(
+    model: GarmentModel, before: Tensor, now: Tensor, seen: FrameDescriptors, body: BodyFrames
+) -> Tensor:
+    """Return the network's state (N, m) after two states (N, m) of any precision. Nothing else here steps it.
+
+    Args:
+        body: the character in the frames of both states and in the next one, F = 3.
+    """
     dtype = seen.rest.dtype
-    return model.step(before.to(dtype), now.to(dtype), seen.rest, seen.pose).to(now.dtype)
+    last, latest = before.to(dtype), now.to(dtype)
+    cloth = model.seen_from(last, latest, BodyFrames(body.matrices.to(dtype), body.bend.to(dtype)))
+    return model.step(last, latest, seen.rest, seen.pose, cloth).to(now.dtype)
 
 
-def warm_starts(model: GarmentModel, before: Tensor, now: Tensor, seen: FrameDescriptors) -> list[Tensor]:
+def warm_starts(
+    model: GarmentModel, before: Tensor, now: Tensor, seen: FrameDescriptors, body: BodyFrames
+) -> list[Tensor]:
     """Return latents (N, m) that a frame may start from: on the course of the two states before it, which inertia
     has most often nearer, and the network's step, which knows what moves the garment."""
-    return [2 * now - before, network_step(model, before, now, seen)]
+    return [2 * now - before, network_step(model, before, now, seen, body)]

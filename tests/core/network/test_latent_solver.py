@@ -18,6 +18,7 @@ from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.latent_solver.slopes import limited_slopes, mlp_slopes
 from ssilk_core.network.latent_solver.warm_start import FrameDescriptors, network_step
 from ssilk_core.network.model.decoder import limited
+from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.collision import SmoothedDistance, contacts
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
@@ -308,11 +309,21 @@ def test_settings_that_make_no_sense_are_refused(settings) -> None:
         LatentOptions(**settings)
 
 
-def test_the_network_steps_in_its_own_precision(scene, toy_model) -> None:
+def test_the_network_steps_in_its_own_precision_and_sees_the_cloth(scene, toy_model, toy_body) -> None:
     model = toy_model(scene)
-    static, pose = model.initialiser[0].in_features, model.stepper[0].in_features - 3 * model.config.latent
+    static = model.initialiser[0].in_features
+    pose = model.stepper[0].in_features - 3 * model.config.latent - 3 * model.feedback.count
     rest = model.initial(torch.zeros(1, static)).detach()
-    seen = FrameDescriptors(rest, torch.zeros(1, pose))
-    found = network_step(model, rest.double(), rest.double(), seen)
+    seen, body, now = FrameDescriptors(rest, torch.zeros(1, pose)), toy_body(scene, 3, 1), rest + 0.1
+    found = network_step(model, rest.double(), now.double(), seen, body)
     assert found.dtype == torch.float64
-    torch.testing.assert_close(found, model.step(rest, rest, rest, seen.pose).double())
+    expected = model.roll([rest, now], rest[None], seen.pose[None], body)[-1]
+    torch.testing.assert_close(found, expected.double())
+    held = network_step(
+        model,
+        rest.double(),
+        now.double(),
+        seen,
+        BodyFrames(body.matrices[:1].expand(3, -1, -1, -1, -1), 0 * body.bend),
+    )
+    assert (found - held).abs().max() > 1e-4
