@@ -65,7 +65,7 @@ def test_a_budget_is_kept_and_what_it_bought_is_said(world, capsys):
         ("--budget 1kB", "--budget: nothing fits 1 kB; this model needs at least"),
         ("--budget much", "not a budget"),
         ("--influences 0", "influences = 0"),
-        ("--quality best", "--quality: 'best'; it is one of crowd, game, film, hero"),
+        ("--quality best", "--quality: 'best'; it is one of crowd, game, film, latent, hero"),
         ("--motions nowhere.usda", "nowhere.usda"),
         ("-o small.usdc", "it ends in .safetensors"),
         ("-o model.safetensors", "the output is also an input"),

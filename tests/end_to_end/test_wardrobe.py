@@ -358,7 +358,7 @@ def test_two_processes_train_one_garment_and_one_of_them_speaks(world, toy):
     told = {**os.environ, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2"}
     processes = [
         subprocess.Popen(
-            [*command, "-o", "together.safetensors", *toy.training],
+            [*command, "-o", "together.safetensors", *toy.training, "--set", "feedback_points=0"],
             env={**told, "RANK": rank, "LOCAL_RANK": rank},
             stdout=subprocess.PIPE,
             text=True,

@@ -26,7 +26,7 @@ FRAMES = 9
 @pytest.fixture(scope="module")
 def rollout(scene, toy_model, toy_motion):
     """A motion and the network's vertices over it, some of them inside the ball."""
-    model, motion = toy_model(scene), toy_motion(scene, FRAMES)
+    model, motion = toy_model(scene, scale=0.2, feedback_points=0), toy_motion(scene, FRAMES)
     points = np.concatenate([decode(model, motion, pose) for pose in garment_poses(model, motion, 30.0)])
     points[:, scene.classes != PINNED] += [0, 0, 0.08]
     return motion, points

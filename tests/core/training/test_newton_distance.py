@@ -69,7 +69,7 @@ def test_where_inertia_is_all_the_gradient_grows_by_the_weight(scene, cloth):
 
 
 def test_training_follows_it_and_the_energy_alone_without(scene, toy_model, toy_motion):
-    model = toy_model(scene)
+    model = toy_model(scene, feedback_points=0)
     energy = GarmentEnergy(scene.garment.mesh, FABRIC, scene.classes)
     body = CollisionBody(scene.character.merged_body(), scene.character.skeleton.joint_count, device=CPU)
     bank = build_bank([toy_motion(scene, 12)], scene.character.skeleton, model.joints, model.config.fps, CPU)
