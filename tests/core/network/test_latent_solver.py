@@ -136,8 +136,7 @@ def test_its_hessian_is_that_of_the_simulator_seen_by_the_latents(frames) -> Non
     assert torch.linalg.eigvalsh(model.hessian).min() > 0
 
 
-@pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("precision", ["float64", "float32"])
+@pytest.mark.parametrize(("exact", "precision"), [(True, "float64"), (False, "float32")])
 def test_no_frame_gains_energy(scene, toy_model, toy_motion, exact, precision) -> None:
     model, motion = toy_model(scene), toy_motion(scene, 8, speed=3.0)
     options = LatentOptions(iterations=2, first_iterations=9, exact_contact=exact)
