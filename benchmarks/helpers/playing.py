@@ -14,7 +14,8 @@ from baselines.networks import Baseline, BaselineConfig, baseline
 from torch import Tensor
 
 from ssilk_core.network.checkpoint import ModelFile, network
-from ssilk_core.network.model.batch import DOWN, motion_inputs
+from ssilk_core.network.model.batch import motion_inputs
+from ssilk_core.network.model.descriptors import DOWN
 from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime import Player

@@ -15,7 +15,7 @@ from ..errors import fail
 from ..scene.assets import Floats, GarmentPose, Motion
 from ..scene.kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .descriptors import pose_features
-from .model.descriptors import gravity_features
+from .model.descriptors import upright_descriptors
 from .model.feedback import BodyFrames
 from .model.network import GarmentModel
 from .sampling import sample_pose
@@ -23,7 +23,6 @@ from .settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
 
 CHUNK = 256  # frames decoded at once
 HISTORY = 2  # earlier frames that the descriptors of a chunk need
-DOWN = (0.0, -1.0, 0.0)
 STILL_THRESHOLD = 1e-7  # [rad, m]; a character that moves less holds still
 REST_THRESHOLD = 3e-5  # change of a latent in one frame below which it is at rest
 
@@ -113,13 +112,7 @@ def _advance(
     parameter, skeleton = next(model.parameters()), model.scene.character.skeleton
     world = motion_transforms(seen, skeleton.parents)
     features = pose_features(seen, skeleton, model.joints, world)
-
-    def tensor(values: Floats) -> Tensor:
-        return torch.as_tensor(values[-count:], dtype=parameter.dtype, device=parameter.device)
-
-    down = torch.tensor(DOWN, dtype=parameter.dtype, device=parameter.device).expand(count, 3)
-    static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
-    dynamic = torch.cat([static, tensor(features.dynamic)], dim=1)
+    static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     starting = min(max(0, HISTORY - start), count)

@@ -19,10 +19,10 @@ from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
 from ...physics.simulate.simulator import StepHistory
-from ...scene.assets import Floats, Motion
+from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
 from ..descriptors import pose_features
-from ..model.descriptors import gravity_features
+from ..model.descriptors import upright_descriptors
 from ..model.feedback import BodyFrames
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
@@ -30,7 +30,6 @@ from .options import LatentOptions
 from .solver import LatentSolution, LatentSolver
 from .warm_start import FrameDescriptors, warm_starts
 
-DOWN = (0.0, -1.0, 0.0)
 LOOK_BACK = 2  # earlier frames that descriptors need
 DESCRIBED = 256  # frames described at once
 
@@ -145,16 +144,11 @@ class LatentShots:
         seen = motion.clip(max(0, start - LOOK_BACK), stop)
         count = min(stop, motion.frame_count) - start
         features = pose_features(seen, model.scene.character.skeleton, model.joints)
-
-        def tensor(values: Floats) -> Tensor:
-            return torch.as_tensor(values[-count:], dtype=parameter.dtype, device=parameter.device)
-
-        down = parameter.new_tensor(DOWN).expand(count, 3)
-        static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), down)], dim=1)
+        static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
         rest = model.initial(static)
         sound = rest.abs().amax(dim=1, keepdim=True) < DIVERGENCE_BOUND  # NaN is not less than anything
         rest = torch.where(sound, rest, torch.zeros_like(rest))
-        return FrameDescriptors(rest, torch.cat([static, tensor(features.dynamic)], dim=1))
+        return FrameDescriptors(rest, dynamic)
 
     def _advance(
         self, number: int, past: _Past | None, poses: PosedCharacters, seen: FrameDescriptors

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -14,11 +13,10 @@ from ...errors import fail
 from ...scene.assets import Motion
 from ...scene.kinematics import motion_transforms, split_at_cuts
 from ..descriptors import pose_features
-from .descriptors import gravity_features
+from .descriptors import upright_descriptors
 from .feedback import BodyFrames
 from .network import GarmentModel
 
-DOWN = (0.0, -1.0, 0.0)
 REST_FRAMES = 2  # frames at rest at the start of a shot and after a cut
 GRAPH_WARMUP_CALLS = 3  # before a graph is captured
 
@@ -68,13 +66,7 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, model.joints, world)
     body = BodyFrames.of(world, skeleton, parameter)
-
-    def tensor(values: np.ndarray) -> Tensor:
-        return torch.as_tensor(values).to(parameter)
-
-    gravity = gravity_features(tensor(features.down), tensor(np.array(DOWN)).expand(motion.frame_count, 3))
-    static = torch.cat([tensor(features.static), gravity], dim=1)
-    pose = torch.cat([static, tensor(features.dynamic)], dim=1)
+    static, pose = upright_descriptors(features, parameter)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
     origins = torch.as_tensor(world[:, 0, :3, 3].copy()).to(parameter.device)
     return model.initial(static), pose, body.matrices[..., 0], body.bend[..., 0], origins, begins
