@@ -119,7 +119,7 @@ def decoded_frames(config: TrainConfig, batch: int) -> int:
 
 def _frames_of_a_window(config: TrainConfig) -> float:
     """Return the decoded frames per window, with its share of the single poses."""
-    return config.window + config.static_batch / config.batch
+    return config.window + config.static_batch / config.batch + 2 * config.initial_loss
 
 
 def fits_in_memory(work: Callable[[], None]) -> bool:
