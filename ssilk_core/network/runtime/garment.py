@@ -18,7 +18,7 @@ from .feedback import ClothPoints
 from .kinematics import ProxyKinematics
 from .networks import evaluate, layers
 from .skinning import tiles
-from .stepper import SoftClamp, SpringStepper, Stepper, VerletStepper, diverged
+from .stepper import NumpyStepper, SoftClamp, SpringStepper, VerletStepper, diverged
 
 STEPPERS = {"spring_verlet": SpringStepper, "verlet": VerletStepper, "quasi_static": None}  # by scheme
 
@@ -44,7 +44,7 @@ class NumpyGarment:
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
-        self.stepper: Stepper[Any] | None = None
+        self.stepper: NumpyStepper[Any] | None = None
         if stepper := STEPPERS[config.scheme]:
             points = ClothPoints(file, self.decoder, self.kinematics)
             sizes = descriptor_sizes(scene, file.joints, config.descriptors)

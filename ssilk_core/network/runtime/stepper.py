@@ -103,7 +103,7 @@ class SpringInputs(StepperInputs):
 Inputs = TypeVar("Inputs", bound=StepperInputs)
 
 
-class Stepper(ABC, Generic[Inputs]):
+class NumpyStepper(ABC, Generic[Inputs]):
     """Rolls out latents.
 
     Args:
@@ -163,7 +163,7 @@ class Stepper(ABC, Generic[Inputs]):
         return [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
 
 
-class SpringStepper(Stepper[SpringInputs]):
+class SpringStepper(NumpyStepper[SpringInputs]):
     """Rolls out latents of `SpringVerlet`.
 
     Args:
@@ -243,7 +243,7 @@ class SpringStepper(Stepper[SpringInputs]):
                     cloth.keep(new)
 
 
-class VerletStepper(Stepper[StepperInputs]):
+class VerletStepper(NumpyStepper[StepperInputs]):
     """Rolls out latents of `Verlet`; arguments as for `SpringStepper`."""
 
     def __init__(

@@ -238,3 +238,16 @@ def test_a_scheme_whose_garments_rest_takes_neither(scene):
     with pytest.raises(SsilkError, match=r"'absolut'.*absolute"):
         ModelConfig(descriptors="absolut")
     assert feedback_size(scene, ModelConfig(**PAPER | {"scheme": "quasi_static"})) == 0
+
+
+def test_no_proxy_goes_that_the_stepper_sees(calm, scene):
+    from ssilk_core.quality.reduction.files import with_weights
+
+    weights, seen, blind = (
+        np.full((len(scene.classes), 5), 0.2),
+        *(model_file(calm(kind), FABRICS["paper"], {}) for kind in ("paper", "blind")),
+    )
+    with pytest.raises(SsilkError, match="stepper sees its proxies; none of them can go; keep all joints"):
+        with_weights(seen, weights, [4])
+    assert with_weights(blind, weights, [4]).scene.rig.proxy_count == scene.rig.proxy_count - 1
+    assert with_weights(seen, weights, []).scene.rig.proxy_count == scene.rig.proxy_count
