@@ -90,8 +90,11 @@ class StepMemory:
         """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""
         most = decoded_frames(config, config.batch)
         frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=self.needed) - 1
-        still = min(config.pretraining_batch, frames) if config.static_fraction else config.pretraining_batch
-        return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(1, still)
+        if frames == most:
+            return config.batch, config.pretraining_batch
+        return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
+            1, min(config.pretraining_batch, frames)
+        )
 
     def check_one_window_fits(self, config: TrainConfig, available: int) -> None:
         """Raise `SsilkError` unless a step on a single window fits into `available` bytes."""
