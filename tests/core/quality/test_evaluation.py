@@ -18,6 +18,8 @@ from benchmarks.baselines.evaluation import method_over
 from benchmarks.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Progress
+from ssilk_core.network.latent_solver import LatentOptions
+from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.quality.evaluation.methods import (
@@ -26,10 +28,12 @@ from ssilk_core.quality.evaluation.methods import (
     EvaluationScene,
     LinearBlendSkinning,
     Simulated,
+    SolvedNetwork,
     TakeSet,
     build_take_set,
 )
 from ssilk_core.quality.evaluation.minimum import minima, minimum_errors
+from ssilk_core.quality.evaluation.own_starts import MethodWindow, departures
 from ssilk_core.quality.evaluation.probes import (
     REST_SPEED,
     joined_loop_drift,
@@ -479,3 +483,41 @@ def test_windows_begin_with_a_take_and_with_its_most_violent_second(dressed, sce
     windows = windows_of(dressed, build_take_set([take], dressed, JOINTS), [0])
     assert windows[0] == (0, range(62))
     assert 65 <= windows[1][1].start <= 85
+
+
+def test_departures_are_those_of_cloth_that_leaves_the_simulation(scene, dressed, toy_motion):
+    """A method that follows its own simulation, then is moved by steps of a millimetre; windows of two lengths."""
+    take_set = build_take_set(takes_of("sway", toy_motion(scene, 12), FPS), dressed, JOINTS)
+    simulated = Simulated(dressed, take_set)
+    windows = [MethodWindow(dressed, take_set, simulated, (0, frames)) for frames in (range(9), range(3, 8))]
+    for window in windows:
+        window.x = window.x + 1e-3 * torch.arange(-1, len(window.x) - 1).clamp_min(0)[:, None, None] / 3**0.5
+    counts: list[int] = []
+    found = departures(dressed.simulator, windows, dressed.energy.mass, counts.append)
+    assert counts == [2, 2, 2, 1, 1, 1, 1]
+    expected = torch.arange(1, 8) * 1e-3
+    np.testing.assert_allclose(found.position[:, 0].sqrt(), expected, rtol=0.05)
+    np.testing.assert_allclose(found.position[:3, 1].sqrt(), expected[:3], rtol=0.05)
+    np.testing.assert_allclose(found.velocity[:, 0].sqrt(), torch.full((7,), 1e-3), rtol=0.1)
+    assert found.position[3:, 1].isnan().all() and found.position_after(8).isnan().all()
+    assert torch.equal(found.position_after(3), found.position[2])
+
+
+def test_solved_latents_are_a_method(scene, dressed, toy_motion, toy_model):
+    """Over takes of two lengths at once, each as it is solved alone, and lower in energy than the network."""
+    model, fabric, options = toy_model(scene), dressed.fabric, LatentOptions(iterations=4)
+    takes = [Take("short", 0, toy_motion(scene, 5)), Take("long", 0, toy_motion(scene, 7, speed=2.0))]
+    take_set, ticks = build_take_set(takes, dressed, JOINTS), []
+    solved = SolvedNetwork(model, fabric, options, take_set, lambda: ticks.append(1))
+    assert [len(states) for states in solved.states] == [5, 7] and len(ticks) == 7 and solved.lost == 0
+    for number, take in enumerate(takes):
+        alone = list(LatentShots(model, fabric, options).frames([take.motion]))
+        points = torch.cat([frame.solution.x for frame in alone], dim=-1)
+        roots = torch.as_tensor(take.motion.translations[:, 0] - take.motion.translations[0, 0]).T
+        found = solved.vertices(number, range(take.frame_count))
+        np.testing.assert_allclose(found, points + roots, atol=2e-3)
+    energies = [
+        sum(recorded(dressed, take_set, method, 1).values[name].mean() for name in TERMS)
+        for method in (solved, method_over(model, take_set))
+    ]
+    assert energies[0] < energies[1]
