@@ -383,27 +383,37 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     assert model.minimum.static_energy_excess > 0
     assert by_name["LBS", "valid"].settling is None and simulated.settling.stops == 2
     # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
+    assert model.closed_loop.states == 12 and by_name["ncs", "valid"].closed_loop is None
     assert model.pose_novelty.mean_distance < by_name["ssilk", "flips"].pose_novelty.mean_distance
     assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 8 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 9 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def test_a_character_that_never_moves_has_no_jerk_to_compare_with(scene, dressed, motion, toy_model):
     frozen = replace(motion, rotations=motion.rotations[[5] * 12], translations=motion.translations[[5] * 12])
     played = EvaluationClips(clips={"frozen": frozen}, splits={"all": ["frozen"]})
-    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
+    rows = list(
+        evaluate(
+            dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0, linearised=0)
+        )
+    )
     assert rows[0].figures.jerk == 0 and math.isnan(rows[1].figures.jerk_ratio) and "nan" in tables(rows)
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
     played = EvaluationClips(clips={"sway": motion}, splits={"all": ["sway"]})
-    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
+    rows = list(
+        evaluate(
+            dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0, linearised=0)
+        )
+    )
     assert [row.method for row in rows] == ["LBS", "ssilk"]
     found = rows[1].figures
-    assert (found.reference, found.pose_novelty, found.settling, found.loop_drift) == (None, None, None, None)
+    kinds = found.reference, found.pose_novelty, found.settling, found.loop_drift, found.closed_loop
+    assert kinds == (None,) * 5
 
 
 def test_an_index_says_which_clips_are_in_which_split(tmp_path):
@@ -438,6 +448,7 @@ def test_a_malformed_index_is_refused(tmp_path, text):
         ({"hold": 0.0}, "a hold of 0 s"),
         ({"hold": math.nan}, "a hold of nan s"),
         ({"loop": -5}, "loops of -5 frames"),
+        ({"linearised": -1}, "-1 states to linearise about"),
     ],
 )
 def test_options_out_of_range_are_refused(options, complaint):
