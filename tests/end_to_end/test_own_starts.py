@@ -7,6 +7,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from PIL import Image
 
 from ssilk_core.delivery.view.panels import GAP
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model, save_model
 
 PLACE = "--stage rigged.usda --threads 1"
 
@@ -81,6 +83,23 @@ def test_windows_are_spread_and_short_takes_are_one(script):
     assert found == [(3, range(7, 17)), (3, range(21, 31)), (4, range(4, 14))]
     assert spread_windows({0: take(7)}, 3, (2, 8)) == [(0, range(7))]
     assert spread_windows({0: take(3)}, 3, (2, 8)) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ("--windows 0", "0 windows"),
+        ("--after 0 5", r"after \[0, 5\] frames"),
+        ("--splits inertia", "none of the splits inertia is chosen"),
+        ("--clips brief --after 8", "flips: its clips are too short"),
+        ("--model model.safetensors silk.safetensors", "silk.safetensors: its garment, fabric or rate is not that"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused(script, world, options, complaint):
+    file = load_model("model.safetensors")
+    save_model("silk.safetensors", replace(file, fabric=replace(file.fabric, bending=2 * file.fabric.bending)))
+    with pytest.raises(SsilkError, match=complaint):
+        script("own_starts", f"--model model.safetensors {PLACE} --motions clips {options}")
 
 
 def test_a_sheet_has_a_row_for_each_method(script, world):
