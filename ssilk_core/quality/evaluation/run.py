@@ -14,15 +14,18 @@ from torch import Tensor
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
+from ...network.model.network import GarmentModel
 from ...scene.assets import Motion
 from ...training.motion_bank import MotionBank, build_bank
-from .figures import Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
+from .closed_loop import closed_loop
+from .figures import ClosedLoop, Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
 from .methods import (
     CachedPoints,
     EvaluatedMethod,
     EvaluationScene,
     LinearBlendSkinning,
     Method,
+    Network,
     Reader,
     Simulated,
     TakeSet,
@@ -62,6 +65,7 @@ class EvaluationOptions:
         simulate: whether it plays the stops as well, to see how it settles.
         solver: whether it simulates from the methods' own states. These three take long on a CPU.
         loop: frames that the first seconds of each clip loop for, at least; none for zero.
+        linearised: states of each split about which a network's steps are linearised, at most; none for zero.
     """
 
     sequence: int | None = None
@@ -71,6 +75,7 @@ class EvaluationOptions:
     simulate: bool = False
     solver: bool = False
     loop: int = 2000
+    linearised: int = 16
 
     def __post_init__(self) -> None:
         if not (self.sequence is None or self.sequence >= 4):
@@ -81,6 +86,8 @@ class EvaluationOptions:
             fail("evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
         if not 0 <= self.loop <= 1_000_000:
             fail("evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
+        if not 0 <= self.linearised <= 10_000:
+            fail("evaluation", f"{self.linearised} states to linearise about", "0 to 10,000 are allowed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,6 +205,7 @@ class _Run:
                 pose_novelty=pose_novelty(tally.only(takes_in(self.clips, names)), distances) if distances else None,
                 loop_drift=joined_loop_drift([loop for clip, loop in loops if clip in names]),
                 solver=self._solver_errors(take_set, played, takes_in(self.clips, names)),
+                closed_loop=self._closed_loop(played, takes_in(self.clips, names)),
             )
             yield replace(row, figures=found)
 
@@ -208,6 +216,12 @@ class _Run:
             return None
         self.report(Message(f"the solver plays {len(windows)} windows and single steps from the method's own states"))
         return solver_errors(self.dressed, take_set, method, windows, self.report)
+
+    def _closed_loop(self, method: Method, takes: Sequence[int]) -> ClosedLoop | None:
+        """Return the closed loop of single steps on some takes; None but for networks with states of two frames."""
+        if not (isinstance(method, Network) and isinstance(method.model, GarmentModel)):
+            return None
+        return closed_loop(method, takes, self.options.linearised)
 
     def _distances(self, take_set: TakeSet, joints: np.ndarray) -> dict[int, Tensor]:
         """Return the distances of each take's poses from the training's [rad], (N,); empty if those are not known."""
