@@ -26,6 +26,7 @@ from helpers.paper_jobs import GARMENTS, PYTHON, TABLES, Job, Plan, jobs, withou
 from helpers.reports import table
 
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE, SsilkError
+from ssilk_core.events import TextReporter
 from ssilk_core.training.signals import stop_on_signals
 from ssilk_core.training.wardrobe.queue import CommandTask, End, Queue
 
@@ -162,7 +163,7 @@ def main() -> int:
         return 0
     backlog = Backlog([job for job in found if not job.is_done], plan.folder, options.until)
     gpus: list[int | None] = [*range(options.gpus)] or [None]
-    with stop_on_signals() as stop:
+    with stop_on_signals(TextReporter()) as stop:
         run(backlog, gpus * options.per_gpu, stop)
     print(
         f"{len(found) - len(backlog.left) - len(backlog.failed)} of {len(found)} jobs are done; failed: "

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 from typing import TYPE_CHECKING
 
@@ -38,6 +39,11 @@ def default_preset(name: str) -> str:
         name: as for `select_device`.
     """
     return "draft" if select_device(name).type == "cpu" else "preview"
+
+
+def busy_cores() -> float:
+    """Return how many cores programs kept busy in the last minute; zero where the system does not tell."""
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
 
 
 def device_name(device: torch.device) -> str:

@@ -143,10 +143,15 @@ def finite(value: Any) -> Any:
 
 
 class TextReporter:
-    """Print events as text; progress rewrites one line on a terminal, and adds one every ten seconds elsewhere."""
+    """Print events as text; progress rewrites one line on a terminal, and adds one every ten seconds elsewhere.
+
+    Attributes:
+        since: when lines that begin with a time count from, as `time.monotonic` tells it [s]; None for no times.
+    """
 
     def __init__(self, stream: TextIO | None = None) -> None:
         self.stream = stream or sys.stderr
+        self.since: float | None = None
         self.live = self.stream.isatty()
         self.last = 0.0
         self.open_line = False
@@ -158,16 +163,23 @@ class TextReporter:
         self._end_line()
         text = describe(event)
         if text:
-            print(text, file=self.stream, flush=True)
+            print(self._time() + text, file=self.stream, flush=True)
 
     def _progress(self, event: Progress) -> None:
         now = time.monotonic()
         if now - self.last < (0.1 if self.live else 10.0) and event.done < event.total:
             return
         self.last = now
-        line = "  " + describe_progress(event)
+        line = (self._time() or "  ") + describe_progress(event)
         print(f"\r\x1b[K{line}" if self.live else line, end="" if self.live else "\n", file=self.stream, flush=True)
         self.open_line = self.live
+
+    def _time(self) -> str:
+        """Return what a line begins with: hours, minutes and seconds, where they are asked for."""
+        if self.since is None:
+            return ""
+        minutes, seconds = divmod(int(time.monotonic() - self.since), 60)
+        return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}  "
 
     def _end_line(self) -> None:
         if self.open_line:

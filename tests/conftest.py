@@ -26,6 +26,14 @@ def one_thread_again() -> None:
     _one_thread()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def quiet_machine() -> Iterator[None]:
+    """No other program is seen, whose warnings would come between those that a test expects."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.getloadavg", lambda: (0.0, 0.0, 0.0), raising=False)
+        yield
+
+
 @pytest.fixture(scope="module")
 def few_contacts() -> Iterator[None]:
     """Cloth touches the body at vertices and at few points between, where contact itself is not what is tested."""

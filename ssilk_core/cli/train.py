@@ -2,20 +2,21 @@
 """Train a garment on motions and write a model.
 
 Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk rig' makes them by default.
-Ctrl-C stops the training and keeps the best model and the state. --resume continues from there. A warning at the end
-says where few of the preset's iterations were done, or where skin shows, and how to go on. A model that is worse
-than linear blend skinning on the validation motions is kept and warned of, and the exit code is 5. torchrun ends with
-its own code 1 then, and names this one.
+Ctrl-C stops the training after the current step, or inside one that takes longer than ten seconds, and keeps the best
+model and the state. --resume continues from there. A warning at the end says where few of the preset's iterations
+were done, or where skin shows, and how to go on. A model that is worse than linear blend skinning on the validation
+motions is kept and warned of, and the exit code is 5. torchrun ends with its own code 1 then, and names this one.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
-from ..events import Message, Reporter, Result, silent
+from ..events import Message, Reporter, Result, TextReporter, silent
 from ..network.settings import ModelConfig, apply_overrides, setting_names
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
@@ -76,13 +77,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Train; return 0 when finished, 5 when the model is worse than linear blend skinning, 130 when interrupted."""
     from ..training.parallel import join_process_group
     from ..training.run import train
-    from ..training.signals import stop_on_signals
+    from ..training.signals import PATIENCE, stop_on_signals
     from ..training.verdict import is_worse, lower_by, shortcomings, worse_message
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output)
-    with join_process_group(options.device) as (group, device), stop_on_signals() as stop:
+    if isinstance(report, TextReporter):
+        report.since = time.monotonic()
+    with join_process_group(options.device) as (group, device), stop_on_signals(report, PATIENCE) as stop:
         report = report if group.is_first else silent
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)

@@ -94,7 +94,7 @@ def _train(
     for name, training in named.items():
         if training.plan:
             tell(name, Message(training.plan))
-    with stop_on_signals() as stop:
+    with stop_on_signals(show) as stop:
         tasks = (training.begin(source, device) for training in trainings if training.state == "waiting")
         Queue(slots, tell, ended).run(lambda: next(tasks, None), stop)
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import ceil
 
 import torch
 
 from ..errors import fail
+from ..events import format_count
 from .prediction import SECONDS_PER_SAMPLE, step_seconds, trained_frames
 from .settings import MOST_OF_ALL, TrainConfig
 from .step import EAGER_STEPS, Stepper
@@ -94,8 +96,22 @@ def timed_pace(stepper: Stepper, config: TrainConfig, left: Callable[[], float],
 
 
 def check_possible(pace: Pace, config: TrainConfig, seconds: float, where: str) -> None:
-    """Raise `SsilkError` if too few iterations of a new run, named `where`, fit into so many seconds at a pace."""
-    check_enough(fitting_iterations(pace, config, seconds), where)
+    """Raise `SsilkError` if too few iterations of a new run, named `where`, fit into so many seconds at a pace.
+
+    It says what a step takes, and how many more minutes would do.
+    """
+    iterations = max(0, fitting_iterations(pace, config, seconds))
+    if not iterations >= MIN_ITERATIONS:
+        share = config.static_fraction
+        each = share * pace.static + (1 - share) * pace.dynamic
+        lacking = MIN_ITERATIONS * each / PLANNED_SHARE - max(0.0, seconds)
+        fail(
+            where,
+            f"at most {iterations} iterations fit into the remaining minutes, since a step takes about {each:.2g} s "
+            "on this device",
+            f"at least {MIN_ITERATIONS} are needed",
+            f"give at least {format_count(ceil(lacking / 60), 'more minutes')}, or use a smaller preset",
+        )
 
 
 def fitting_iterations(pace: Pace, config: TrainConfig, seconds: float, done: int = 0) -> int:
@@ -116,17 +132,6 @@ def check_estimate(config: TrainConfig, samples: int, device: str, seconds: floa
         frames = config.pretraining_batch, trained_frames(config)
         each = (ESTIMATE_CAUTION * step_seconds(samples, count, device) / threads for count in frames)
         check_possible(Pace(*each), config, seconds, where)
-
-
-def check_enough(iterations: int, where: str) -> None:
-    """Raise `SsilkError` for a run, named `where`, that would be too short."""
-    if not iterations >= MIN_ITERATIONS:
-        fail(
-            where,
-            f"at most {max(0, iterations)} iterations fit into the remaining minutes on this device",
-            f"at least {MIN_ITERATIONS} are needed",
-            "give more minutes, or use a smaller preset",
-        )
 
 
 def _seconds(stepper: Stepper, iteration: int, check: Callable[[float], None]) -> float:

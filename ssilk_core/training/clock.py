@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from math import inf
 
-from .budget import Pace, affordable_validations, check_enough, fitting_iterations, scale_schedule
+from .budget import Pace, affordable_validations, check_possible, fitting_iterations, scale_schedule
 from .job import TrainJob
 from .settings import TrainConfig
 from .state import RunState
@@ -70,9 +70,9 @@ class RunClock:
         state, config = self.state, self.schedule
         self.pace = pace
         state.validations = affordable_validations(config, 60 * minutes, self.validation_seconds)
-        planned = fitting_iterations(pace, config, self.training_time_left())
-        check_enough(planned, str(self.job.output))
-        state.planned = planned
+        left = self.training_time_left()
+        check_possible(pace, config, left, str(self.job.output))
+        state.planned = fitting_iterations(pace, config, left)
 
     def plan_rest(self, minutes: float) -> None:
         """Plan the rest of a resumed run; one that is done goes on where much more time is left."""

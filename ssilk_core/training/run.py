@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,26 +15,31 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from ..devices import select_device
+from ..devices import busy_cores, select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
+from ..physics.collision.samples import contact_samples
+from ..physics.energy.stitching import held_stitches
 from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
-from .budget import check_estimate, timed_pace
+from .budget import VALIDATION_SHARE, check_estimate, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
-from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory
+from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory, smoothed_vertices
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .parts import build_parts
 from .run_files import RunFiles
 from .settings import MOST_SMOOTHED_VERTICES, TrainConfig
+from .signals import PatientStop
 from .state import Best, ReducedSettings, RunState, learned_tensors, load_state, restore, restore_learned
 from .validation import Score
 from .verdict import non_finite_terms, validation_message
 
 SAVE_INTERVAL = 60.0  # [s] between saved states
 REPORT_INTERVAL = 10.0  # [s] between reports of progress there, where steps are long
+FIRST_MODEL = 60.0  # [s] of steps after which there is a model, if no validation has written one
+BUSY = 0.75  # cores that other programs take, from which on it is told
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 
@@ -63,7 +69,7 @@ class TrainingRun:
     """
 
     def __init__(self, job: TrainJob, report: Reporter, group: ProcessGroup = SINGLE_PROCESS) -> None:
-        began = time.monotonic()
+        began, busy = time.monotonic(), busy_cores()  # before this run keeps any busy itself
         if not (group.size == 1 or job.minutes is None):
             fail(
                 str(job.output),
@@ -72,15 +78,17 @@ class TrainingRun:
                 "set the iterations instead (--set iterations=...)",
             )
         self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
+        if self.device.type == "cpu" and busy >= BUSY:
+            cores = f"about {busy:.1f} of {os.cpu_count()} cores"
+            report(Message(f"other programs keep {cores} busy: steps take longer meanwhile.", "warning"))
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self.clock = RunClock(job, state, began)
+        if job.minutes and job.is_trainable and not job.resume:
+            self._need_enough_minutes(job.minutes)
         self.parts = build_parts(job, self.device, group, report)
         if not job.resume:
             self._fit_batch()
-            if job.minutes and job.is_trainable:
-                samples = len(self.parts.energy.cloth.samples.area)
-                check_estimate(self.config, samples, self.device.type, 60 * job.minutes, str(job.output))
         self.lbs = self._score_lbs()
         if job.minutes and job.is_trainable:
             if job.resume:
@@ -95,7 +103,8 @@ class TrainingRun:
         else:
             self._resume(tensors)
         self.files.save_curve(self.state, self.lbs)
-        self._saved_at = self._reported_at = time.monotonic()
+        self._began = self._saved_at = self._reported_at = time.monotonic()
+        self._has_model = False
         self.clock.start()
 
     @property
@@ -107,6 +116,20 @@ class TrainingRun:
     def config(self) -> TrainConfig:
         """The schedule in use."""
         return self.clock.schedule
+
+    def _need_enough_minutes(self, minutes: float) -> None:
+        """Refuse minutes that the estimate does not allow, before anything is built.
+
+        The whole body is counted, so that the batch is no larger than the one that `_fit_batch` finds.
+        """
+        job, config, scene = self.job, self.config, self.job.scene
+        samples = len(contact_samples(scene.garment.mesh, job.fabric).area)
+        stitches = len(held_stitches(scene.garment.mesh, job.fabric, scene.classes))
+        body = scene.character.merged_body().mesh.vertex_count
+        memory = StepMemory(scene, job.model, body, samples, stitches, smoothed_vertices(scene, job.model, config))
+        batch, poses = memory.fitting_batch(config, free_memory(self.device))
+        fitting = replace(config, batch=batch, pretraining_batch=poses)
+        check_estimate(fitting, samples, self.device.type, 60 * minutes, str(job.output))
 
     def _score_lbs(self) -> Score:
         """Return the score of linear blend skinning, whose validation is the first to be timed."""
@@ -374,6 +397,24 @@ class TrainingRun:
         """Whether it is time to save the state again."""
         return self._any_process(time.monotonic() - self._saved_at >= SAVE_INTERVAL)
 
+    @property
+    def first_model_due(self) -> bool:
+        """Whether a model should be written although no validation is due: there is none, and steps take long.
+
+        A validation that takes long waits until it is a small part of the time.
+        """
+        due = max(FIRST_MODEL, self.clock.validation_seconds / VALIDATION_SHARE)
+        wish = not (self._has_model or self.state.best) and time.monotonic() - self._began >= due
+        return self._any_process(wish)
+
+    def write_first_model(self) -> None:
+        """Write the model as it is. It does not count as the best one, so that no clock decides which one is kept."""
+        with self.clock.paused():
+            score = self._score()
+            self._has_model = True
+            if not non_finite_terms(score):
+                self._write_model(score)
+
     def should_stop(self, stop: threading.Event) -> bool:
         """Return whether to stop after this iteration."""
         return self._any_process(stop.is_set())
@@ -415,14 +456,22 @@ def train(
     Args:
         job: what to train.
         report: receives the events.
-        stop: set from outside to save the state and stop after the current step.
+        stop: set from outside to save the state and stop after the current step, or inside one that takes longer than
+            a `PatientStop` waits.
         group: the processes that train together, each of which calls this.
 
     Raises:
         SsilkError: inputs or memory do not suffice, or training diverged.
     """
     run = TrainingRun(job, report, group)
-    finished = _loop(run, stop or threading.Event())
+    stop = stop or threading.Event()
+    try:
+        finished = _loop(run, stop)
+    except KeyboardInterrupt:
+        report(Message(f"stopped inside a step; --resume continues from iteration {run.saved}."))
+        raise
+    if isinstance(stop, PatientStop):
+        stop.obeyed()
     run.save()
     if run.state.skipped:
         report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
@@ -446,6 +495,8 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
             run.report_progress(left)
         if run.validation_due:
             run.validate()
+        elif run.first_model_due:
+            run.write_first_model()
         elif run.save_due:
             run.save()
     return run.state.iteration >= run.config.iterations

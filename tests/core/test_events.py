@@ -101,6 +101,18 @@ def test_a_log_gets_a_line_now_and_then_and_the_last_one_always(monkeypatch):
     assert stream.getvalue().split() == ["1/30", "11/30", "21/30", "30/30"]
 
 
+def test_lines_begin_with_the_time_where_they_are_asked_to(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(events.time, "monotonic", lambda: now[0])
+    stream = io.StringIO()
+    report = TextReporter(stream)
+    report(Message("before"))
+    report.since = 100.0
+    for now[0], event in ((102.9, Message("soon")), (3765.0, Progress(1, 2, 65.0))):
+        report(event)
+    assert stream.getvalue() == "before\n0:00:02  soon\n1:01:05  1/2  1 min 05 s left  \n"
+
+
 def test_the_time_left_is_told_at_the_pace_since_the_first_step(monkeypatch):
     now, told = [100.0], []
     monkeypatch.setattr(events.time, "monotonic", lambda: now[0])

@@ -19,7 +19,7 @@ from ssilk_core.training import run as training
 from ssilk_core.training.budget import (
     Pace,
     affordable_validations,
-    check_enough,
+    check_possible,
     fitting_iterations,
     scale_schedule,
     timed_pace,
@@ -111,11 +111,17 @@ def test_as_many_iterations_are_planned_as_fit():
     assert fitting_iterations(pace, PLAN, 40, done=300) == 300 + int(0.98 * 40 / 0.4)
     slower = pace.updated(1.4, is_static=False)
     assert slower.dynamic / slower.static == pytest.approx(4) and 0.4 < slower.dynamic < 1.4
-    check_enough(20, "cape.safetensors")
-    with pytest.raises(
-        SsilkError, match=r"^cape.safetensors: at most 14 iterations fit into the remaining minutes .* smaller preset"
-    ):
-        check_enough(14, "cape.safetensors")
+
+
+def test_too_few_minutes_are_refused_with_what_a_step_takes_and_how_many_would_do():
+    pace, each = Pace(1.0, 20.0), 0.3 * 1 + 0.7 * 20
+    enough = 20 * each / 0.98
+    check_possible(pace, PLAN, enough + 1e-6, "cape.safetensors")
+    said = rf"^cape.safetensors: at most 14 iterations .* takes about {each:.2g} s on this.* at least 2 more minutes"
+    with pytest.raises(SsilkError, match=said):
+        check_possible(pace, PLAN, 14.5 * each / 0.98, "cape.safetensors")
+    more = (enough - 14.5 * each / 0.98) / 60
+    assert 1 < more < 2
 
 
 def test_validations_take_a_tenth_of_the_time_at_most():

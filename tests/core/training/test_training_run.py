@@ -698,7 +698,7 @@ def test_a_long_curve_is_thinned_and_ends_at_the_last_validation():
 def test_interrupts_set_the_event_once_and_are_immediate_the_second_time():
     started = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), stop_on_signals() as stop:
+    with pytest.raises(KeyboardInterrupt), stop_on_signals(silent) as stop:
         assert not stop.is_set()
         signal.raise_signal(signal.SIGINT)
         assert stop.wait(1)
@@ -712,7 +712,7 @@ def test_interrupts_elsewhere_than_in_the_main_thread_are_left_alone():
     found: list[bool] = []
 
     def work() -> None:
-        with stop_on_signals() as stop:
+        with stop_on_signals(silent) as stop:
             found.append(stop.is_set())
 
     thread = threading.Thread(target=work)
@@ -811,3 +811,45 @@ def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goe
     monkeypatch.setattr(command, "training_job", lambda *_: ready)
     words = ["train", "hero.usda", "--motions", "walks", "-o", str(model), "--device", "cpu"]
     assert main(words) == 0 and "86 of 500 iterations" in capsys.readouterr().err
+
+
+def test_a_slow_training_has_a_model_before_its_first_validation(job, monkeypatch):
+    """It is the model of that step, and does not count as the best one: the clock decides nothing."""
+    monkeypatch.setattr(training, "FIRST_MODEL", 0.0)
+    monkeypatch.setattr(training, "VALIDATION_SHARE", math.inf)
+    heard: list[Event] = []
+    asked = job("first_model", replace(SHORT, iterations=8, validate_every=8))
+    train(asked, heard.append)
+    written = [event.done for event in heard if isinstance(event, Checkpoint)]
+    assert written[0] < 8 and len(written) == 2 and written[-1] == 8
+    monkeypatch.undo()
+    alone = job("first_model_later", asked.train)
+    train(alone, silent)
+    first, second = (load_model(each.output) for each in (asked, alone))
+    assert all(np.array_equal(value, second.parameters[name]) for name, value in first.parameters.items())
+
+
+@pytest.mark.parametrize(("load", "is_told"), [(2.5, True), (0.3, False)])
+def test_cores_that_other_programs_take_are_told(job, monkeypatch, load, is_told):
+    monkeypatch.setattr(training, "busy_cores", lambda: load)
+    heard: list[Event] = []
+    train(job(f"busy_{is_told}", replace(SHORT, iterations=1, static_fraction=0)), heard.append)
+    said = [event.text for event in heard if isinstance(event, Message) and "other programs" in event.text]
+    assert len(said) == is_told and all("about 2.5 of" in text for text in said)
+
+
+def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job, monkeypatch):
+    def endless(stepper: Stepper, iteration: int) -> None:
+        if iteration == 3:
+            raise KeyboardInterrupt  # as `PatientStop` does
+        run(stepper, iteration)
+
+    run = Stepper.run
+    asked = job("inside", replace(SHORT, iterations=6, validate_every=2))
+    heard: list[Event] = []
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Stepper, "run", endless)
+        train(asked, heard.append)
+    said = [event.text for event in heard if isinstance(event, Message)]
+    assert said[-1] == "stopped inside a step; --resume continues from iteration 2."
+    assert train(replace(asked, resume=True), silent).iterations == 6
