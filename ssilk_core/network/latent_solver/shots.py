@@ -9,7 +9,7 @@ replaced by the network's quasi-static one for `RECOVERY_FRAMES` frames; the sho
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,20 +18,24 @@ from torch import Tensor
 from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
+from ...physics.simulate.cubature import Cubature, spread_evenly
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
+from ...scene.kinematics import motion_transforms
 from ..descriptors import pose_features
 from ..model.descriptors import upright_descriptors
 from ..model.feedback import BodyFrames
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
+from .elements import choose_elements
 from .options import LatentOptions
 from .solver import LatentSolution, LatentSolver
 from .warm_start import FrameDescriptors, warm_starts
 
 LOOK_BACK = 2  # earlier frames that descriptors need
 DESCRIBED = 256  # frames described at once
+CHOSEN_FROM, CHOSEN_STATES = 8, 32  # motions and states that elements are chosen for, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,11 @@ class _Past:
 class LatentShots:
     """Solves shots of one garment in its model's latents.
 
+    Attributes:
+        simulator, solver: over the whole garment, until elements have been chosen for the first motions where the
+            options say so, and then over these.
+        cubature: the elements; None before.
+
     Args:
         model: on the device to use.
         fabric: of the garment.
@@ -97,6 +106,38 @@ class LatentShots:
             model.scene, fabric, SimulationOptions(fps=self.fps, precision=precision), device=device
         )
         self.solver = LatentSolver(model, self.simulator.potential, options)
+        self.cubature: Cubature | None = None
+
+    @torch.no_grad()
+    def choose(self, motions: Sequence[Motion]) -> None:
+        """Choose elements for what the network does in some motions, and solve on these from now on.
+
+        States are taken from at most `CHOSEN_FROM` of the motions, `CHOSEN_STATES` in all.
+        """
+        motions = [motions[number] for number in spread_evenly(len(motions), CHOSEN_FROM)]
+        share, z, poses = CHOSEN_STATES // len(motions), [], []
+        for motion in motions:
+            states, kept = self._rolled(motion), spread_evenly(motion.frame_count, share)
+            z.append(states[torch.as_tensor(kept, device=states.device)])
+            poses.append(replace(motion, rotations=motion.rotations[kept], translations=motion.translations[kept]))
+        posed = self.simulator.poser.pose(*(
+            np.concatenate([getattr(motion, name) for motion in poses]) for name in ("rotations", "translations")
+        ))  # fmt: skip
+        states = torch.cat(z).to(self.solver.potential.dtype)
+        states = states.clamp(-self.solver.bound, self.solver.bound)
+        scene = self.model.scene
+        self.cubature = choose_elements(scene, self.simulator, self.solver, states, posed)
+        self.simulator = self.simulator.sampled(scene, self.cubature)
+        self.solver = LatentSolver(self.model, self.simulator.potential, self.options, self.cubature)
+
+    def _rolled(self, motion: Motion) -> Tensor:
+        """Return the network's states over a motion (F, m), its quasi-static ones where it is lost."""
+        seen, skeleton = list(self._descriptors([motion])), self.model.scene.character.skeleton
+        rest, pose = (torch.stack([getattr(frame, name) for frame in seen]) for name in ("rest", "pose"))
+        body = BodyFrames.of(motion_transforms(motion, skeleton.parents), skeleton, rest)
+        states = torch.stack(self.model.roll([rest[0], *rest[1:LOOK_BACK]], rest[LOOK_BACK:], pose[LOOK_BACK:], body))
+        sound = states.abs().amax(dim=2, keepdim=True) < DIVERGENCE_BOUND
+        return torch.where(sound, states, rest)[:, 0]
 
     @torch.no_grad()
     def frames(self, motions: Sequence[Motion]) -> Iterator[LatentFrame]:
@@ -114,6 +155,8 @@ class LatentShots:
         lengths = [motion.frame_count for motion in motions]
         if lengths != sorted(lengths, reverse=True):
             fail("latent solver", "motions of increasing length", "the longest must come first")
+        if self.options.sampled and self.cubature is None:
+            self.choose(motions)
         past: _Past | None = None
         for number, seen in enumerate(self._descriptors(motions)):
             running = motions[: len(seen.rest)]

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ...physics.collision import SmoothedDistance
 from ...physics.constants import GRAVITY
+from ...physics.simulate.cubature import Cubature
 from ...physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..model.network import GarmentModel
 from .free_decoder import DecodedPoints, FreeDecoder
@@ -115,11 +116,20 @@ class LatentSolver:
     Args:
         model: on the device to use.
         potential: of its garment, in the precision to use.
+        cubature: on whose vertices the potential is; all by default.
     """
 
-    def __init__(self, model: GarmentModel, potential: IncrementalPotential, options: LatentOptions) -> None:
-        self.potential, self.options = potential, options
-        self.decoder = FreeDecoder(model, potential.free, potential.dtype)
+    def __init__(
+        self,
+        model: GarmentModel,
+        potential: IncrementalPotential,
+        options: LatentOptions,
+        cubature: Cubature | None = None,
+    ) -> None:
+        self.potential, self.options, free = potential, options, potential.free
+        if cubature is not None:
+            free = torch.as_tensor(cubature.vertices, device=free.device)[free]
+        self.decoder = FreeDecoder(model, free, potential.dtype)
         self.bound = model.config.latent_bound or torch.inf
         self.free_mass = potential.mass[potential.free, 0]
 
