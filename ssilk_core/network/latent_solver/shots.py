@@ -34,7 +34,7 @@ from .solver import LatentSolution, LatentSolver
 from .warm_start import FrameDescriptors, warm_starts
 
 LOOK_BACK = 2  # earlier frames that descriptors need
-DESCRIBED = 256  # frames described at once
+DESCRIBED, POSED = 256, 16  # frames of each motion at once
 CHOSEN_FROM, CHOSEN_STATES = 8, 32  # motions and states that elements are chosen for, at most
 
 
@@ -158,16 +158,25 @@ class LatentShots:
         if self.options.sampled and self.cubature is None:
             self.choose(motions)
         past: _Past | None = None
-        for number, seen in enumerate(self._descriptors(motions)):
+        for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(motions))):
             running = motions[: len(seen.rest)]
-            at = slice(number, number + 1)
-            poses = self.simulator.poser.pose(*(
-                np.concatenate([getattr(motion, name)[at] for motion in running])
-                for name in ("rotations", "translations")
-            ))  # fmt: skip
             past = past and past.first(len(running))
             frame, past = self._advance(number, past, poses, seen)
             yield frame
+
+    def _poses(self, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
+        """Yield the characters in each frame of the motions that have not ended; some frames are posed at once."""
+        device = self.simulator.gravity.device
+        for start in range(0, motions[0].frame_count, POSED):
+            running = [motion for motion in motions if motion.frame_count > start]
+            spans = [motion.clip(start, start + POSED) for motion in running]
+            counts = torch.tensor([span.frame_count for span in spans], device=device)
+            posed = self.simulator.poser.pose(*(
+                np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
+            ))  # fmt: skip
+            first = counts.cumsum(0) - counts
+            for frame in range(spans[0].frame_count):
+                yield posed.select(first[counts > frame] + frame)
 
     def _descriptors(self, motions: Sequence[Motion]) -> Iterator[FrameDescriptors]:
         """Yield what the network sees in each frame of the motions that have not ended."""

@@ -34,6 +34,7 @@ TRIALS = ((1.0, 1.0), (0.1, 1.0), (10.0, 1.0), (100.0, 1.0), (100.0, 0.25))
 ADAPTED = 0.5  # the exponent of the best trial's factor, by which a frame's damping changes
 TIGHTENED = 100.0  # the factor where no trial was good
 DAMPING_RANGE = (1e-6, 1e9)
+ALLOWANCE = 0.02  # [m] that sampled cloth may come nearer to the body in an iteration, and be seen
 ROUNDING = 8  # units in the last place of an energy that are not told apart
 
 
@@ -127,6 +128,7 @@ class LatentSolver:
         cubature: Cubature | None = None,
     ) -> None:
         self.potential, self.options, free = potential, options, potential.free
+        self.sampled = cubature is not None
         if cubature is not None:
             free = torch.as_tensor(cubature.vertices, device=free.device)[free]
         self.decoder = FreeDecoder(model, free, potential.dtype)
@@ -186,11 +188,17 @@ class LatentSolver:
 
     def _state(self, z: Tensor, character: Tensor, inputs: StepInputs, near: _State | None = None) -> _State:
         """Return the state of latents; one that is `near`, of the same frames, saves time."""
-        x = self.decode(z, character, inputs)
-        if near is None:
-            distance = self.potential.body_distance(x, inputs)
+        return self._queried(z, self.decode(z, character, inputs), inputs, near)
+
+    def _queried(self, z: Tensor, x: Tensor, inputs: StepInputs, near: _State | None = None) -> _State:
+        """Return the state of latents whose positions are known."""
+        potential = self.potential
+        if self.sampled:
+            distance = potential.body_distance(x, inputs, ALLOWANCE)
+        elif near is None:
+            distance = potential.body_distance(x, inputs)
         else:
-            distance = self.potential.body_distance_nearby(x, inputs, near.distance, near.x)
+            distance = potential.body_distance_nearby(x, inputs, near.distance, near.x)
         return self._with_energy(z, x, inputs, distance)
 
     def _on_planes(self, z: Tensor, character: Tensor, inputs: StepInputs, of: _State) -> _State:
@@ -205,11 +213,11 @@ class LatentSolver:
         first, *others = (start.to(self.potential.dtype).clamp(-self.bound, self.bound) for start in starts)
         best = self._state(first, character, inputs)
         for z in others:
-            if not self.options.exact_contact:
-                lower = self._on_planes(z, character, inputs, best).energy < best.energy
-                if not bool(lower.any()):
+            state = self._on_planes(z, character, inputs, best)
+            if not self.sampled:
+                if not self.options.exact_contact and not bool((state.energy < best.energy).any()):
                     continue
-            state = self._state(z, character, inputs, best)
+                state = self._queried(z, state.x, inputs, best)
             best = best.where(state.energy < best.energy, state)
         return best
 
@@ -232,6 +240,8 @@ class _LatentSearch:
     def advance(self) -> bool:
         """Make one step; return whether another may gain anything."""
         if self.stale:
+            if self.solver.sampled and bool(self.iterations.any()):
+                self.state = self.solver._queried(self.state.z, self.state.x, self.inputs)
             self.decoded, self.model = self.solver._model(self.state, self.character, self.inputs)
             self.stale = False
         factors = self.damping.new_tensor([factor for factor, _ in TRIALS])
@@ -243,8 +253,8 @@ class _LatentSearch:
             return False
         found, trial = self._least(steps)
         lower = wanted & (found.energy < self.state.energy)
-        if not self.solver.options.exact_contact:
-            found = self.solver._state(found.z, self.character, self.inputs, self.state)
+        if not (self.solver.options.exact_contact or self.solver.sampled):
+            found = self.solver._queried(found.z, found.x, self.inputs, self.state)
             lower &= found.energy < self.state.energy
         self.state, self.stale = self.state.where(lower, found), bool(lower.any())
         self.failed, self.iterations = wanted & ~lower, self.iterations + lower
@@ -260,7 +270,8 @@ class _LatentSearch:
         every = torch.arange(frames, device=z.device).repeat(count)
         character, inputs = self.character[..., every], self.inputs.select(every)
         here, z = self.state.select(every), z.flatten(0, 1)
-        tried = (solver._state if solver.options.exact_contact else solver._on_planes)(z, character, inputs, here)
+        exact = solver.options.exact_contact and not solver.sampled
+        tried = (solver._state if exact else solver._on_planes)(z, character, inputs, here)
         best = tried.energy.reshape(count, frames).argmin(0)
         at = best * frames + every[:frames]
         return tried.select(at), best
