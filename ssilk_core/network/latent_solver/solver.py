@@ -268,13 +268,14 @@ class _LatentSearch:
         lengths = steps.new_tensor([length for _, length in TRIALS])[:, None, None]
         z = (self.state.z + (lengths * steps).to(self.state.z.dtype)).clamp(-solver.bound, solver.bound)
         every = torch.arange(frames, device=z.device).repeat(count)
-        character, inputs = self.character[..., every], self.inputs.select(every)
-        here, z = self.state.select(every), z.flatten(0, 1)
-        exact = solver.options.exact_contact and not solver.sampled
-        tried = (solver._state if exact else solver._on_planes)(z, character, inputs, here)
+        character, z = self.character[..., every], z.flatten(0, 1)
+        if solver.options.exact_contact and not solver.sampled:
+            tried = solver._state(z, character, self.inputs.select(every), self.state.select(every))
+        else:
+            inputs = replace(self.inputs, body=None).select(every)
+            tried = solver._on_planes(z, character, inputs, self.state.select(every))
         best = tried.energy.reshape(count, frames).argmin(0)
-        at = best * frames + every[:frames]
-        return tried.select(at), best
+        return tried.select(best * frames + every[:frames]), best
 
     def _held(self, gradient: Tensor) -> Tensor:
         """Return which latents lie on the bound, with a force that presses them against it, shape (N, m)."""
