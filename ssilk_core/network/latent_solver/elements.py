@@ -2,8 +2,8 @@
 """The few elements that a solver in latents sums the energy over, and their weights.
 
 Pairs of adjacent faces are spread over the garment, so that no state can hide from them. In states s of the network's
-own rollouts, an element e pulls on the m latents with J' f_e. Faces that give most of the missing forces are added one
-after the other, as An, Kim and James do (2008, "Optimizing cubature for efficient integration of subspace
+own rollouts, an element e pulls on the m latents with J' f_e. Faces that give most of the missing forces are added
+after one another, as An, Kim and James do (2008, "Optimizing cubature for efficient integration of subspace
 deformations"). All faces and hinges between these vertices get weights w that give the forces of the whole garment,
 near those w_0 with which each stands for what lies around it:
 
@@ -52,14 +52,13 @@ def choose_elements(
     mesh, potential = scene.garment.mesh, simulator.potential
     spread = cubature_between(scene, potential, spread_pairs(scene, PAIRS))
     faces = np.union1d(spread.faces, spread_evenly(len(mesh.faces), CANDIDATES))
-    (stretch, target), = _mixed_forces(simulator, solver, z, poses, [faces])
+    ((stretch, target),) = _mixed_forces(simulator, solver, z, poses, [faces])
     added = faces[_missing(stretch, target, np.searchsorted(faces, spread.faces), spread.face_weights)]
     found = cubature_between(scene, potential, np.append(spread.vertices, mesh.faces[added]))
     forces = _mixed_forces(simulator, solver, z, poses, [found.faces, found.hinges])
-    share = len(z) ** 0.5
     weights = [found.face_weights, found.hinge_weights]
     for number, mixed in enumerate(forces):
-        weights[number] = _fitted(*mixed, share, weights[number])
+        weights[number] = _fitted(*mixed, len(z) ** 0.5, weights[number])
     return replace(found, face_weights=weights[0], hinge_weights=weights[1])
 
 
@@ -85,7 +84,7 @@ def _missing(columns: Tensor, target: Tensor, chosen: Ints, usual: Floats) -> In
 def _mixed_forces(
     simulator: Simulator, solver: LatentSolver, z: Tensor, poses: PosedCharacters, rows: Sequence[Ints]
 ) -> list[tuple[Tensor, Tensor]]:
-    """Return, for stretch and bending, mixed forces of the elements `rows` (EQUATIONS, E), and of all (EQUATIONS,)."""
+    """Return, for stretch and bending, mixed forces of elements `rows` (EQUATIONS, E), and of all (EQUATIONS,)."""
     generator, first = torch.Generator().manual_seed(0), torch.zeros(1, dtype=torch.long, device=z.device)
     posed = poses.select(first)
     hessian = solver.equations(z[:1], posed.matrices, simulator.inputs(posed, None)).hessian[0]

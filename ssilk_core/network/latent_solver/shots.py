@@ -9,7 +9,7 @@ replaced by the network's quasi-static one for `RECOVERY_FRAMES` frames; the sho
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
-from ...physics.simulate.cubature import Cubature, spread_evenly
+from ...physics.simulate.cubature import spread_evenly
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
@@ -87,9 +87,7 @@ class LatentShots:
     """Solves shots of one garment in its model's latents.
 
     Attributes:
-        simulator, solver: over the whole garment, until elements have been chosen for the first motions where the
-            options say so, and then over these.
-        cubature: the elements; None before.
+        simulator, solver: over the whole garment, even where the options say that few elements are solved for.
 
     Args:
         model: on the device to use.
@@ -106,29 +104,26 @@ class LatentShots:
             model.scene, fabric, SimulationOptions(fps=self.fps, precision=precision), device=device
         )
         self.solver = LatentSolver(model, self.simulator.potential, options)
-        self.cubature: Cubature | None = None
 
     @torch.no_grad()
-    def choose(self, motions: Sequence[Motion]) -> None:
-        """Choose elements for what the network does in some motions, and solve on these from now on.
+    def sampled(self, motions: Sequence[Motion]) -> tuple[Simulator, LatentSolver]:
+        """Return a simulator and a solver on few elements, chosen for what the network does in some motions.
 
         States are taken from at most `CHOSEN_FROM` of the motions, `CHOSEN_STATES` in all.
         """
         motions = [motions[number] for number in spread_evenly(len(motions), CHOSEN_FROM)]
-        share, z, poses = CHOSEN_STATES // len(motions), [], []
-        for motion in motions:
-            states, kept = self._rolled(motion), spread_evenly(motion.frame_count, share)
-            z.append(states[torch.as_tensor(kept, device=states.device)])
-            poses.append(replace(motion, rotations=motion.rotations[kept], translations=motion.translations[kept]))
-        posed = self.simulator.poser.pose(*(
-            np.concatenate([getattr(motion, name) for motion in poses]) for name in ("rotations", "translations")
+        share = CHOSEN_STATES // len(motions)
+        kept = [spread_evenly(motion.frame_count, share) for motion in motions]
+        rolled = [self._rolled(motion)[torch.as_tensor(rows)] for motion, rows in zip(motions, kept)]
+        z = torch.cat(rolled).to(self.solver.potential.dtype).clamp(-self.solver.bound, self.solver.bound)
+        poses = self.simulator.poser.pose(*(
+            np.concatenate([getattr(motion, name)[rows] for motion, rows in zip(motions, kept)])
+            for name in ("rotations", "translations")
         ))  # fmt: skip
-        states = torch.cat(z).to(self.solver.potential.dtype)
-        states = states.clamp(-self.solver.bound, self.solver.bound)
         scene = self.model.scene
-        self.cubature = choose_elements(scene, self.simulator, self.solver, states, posed)
-        self.simulator = self.simulator.sampled(scene, self.cubature)
-        self.solver = LatentSolver(self.model, self.simulator.potential, self.options, self.cubature)
+        cubature = choose_elements(scene, self.simulator, self.solver, z, poses)
+        simulator = self.simulator.sampled(scene, cubature)
+        return simulator, LatentSolver(self.model, simulator.potential, self.options, cubature)
 
     def _rolled(self, motion: Motion) -> Tensor:
         """Return the network's states over a motion (F, m), its quasi-static ones where it is lost."""
@@ -155,23 +150,22 @@ class LatentShots:
         lengths = [motion.frame_count for motion in motions]
         if lengths != sorted(lengths, reverse=True):
             fail("latent solver", "motions of increasing length", "the longest must come first")
-        if self.options.sampled and self.cubature is None:
-            self.choose(motions)
+        simulator, solver = self.sampled(motions) if self.options.sampled else (self.simulator, self.solver)
         past: _Past | None = None
-        for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(motions))):
+        for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(simulator, motions))):
             running = motions[: len(seen.rest)]
             past = past and past.first(len(running))
-            frame, past = self._advance(number, past, poses, seen)
+            frame, past = self._advance(simulator, solver, number, past, poses, seen)
             yield frame
 
-    def _poses(self, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
+    def _poses(self, simulator: Simulator, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
         """Yield the characters in each frame of the motions that have not ended; some frames are posed at once."""
-        device = self.simulator.gravity.device
+        device = simulator.gravity.device
         for start in range(0, motions[0].frame_count, POSED):
             running = [motion for motion in motions if motion.frame_count > start]
             spans = [motion.clip(start, start + POSED) for motion in running]
             counts = torch.tensor([span.frame_count for span in spans], device=device)
-            posed = self.simulator.poser.pose(*(
+            posed = simulator.poser.pose(*(
                 np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
             ))  # fmt: skip
             first = counts.cumsum(0) - counts
@@ -203,23 +197,29 @@ class LatentShots:
         return FrameDescriptors(rest, dynamic)
 
     def _advance(
-        self, number: int, past: _Past | None, poses: PosedCharacters, seen: FrameDescriptors
+        self,
+        simulator: Simulator,
+        solver: LatentSolver,
+        number: int,
+        past: _Past | None,
+        poses: PosedCharacters,
+        seen: FrameDescriptors,
     ) -> tuple[LatentFrame, _Past]:
         """Return a frame, and the states for the next one."""
-        rest = seen.rest.to(self.solver.potential.dtype)
-        inputs = self.simulator.inputs(poses, past.cloth if past else None)
+        rest = seen.rest.to(solver.potential.dtype)
+        inputs = simulator.inputs(poses, past.cloth if past else None)
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
         else:
             body = past.followed_by(poses)
             starts, iterations = warm_starts(self.model, past.before, past.now, seen, body), None
-        found = self.solver.solve(starts, poses.matrices, inputs, iterations)
+        found = solver.solve(starts, poses.matrices, inputs, iterations)
         lost = ~(found.energy.isfinite() & found.z.isfinite().all(1))
         recovering = torch.zeros_like(found.iterations) if past is None else past.recovering
         recovering = torch.where(lost, RECOVERY_FRAMES, recovering)
         lost = recovering > 0
         if bool(lost.any()):
-            found = found.where(lost, self.solver.given(rest, poses.matrices, inputs))
+            found = found.where(lost, solver.given(rest, poses.matrices, inputs))
         cloth = StepHistory(found.x.double() + poses.root, past.cloth.last if past else None, poses.root, poses.lbs)
         before, earlier, root = found.z, poses.matrices, poses.root
         if past:

@@ -44,7 +44,7 @@ class LatentSolution:
 
     Attributes:
         z: latents, shape (N, m).
-        x: positions [m], pinned vertices under linear blend skinning, shape (V, 3, N).
+        x: positions of the potential's vertices [m], pinned ones under linear blend skinning, shape (V, 3, N).
         energy, start_energy: at x, and at the best of the starts [J], shape (N,).
         left: by how much the quadratic model says that the energy could still fall [J], shape (N,); with the forces
             at x, and the Jacobian and Hessian of the last iteration.

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -110,8 +109,8 @@ class Contacts:
             within: distances that matter outside of the body [m] (`smoothed_planes`).
         """
 
-        def find(*asked: Any) -> Sequence[Tensor]:
-            return smoothed_planes(*asked, within).tensors()
+        def find(x: Tensor, body: PosedBody, blocks: Tensor, patches: Patches | None) -> Sequence[Tensor]:
+            return smoothed_planes(x, body, blocks, patches, within).tensors()
 
         def no_contact(x: Tensor) -> Sequence[Tensor]:
             return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)

@@ -5,8 +5,8 @@ With weights w of chosen faces f and hinges h, and vertices v that each stand fo
 
     E(x) ~ sum_f w_f stretch_f(x) + sum_h w_h bending_h(x) + sum_v (gravity, inertia, drag, tether, contact)_v(x)
 
-A chosen vertex has the mass, the tether and the contact area of all that it stands for. Who chooses knows the states
-(`network.latent_solver.elements`); here only the vertices are spread over the garment.
+A chosen vertex has the mass, the tether and the contact area of all that it stands for. Who chooses the vertices
+knows the states (`network.latent_solver.elements`); all faces and hinges between them count.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .incremental_potential import IncrementalPotential
 from .membrane import Membrane
 
 MAX_STITCHES = 64
+NO_ELEMENTS: Ints = np.zeros(0, dtype=np.int64)
 OWNED_AT_ONCE = 4096  # vertices whose distances to all chosen ones are in memory
 
 
@@ -82,13 +83,13 @@ def cubature_between(scene: Scene, whole: IncrementalPotential, vertices: Ints) 
         whole: the potential of the scene's garment.
         vertices: some of each island and class; those of a few stitches are added.
     """
-    mesh, stitches = scene.garment.mesh, np.zeros(0, dtype=np.int64)
+    mesh, stitches = scene.garment.mesh, NO_ELEMENTS
     if whole.stitching:
         stitches = spread_evenly(len(whole.stitching), MAX_STITCHES)
         vertices = np.append(vertices, whole.stitching.corners[stitches])
     vertices = np.unique(vertices)
     faces = _between(scene, mesh.faces, whole.membrane.area, vertices)
-    hinges = np.zeros(0, dtype=np.int64), np.zeros(0)
+    hinges: tuple[Ints, Floats] = NO_ELEMENTS, np.zeros(0)
     if whole.hinges:
         hinges = _between(scene, whole.hinges.corners, whole.hinges.stiffness, vertices)
     groups = _groups(scene)
