@@ -9,6 +9,10 @@ with the Jacobian J = dx/dz of the decoder (`free_decoder`) and the projected He
 few dampings D and lengths of s together, and takes the one with the least energy. Where none has less, the frame
 stays, and the next iteration damps more. So no frame ever has more energy than the best of its starts. The result is
 a latent: what a shot stores of it are joints and blendshapes of the model, and nothing is fitted.
+
+On few elements (`elements`) E is their weighted sum, and the body is queried once before each iteration. No iteration
+adds to that sum, with the body as it was found; between two iterations a new query may, and nothing bounds the energy
+of the whole garment.
 """
 
 from __future__ import annotations
