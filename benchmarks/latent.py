@@ -4,10 +4,13 @@
     OMP_NUM_THREADS=1 python benchmarks/latent.py --garment cape --threads 1
 
 All shots of a motion are solved at once, each a frame later in the motion than the one before. Times are those of a
-frame of one shot: medians over frames, without the first two. Energies are means over frames and shots, of the best
-start, and as solved; each row has its own past, so rows differ in these. "Left" is the share of the gain that the
-solver's own prediction has still left. The first row of a motion is the network. With --simulate the simulator goes
-through the first shot, and RMS distances from it are told; a frame of a cape takes it seconds.
+frame of one shot, in processor time on a processor: medians over frames, without the first two. What it takes to
+choose elements for a motion comes before the first frame ("begins"). Energies are means over frames and shots, of the
+best start, and as solved, on the elements that the solver has; each row has its own past, so rows differ in these.
+"Whole" is the first shot's on all elements, of the same states. "Left" is the share of the gain that the solver's own
+prediction has still left. The first row of a motion is the network; "all" rows solve for the whole garment. With
+--simulate the simulator goes through the first shot, and RMS distances from it, after five frames and at the end, are
+told; a frame of a cape takes it seconds.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import torch
 from helpers.reports import table
 from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
+from torch import Tensor
 
 from ssilk_core.demo.motions import MOTIONS, build_motion
 from ssilk_core.demo.shipped import shipped_path
@@ -33,46 +37,73 @@ from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import decode, garment_poses
 from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import Floats, Motion
 
-HEADER = ("motion", "iterations", "ms a frame and shot", "energy before [J]", "energy [J]", "left",
-          "not converged", "failed", "from the simulator [mm]")  # fmt: skip
+HEADER = ("motion", "elements", "iterations", "begins [s]", "ms a frame and shot", "energy before [J]", "energy [J]",
+          "whole [J]", "inside [%]", "left", "not converged", "failed", "from the simulator [mm]")  # fmt: skip
+SHOWN = 5, -1  # frames whose distances are told
 
 
 def rms(points: Floats, reference: Floats | None) -> str:
-    """Return the RMS distance of vertices from the simulator's [mm], where there are any."""
+    """Return RMS distances of vertices from the simulator's in two frames [mm], where there are any."""
     if reference is None:
         return ""
-    return f"{1000 * float(np.sqrt(((points - reference) ** 2).sum(axis=-1).mean())):.0f}"
+    apart = 1000 * np.sqrt(((points - reference) ** 2).sum(axis=-1).mean(axis=1))
+    return ", ".join(f"{apart[frame]:.0f}" for frame in SHOWN)
+
+
+def on_all_elements(solver: LatentShots, shot: Motion, states: Sequence[Tensor]) -> tuple[Floats, float, float]:
+    """Return the vertices of a shot's states (F, V, 3) [m], their mean energy [J], and the share inside the body."""
+    simulator, potential, past = solver.simulator, solver.simulator.potential, None
+    points, figures = [], []
+    for number, z in enumerate(states):
+        at = slice(number, number + 1)
+        poses = simulator.poser.pose(shot.rotations[at], shot.translations[at])
+        inputs = simulator.inputs(poses, past)
+        x = solver.solver.decode(z, poses.matrices, inputs)
+        distance = potential.body_distance(x, inputs)
+        figures.append((float(potential.energy(x, inputs, distance)), float(potential.inside(x, distance))))
+        past = StepHistory(x.double() + poses.root, past.last if past else None, poses.root, poses.lbs)
+        points.append(past.last[..., 0].cpu().numpy())
+    energy, inside = np.mean(figures, axis=0)
+    return np.stack(points), float(energy), float(inside)
 
 
 def rows(
-    model: GarmentModel, file: ModelFile, shots: Sequence[Motion], iterations: Sequence[int], reference: Floats | None
+    model: GarmentModel,
+    file: ModelFile,
+    shots: Sequence[Motion],
+    tried: Sequence[LatentOptions],
+    reference: Floats | None,
 ) -> Iterator[tuple[str, ...]]:
-    """Yield the network's row, then one for each number of iterations."""
+    """Yield the network's row, then one for each of the options."""
     name, first = shots[0].path, shots[0]
     played = np.concatenate([decode(model, first, pose) for pose in garment_poses(model, first, first.fps)])
-    yield name, "network", "", "", "", "", "", "", rms(played, reference)
-    for count in iterations:
-        solver, tally = LatentShots(model, file.fabric, LatentOptions(iterations=count)), LatentTally()
-        points, ends = [], []
+    yield name, "", "network", *[""] * (len(HEADER) - 4), rms(played, reference)
+    clock = time.perf_counter if next(model.parameters()).is_cuda else time.process_time
+    for options in tried:
+        solver, tally = LatentShots(model, file.fabric, options), LatentTally()
+        states, ends = [], [clock()]
         for frame in solver.frames(shots):
             tally.add(frame)
-            at = slice(frame.number, frame.number + 1)
-            root = solver.simulator.poser.pose(first.rotations[at], first.translations[at]).root[:, 0]
-            points.append((frame.solution.x[..., 0].double() + root).cpu().numpy())
-            ends.append(time.perf_counter())
-        pace = 1000 * float(np.median(np.diff(ends[1:]))) / len(shots)
+            states.append(frame.solution.z[:1])
+            ends.append(clock())
+        points, whole, inside = on_all_elements(solver, first, states)
         yield (
             name,
-            str(count),
-            f"{pace:.1f}",
+            "chosen" if options.sampled else "all",
+            str(options.iterations),
+            f"{ends[1] - ends[0]:.1f}",
+            f"{1000 * float(np.median(np.diff(ends[2:]))) / len(shots):.1f}",
             f"{tally.mean('start_energy'):.4f}",
             f"{tally.mean('energy'):.4f}",
+            f"{whole:.4f}",
+            f"{100 * inside:.2f}",
             f"{tally.mean('left_share'):.3f}",
             f"{tally.unconverged} of {tally.frames}",
             str(tally.failed),
-            rms(np.stack(points), reference),
+            rms(points, reference),
         )
 
 
@@ -84,6 +115,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=30, help="of each shot (default 30)")
     parser.add_argument("--shots", type=int, default=1, help="solved at once (default 1)")
     parser.add_argument("--iterations", type=int, nargs="+", default=[1, 2, 4], help="of the solver (default 1 2 4)")
+    parser.add_argument("--elements", nargs="+", choices=("all", "chosen"), default=["all", "chosen"])
     parser.add_argument("--simulate", action="store_true", help="tell distances from the simulator")
     parser.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
     parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
@@ -93,6 +125,11 @@ def main() -> None:
     scene, device = replace(file.scene, character=character), select_device(options.device)
     model = network(file, scene).to(device)
     found: list[tuple[str, ...]] = []
+    tried = [
+        LatentOptions(iterations=count, sampled=kind == "chosen")
+        for count in options.iterations
+        for kind in options.elements
+    ]
     for name in options.motion:
         whole = build_motion(name, character.skeleton)
         starts = range(options.first, options.first + options.shots)
@@ -101,7 +138,7 @@ def main() -> None:
         reference = None
         if options.simulate:
             reference = simulate(scene, file.fabric, shots[:1], SimulationOptions(fps=shots[0].fps), device=device)[0]
-        found.extend(rows(model, file, shots, options.iterations, reference))
+        found.extend(rows(model, file, shots, tried, reference))
     print(table(HEADER, found))
 
 

@@ -21,15 +21,19 @@ class LatentOptions:
             m (tolerance g dt)^2 / 2, for the garment's mass m and a step dt. Newton's method over the vertices stops
             there, too (`SolverOptions`).
         damping: relative to inertia: the damping is this times the mean over the latents of |dx/dz|^2 m / dt^2.
+        sampled: sum the energy over few elements, which are chosen for the motions (`elements`), and query the
+            distance to the body once before each iteration. No frame gains that energy, on the planes of its last
+            query; the whole garment's is not looked at. Otherwise everything is that of the whole garment.
         exact_contact: query the distance to the body for each state that is tried. Otherwise states are tried on
-            the planes of the state before, and only the one that is taken is queried. No frame gains energy either
-            way.
+            the planes of the state before, and only the one that is taken is queried. No frame of the whole garment
+            gains energy either way.
     """
 
     iterations: int = 2
     first_iterations: int = 20
     tolerance: float = 1e-2
     damping: float = 0.1
+    sampled: bool = True
     exact_contact: bool = False
 
     def __post_init__(self) -> None:

@@ -18,20 +18,24 @@ from torch import Tensor
 from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
+from ...physics.simulate.cubature import spread_evenly
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
+from ...scene.kinematics import motion_transforms
 from ..descriptors import pose_features
 from ..model.descriptors import upright_descriptors
 from ..model.feedback import BodyFrames
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
+from .elements import choose_elements
 from .options import LatentOptions
 from .solver import LatentSolution, LatentSolver
 from .warm_start import FrameDescriptors, warm_starts
 
 LOOK_BACK = 2  # earlier frames that descriptors need
-DESCRIBED = 256  # frames described at once
+DESCRIBED, POSED = 256, 16  # frames of each motion at once
+CHOSEN_FROM, CHOSEN_STATES = 8, 32  # motions and states that elements are chosen for, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,9 @@ class _Past:
 class LatentShots:
     """Solves shots of one garment in its model's latents.
 
+    Attributes:
+        simulator, solver: over the whole garment, even where the options say that few elements are solved for.
+
     Args:
         model: on the device to use.
         fabric: of the garment.
@@ -99,6 +106,35 @@ class LatentShots:
         self.solver = LatentSolver(model, self.simulator.potential, options)
 
     @torch.no_grad()
+    def sampled(self, motions: Sequence[Motion]) -> tuple[Simulator, LatentSolver]:
+        """Return a simulator and a solver on few elements, chosen for what the network does in some motions.
+
+        States are taken from at most `CHOSEN_FROM` of the motions, `CHOSEN_STATES` in all.
+        """
+        motions = [motions[number] for number in spread_evenly(len(motions), CHOSEN_FROM)]
+        share = CHOSEN_STATES // len(motions)
+        kept = [spread_evenly(motion.frame_count, share) for motion in motions]
+        rolled = [self._rolled(motion)[torch.as_tensor(rows)] for motion, rows in zip(motions, kept)]
+        z = torch.cat(rolled).to(self.solver.potential.dtype).clamp(-self.solver.bound, self.solver.bound)
+        poses = self.simulator.poser.pose(*(
+            np.concatenate([getattr(motion, name)[rows] for motion, rows in zip(motions, kept)])
+            for name in ("rotations", "translations")
+        ))  # fmt: skip
+        scene = self.model.scene
+        cubature = choose_elements(scene, self.simulator, self.solver, z, poses)
+        simulator = self.simulator.sampled(scene, cubature)
+        return simulator, LatentSolver(self.model, simulator.potential, self.options, cubature)
+
+    def _rolled(self, motion: Motion) -> Tensor:
+        """Return the network's states over a motion (F, m), its quasi-static ones where it is lost."""
+        seen, skeleton = list(self._descriptors([motion])), self.model.scene.character.skeleton
+        rest, pose = (torch.stack([getattr(frame, name) for frame in seen]) for name in ("rest", "pose"))
+        body = BodyFrames.of(motion_transforms(motion, skeleton.parents), skeleton, rest)
+        states = torch.stack(self.model.roll([rest[0], *rest[1:LOOK_BACK]], rest[LOOK_BACK:], pose[LOOK_BACK:], body))
+        sound = states.abs().amax(dim=2, keepdim=True) < DIVERGENCE_BOUND
+        return torch.where(sound, states, rest)[:, 0]
+
+    @torch.no_grad()
     def frames(self, motions: Sequence[Motion]) -> Iterator[LatentFrame]:
         """Yield the frames of motions without cuts, at the model's rate, all motions at once.
 
@@ -114,17 +150,27 @@ class LatentShots:
         lengths = [motion.frame_count for motion in motions]
         if lengths != sorted(lengths, reverse=True):
             fail("latent solver", "motions of increasing length", "the longest must come first")
+        simulator, solver = self.sampled(motions) if self.options.sampled else (self.simulator, self.solver)
         past: _Past | None = None
-        for number, seen in enumerate(self._descriptors(motions)):
+        for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(simulator, motions))):
             running = motions[: len(seen.rest)]
-            at = slice(number, number + 1)
-            poses = self.simulator.poser.pose(*(
-                np.concatenate([getattr(motion, name)[at] for motion in running])
-                for name in ("rotations", "translations")
-            ))  # fmt: skip
             past = past and past.first(len(running))
-            frame, past = self._advance(number, past, poses, seen)
+            frame, past = self._advance(simulator, solver, number, past, poses, seen)
             yield frame
+
+    def _poses(self, simulator: Simulator, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
+        """Yield the characters in each frame of the motions that have not ended; some frames are posed at once."""
+        device = simulator.gravity.device
+        for start in range(0, motions[0].frame_count, POSED):
+            running = [motion for motion in motions if motion.frame_count > start]
+            spans = [motion.clip(start, start + POSED) for motion in running]
+            counts = torch.tensor([span.frame_count for span in spans], device=device)
+            posed = simulator.poser.pose(*(
+                np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
+            ))  # fmt: skip
+            first = counts.cumsum(0) - counts
+            for frame in range(spans[0].frame_count):
+                yield posed.select(first[counts > frame] + frame)
 
     def _descriptors(self, motions: Sequence[Motion]) -> Iterator[FrameDescriptors]:
         """Yield what the network sees in each frame of the motions that have not ended."""
@@ -152,23 +198,29 @@ class LatentShots:
         return FrameDescriptors(rest, dynamic)
 
     def _advance(
-        self, number: int, past: _Past | None, poses: PosedCharacters, seen: FrameDescriptors
+        self,
+        simulator: Simulator,
+        solver: LatentSolver,
+        number: int,
+        past: _Past | None,
+        poses: PosedCharacters,
+        seen: FrameDescriptors,
     ) -> tuple[LatentFrame, _Past]:
         """Return a frame, and the states for the next one."""
-        rest = seen.rest.to(self.solver.potential.dtype)
-        inputs = self.simulator.inputs(poses, past.cloth if past else None)
+        rest = seen.rest.to(solver.potential.dtype)
+        inputs = simulator.inputs(poses, past.cloth if past else None)
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
         else:
             body = past.followed_by(poses)
             starts, iterations = warm_starts(self.model, past.before, past.now, seen, body), None
-        found = self.solver.solve(starts, poses.matrices, inputs, iterations)
+        found = solver.solve(starts, poses.matrices, inputs, iterations)
         lost = ~(found.energy.isfinite() & found.z.isfinite().all(1))
         recovering = torch.zeros_like(found.iterations) if past is None else past.recovering
         recovering = torch.where(lost, RECOVERY_FRAMES, recovering)
         lost = recovering > 0
         if bool(lost.any()):
-            found = found.where(lost, self.solver.given(rest, poses.matrices, inputs))
+            found = found.where(lost, solver.given(rest, poses.matrices, inputs))
         cloth = StepHistory(found.x.double() + poses.root, past.cloth.last if past else None, poses.root, poses.lbs)
         before, earlier, root = found.z, poses.matrices, poses.root
         if past:

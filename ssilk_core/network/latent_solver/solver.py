@@ -9,6 +9,10 @@ with the Jacobian J = dx/dz of the decoder (`free_decoder`) and the projected He
 few dampings D and lengths of s together, and takes the one with the least energy. Where none has less, the frame
 stays, and the next iteration damps more. So no frame ever has more energy than the best of its starts. The result is
 a latent: what a shot stores of it are joints and blendshapes of the model, and nothing is fitted.
+
+On few elements (`elements`) E is their weighted sum, and the body is queried once before each iteration. No iteration
+adds to that sum, with the body as it was found; between two iterations a new query may, and nothing bounds the energy
+of the whole garment.
 """
 
 from __future__ import annotations
@@ -21,6 +25,7 @@ from torch import Tensor
 
 from ...physics.collision import SmoothedDistance
 from ...physics.constants import GRAVITY
+from ...physics.simulate.cubature import Cubature
 from ...physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..model.network import GarmentModel
 from .free_decoder import DecodedPoints, FreeDecoder
@@ -33,6 +38,7 @@ TRIALS = ((1.0, 1.0), (0.1, 1.0), (10.0, 1.0), (100.0, 1.0), (100.0, 0.25))
 ADAPTED = 0.5  # the exponent of the best trial's factor, by which a frame's damping changes
 TIGHTENED = 100.0  # the factor where no trial was good
 DAMPING_RANGE = (1e-6, 1e9)
+ALLOWANCE = 0.02  # [m] that sampled cloth may come nearer to the body in an iteration, and be seen
 ROUNDING = 8  # units in the last place of an energy that are not told apart
 
 
@@ -42,7 +48,7 @@ class LatentSolution:
 
     Attributes:
         z: latents, shape (N, m).
-        x: positions [m], pinned vertices under linear blend skinning, shape (V, 3, N).
+        x: positions of the potential's vertices [m], pinned ones under linear blend skinning, shape (V, 3, N).
         energy, start_energy: at x, and at the best of the starts [J], shape (N,).
         left: by how much the quadratic model says that the energy could still fall [J], shape (N,); with the forces
             at x, and the Jacobian and Hessian of the last iteration.
@@ -115,11 +121,21 @@ class LatentSolver:
     Args:
         model: on the device to use.
         potential: of its garment, in the precision to use.
+        cubature: on whose vertices the potential is; all by default.
     """
 
-    def __init__(self, model: GarmentModel, potential: IncrementalPotential, options: LatentOptions) -> None:
-        self.potential, self.options = potential, options
-        self.decoder = FreeDecoder(model, potential.free, potential.dtype)
+    def __init__(
+        self,
+        model: GarmentModel,
+        potential: IncrementalPotential,
+        options: LatentOptions,
+        cubature: Cubature | None = None,
+    ) -> None:
+        self.potential, self.options, free = potential, options, potential.free
+        self.sampled = cubature is not None
+        if cubature is not None:
+            free = torch.as_tensor(cubature.vertices, device=free.device)[free]
+        self.decoder = FreeDecoder(model, free, potential.dtype)
         self.bound = model.config.latent_bound or torch.inf
         self.free_mass = potential.mass[potential.free, 0]
 
@@ -176,11 +192,17 @@ class LatentSolver:
 
     def _state(self, z: Tensor, character: Tensor, inputs: StepInputs, near: _State | None = None) -> _State:
         """Return the state of latents; one that is `near`, of the same frames, saves time."""
-        x = self.decode(z, character, inputs)
-        if near is None:
-            distance = self.potential.body_distance(x, inputs)
+        return self._queried(z, self.decode(z, character, inputs), inputs, near)
+
+    def _queried(self, z: Tensor, x: Tensor, inputs: StepInputs, near: _State | None = None) -> _State:
+        """Return the state of latents whose positions are known."""
+        potential = self.potential
+        if self.sampled:
+            distance = potential.body_distance(x, inputs, ALLOWANCE)
+        elif near is None:
+            distance = potential.body_distance(x, inputs)
         else:
-            distance = self.potential.body_distance_nearby(x, inputs, near.distance, near.x)
+            distance = potential.body_distance_nearby(x, inputs, near.distance, near.x)
         return self._with_energy(z, x, inputs, distance)
 
     def _on_planes(self, z: Tensor, character: Tensor, inputs: StepInputs, of: _State) -> _State:
@@ -195,11 +217,11 @@ class LatentSolver:
         first, *others = (start.to(self.potential.dtype).clamp(-self.bound, self.bound) for start in starts)
         best = self._state(first, character, inputs)
         for z in others:
-            if not self.options.exact_contact:
-                lower = self._on_planes(z, character, inputs, best).energy < best.energy
-                if not bool(lower.any()):
+            state = self._on_planes(z, character, inputs, best)
+            if not self.sampled:
+                if not self.options.exact_contact and not bool((state.energy < best.energy).any()):
                     continue
-            state = self._state(z, character, inputs, best)
+                state = self._queried(z, state.x, inputs, best)
             best = best.where(state.energy < best.energy, state)
         return best
 
@@ -222,6 +244,8 @@ class _LatentSearch:
     def advance(self) -> bool:
         """Make one step; return whether another may gain anything."""
         if self.stale:
+            if self.solver.sampled and bool(self.iterations.any()):
+                self.state = self.solver._queried(self.state.z, self.state.x, self.inputs)
             self.decoded, self.model = self.solver._model(self.state, self.character, self.inputs)
             self.stale = False
         factors = self.damping.new_tensor([factor for factor, _ in TRIALS])
@@ -233,8 +257,8 @@ class _LatentSearch:
             return False
         found, trial = self._least(steps)
         lower = wanted & (found.energy < self.state.energy)
-        if not self.solver.options.exact_contact:
-            found = self.solver._state(found.z, self.character, self.inputs, self.state)
+        if not (self.solver.options.exact_contact or self.solver.sampled):
+            found = self.solver._queried(found.z, found.x, self.inputs, self.state)
             lower &= found.energy < self.state.energy
         self.state, self.stale = self.state.where(lower, found), bool(lower.any())
         self.failed, self.iterations = wanted & ~lower, self.iterations + lower
@@ -248,12 +272,14 @@ class _LatentSearch:
         lengths = steps.new_tensor([length for _, length in TRIALS])[:, None, None]
         z = (self.state.z + (lengths * steps).to(self.state.z.dtype)).clamp(-solver.bound, solver.bound)
         every = torch.arange(frames, device=z.device).repeat(count)
-        character, inputs = self.character[..., every], self.inputs.select(every)
-        here, z = self.state.select(every), z.flatten(0, 1)
-        tried = (solver._state if solver.options.exact_contact else solver._on_planes)(z, character, inputs, here)
+        character, z = self.character[..., every], z.flatten(0, 1)
+        if solver.options.exact_contact and not solver.sampled:
+            tried = solver._state(z, character, self.inputs.select(every), self.state.select(every))
+        else:
+            inputs = replace(self.inputs, body=None).select(every)
+            tried = solver._on_planes(z, character, inputs, self.state.select(every))
         best = tried.energy.reshape(count, frames).argmin(0)
-        at = best * frames + every[:frames]
-        return tried.select(at), best
+        return tried.select(best * frames + every[:frames]), best
 
     def _held(self, gradient: Tensor) -> Tensor:
         """Return which latents lie on the bound, with a force that presses them against it, shape (N, m)."""

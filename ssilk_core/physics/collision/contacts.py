@@ -10,9 +10,9 @@ is pushed along the limb instead (`pierced`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -104,11 +104,15 @@ class Contacts:
         normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
-    def smoothed(self, x: Tensor, body: PosedBody) -> SmoothedDistance:
-        """Return smoothed distances of x (S, 3, N) to the body, in the precision of x."""
+    def smoothed(self, x: Tensor, body: PosedBody, within: float = math.inf) -> SmoothedDistance:
+        """Return smoothed distances of x (S, 3, N) to the body, in the precision of x.
 
-        def find(*asked: Any) -> Sequence[Tensor]:
-            return smoothed_planes(*asked).tensors()
+        Args:
+            within: distances that matter outside of the body [m] (`smoothed_planes`).
+        """
+
+        def find(x: Tensor, body: PosedBody, blocks: Tensor, patches: Patches | None) -> Sequence[Tensor]:
+            return smoothed_planes(x, body, blocks, patches, within).tensors()
 
         def no_contact(x: Tensor) -> Sequence[Tensor]:
             return *no_planes(x), x.new_zeros(len(x), 3, *x.shape[1:], dtype=torch.float32)

@@ -126,12 +126,20 @@ def nearest_planes(
 
 @torch.no_grad()
 def smoothed_planes(
-    x: Tensor, body: PosedBody, blocks: Tensor | None = None, patches: Patches | None = None
+    x: Tensor,
+    body: PosedBody,
+    blocks: Tensor | None = None,
+    patches: Patches | None = None,
+    within: float = math.inf,
 ) -> SmoothedDistance:
     """Return the smoothed distances of x to the body's surface, in the precision of x.
 
     Arguments are those of `nearest_planes`. Nothing is smoothed for a body without `faces`, or beyond
     `MAX_QUERY_DISTANCE`, or `TIGHT_REACH` with `patches`.
+
+    Args:
+        within: distances that matter outside of the body [m]; what is further away has that to the nearest vertex.
+            On a processor a small one saves time.
     """
     single = x.float()
     flat = single.new_zeros(len(x), 3, *x.shape[1:])
@@ -141,7 +149,7 @@ def smoothed_planes(
         return SmoothedDistance(*nearest_planes(single, replace(body, faces=None), blocks, patches), flat).to(x.dtype)
     if kernels.supports(single):
         return _smoothed_by_kernel(single, body, blocks, patches).to(x.dtype)
-    _, normal, offset, search_radius = _at_vertices(single, body, blocks, patches)
+    _, normal, offset, search_radius = _at_vertices(single, body, blocks, patches, within)
     plane, candidates = SmoothedDistance(normal, offset, flat).to(x.dtype), patches.faces if patches else None
     reach = _reach(patches)
     many = max(1, frames_at_once(x, body.faces, candidates) // SMOOTHING_MEMORY_FACTOR)
@@ -176,7 +184,7 @@ def _smoothed_by_kernel(
 
 
 def _at_vertices(
-    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None
+    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None, within: float = math.inf
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return indices (V, N), normals and offsets of planes at the nearest body vertices, and distances to them [m].
 
@@ -192,7 +200,9 @@ def _at_vertices(
         searched |= (height < 0) & (length < MAX_DEPTH)
     tangent = searched & (height.abs() < _reach(patches)) & (body.faces is None and body.rings is None)
     normal = torch.where(tangent[:, None], normal, away / length[:, None].clamp_min(SURFACE_EPSILON))
-    return index, normal, (normal * point).sum(1), length.clamp_max(_reach(patches)).where(searched, -1)
+    radius = length.clamp_max(_reach(patches))
+    radius = torch.where(height > 0, radius.clamp_max(within), radius)
+    return index, normal, (normal * point).sum(1), radius.where(searched, -1)
 
 
 def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:

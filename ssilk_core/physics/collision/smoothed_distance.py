@@ -86,7 +86,7 @@ def smoothed_distance(
 
     Args:
         x: queries, shape (V, 3, N).
-        search_radius: upper bound of each distance [m], shape (V, N); negative values skip a query.
+        search_radius: up to which each query finds a triangle [m], shape (V, N); negative values skip a query.
         points, normals: of the body, shape (B, 3, N).
         faces: triangles, shape (F, 3).
         surface_epsilon: nearer than this [m], the interpolated normal is the gradient.
@@ -95,12 +95,13 @@ def smoothed_distance(
         candidates: triangles that each row of queries may find, padded with -1, shape (V, L); all by default.
     """
     rows, frames = search_radius.shape
-    row, frame, face = candidate_pairs(x.float(), search_radius * (1 + SEARCH_MARGIN), points, faces, candidates)
+    searched = search_radius * (1 + SEARCH_MARGIN)
+    row, frame, face = candidate_pairs(x.float(), searched, points, faces, candidates)
     query, corners = row * frames + frame, faces[face].T
     positions = torch.stack([points[corner, :, frame].T.to(x.dtype) for corner in corners])
     r, away, weights = _nearest_points(x[row, :, frame].T, positions)
     nearest, best = segment_min(query, r, rows * frames)
-    found = nearest < reach  # infinite where there is none
+    found = (nearest < reach) & (nearest <= searched.reshape(-1))  # infinite where there is none
     kept = found[query]
     best, nearest = (torch.cumsum(kept, 0) - 1)[best[found]], nearest[found]
     query, frame, r = query[kept], frame[kept], r[kept]

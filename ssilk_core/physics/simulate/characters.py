@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import Floats, Motion, Scene
+from ...scene.assets import Floats, Ints, Motion, Scene
 from ...scene.kinematics import (
     frames_at,
     matrix_from_quaternion,
@@ -88,6 +89,12 @@ class PosedCharacters:
     lbs: Tensor
     matrices: Tensor
 
+    def select(self, frames: Tensor) -> PosedCharacters:
+        """Return the poses of the frames with indices (M,)."""
+        return PosedCharacters(
+            self.root[:, frames], self.body.select(frames), self.lbs[..., frames], self.matrices[..., frames]
+        )
+
 
 class CharacterPoser:
     """Poses the character of a scene, and its garment under linear blend skinning."""
@@ -98,6 +105,12 @@ class CharacterPoser:
         self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limb_axes(scene), device=device)
         self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
+
+    def only(self, vertices: Ints) -> CharacterPoser:
+        """Return a poser of the same character with some of the garment's vertices alone."""
+        part, rows = copy.copy(self), torch.as_tensor(vertices, device=self.rest.device)
+        part.weights, part.rest = self.weights[rows], self.rest[rows]
+        return part
 
     def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
         """Return the poses of all spans at a step."""

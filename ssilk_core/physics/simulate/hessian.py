@@ -21,6 +21,7 @@ from .membrane import Membrane, outer
 from .stitches import stitch_slopes
 
 FIXED_STIFFNESS_FACTOR = 1e6
+NO_CORNERS = np.zeros((0, 4), dtype=np.int64)
 SIDES = list(combinations_with_replacement(range(4), 2))  # pairs of an element's four vertices
 
 
@@ -31,7 +32,6 @@ class Hessian:
         membrane, hinges: what bears stretch and bending; no hinges where nothing resists bending.
 
     Args:
-        corners: vertices of the hinges, shape (H, 4).
         samples: of contact, each within a face.
         stitching: what holds islands on one another, or None.
     """
@@ -40,7 +40,6 @@ class Hessian:
         self,
         membrane: Membrane,
         hinges: Hinges | None,
-        corners: Ints,
         samples: ContactSamples,
         free: Ints,
         stitching: Stitching | None = None,
@@ -48,15 +47,12 @@ class Hessian:
         device = membrane.area.device
         self.membrane, self.hinges, self.stitching, self.free_count = membrane, hinges, stitching, len(free)
         self.free = torch.as_tensor(free, device=device)
-        # A row of the membrane's operator has a face's corners in ascending order of vertex indices.
-        matrix = membrane.operator.matrix
-        faces = matrix.col_indices().cpu().numpy().reshape(2, -1, 3)[0]
-        weights = matrix.values().cpu().numpy().reshape(2, -1, 3)
+        faces, corners = membrane.corners, hinges.corners if hinges else NO_CORNERS
         near = np.concatenate([faces[:, pair] for pair in combinations_with_replacement(range(3), 2)])
-        stitched = stitching.corners if stitching else np.zeros((0, 4), dtype=np.int64)
+        stitched = stitching.corners if stitching else NO_CORNERS
         pairs = np.concatenate([near, _pairs(corners), _pairs(stitched)])
         self.pattern = BlockPattern(pairs, free, samples.vertex_count, device)
-        self.sum_faces = self._face_sum(near, weights)
+        self.sum_faces = self._face_sum(near, membrane.weights.cpu().numpy())
         self.sum_samples = self._sample_sum(samples)
         if hinges:
             self.left, self.right, self.sum_hinges = self._pair_sum(corners)
@@ -67,11 +63,12 @@ class Hessian:
     def of(cls, scene: Scene, energy: GarmentEnergy) -> Hessian:
         """Return that of a scene's garment, over the vertices that are not pinned and have mass."""
         mesh, device = scene.garment.mesh, energy.mass.device
-        corners = topology.hinges(mesh.faces) if energy.fabric.bending else np.zeros((0, 4), dtype=np.int64)
+        corners = topology.hinges(mesh.faces) if energy.fabric.bending else NO_CORNERS
         membrane = Membrane(mesh, energy.fabric, device, energy.mass.dtype)
-        hinges = Hinges(corners, energy, mesh.vertex_count) if len(corners) else None
+        bending = energy.bending_stiffness, energy.rest_angle
+        hinges = Hinges(corners, *bending, mesh.vertex_count) if len(corners) else None
         free = np.flatnonzero((scene.classes != PINNED) & (topology.vertex_areas(mesh.points, mesh.faces) > 0))
-        return cls(membrane, hinges, corners, energy.cloth.samples, free, energy.stitching)
+        return cls(membrane, hinges, energy.cloth.samples, free, energy.stitching)
 
     def _face_sum(self, near: Ints, weights: np.ndarray) -> SparseOperator:
         """Return the operator from `Membrane.stiffness` to blocks: w_ik w_jl times the block k, l for pairs i, j."""

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from ...scene.assets import Ints
-from ..energy import GarmentEnergy
 from ..energy.bending import bending_energy, cross, dihedral_angles, wrapped_difference
 from ..operators import difference_operator
 
@@ -19,10 +18,14 @@ TINY = 1e-18
 
 
 class Hinges:
-    """The bending energy of hinges (H, 4) from `mesh.topology.hinges`."""
+    """The bending energy of hinges (H, 4) from `mesh.topology.hinges`.
 
-    def __init__(self, hinges: Ints, energy: GarmentEnergy, vertex_count: int) -> None:
-        self.stiffness, self.rest = energy.bending_stiffness, energy.rest_angle
+    Args:
+        stiffness, rest: factor of the squared angle [J] and angle at rest of each, as in `GarmentEnergy`, (H, 1).
+    """
+
+    def __init__(self, hinges: Ints, stiffness: Tensor, rest: Tensor, vertex_count: int) -> None:
+        self.corners, self.stiffness, self.rest = hinges, stiffness, rest
         heads, tails = hinges[:, [1, 2, 3]].T.reshape(-1), hinges[:, [0, 0, 0]].T.reshape(-1)
         self.operator = difference_operator(heads, tails, vertex_count, self.rest.device, self.rest.dtype)
 
@@ -32,9 +35,18 @@ class Hinges:
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
+        return self.operator.adjoint(torch.cat(self._pull(x)))
+
+    def corner_forces(self, x: Tensor) -> Tensor:
+        """Return the gradient of each hinge's energy at its `corners` [N], shape (H, 4, 3, N)."""
+        edge, left, right = self._pull(x)
+        return torch.stack([-(edge + left + right), edge, left, right], dim=1)
+
+    def _pull(self, x: Tensor) -> list[Tensor]:
+        """Return the gradient [N] at the edge's end and at the tips, each (H, 3, N)."""
         arms = self.operator(x).chunk(3)
         moment = 2 * self.stiffness * wrapped_difference(dihedral_angles(*arms), self.rest)
-        return self.operator.adjoint(torch.cat([moment[:, None] * slope for slope in angle_gradients(*arms)]))
+        return [moment[:, None] * slope for slope in angle_gradients(*arms)]
 
     def slopes(self, x: Tensor) -> Tensor:
         """Return sqrt(2 k) grad(theta) at the four vertices of each hinge, float32, shape (4 H, 3, N)."""

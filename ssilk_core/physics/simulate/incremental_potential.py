@@ -13,6 +13,7 @@ smoothed on its creases (`collision.smoothed_distance`), so that the gradient va
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -81,17 +82,29 @@ class IncrementalPotential:
         self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
-        self._hessian = Hessian.of(scene, energy)
-        self.membrane, self.hinges, self.free = self._hessian.membrane, self._hessian.hinges, self._hessian.free
+        self.use(Hessian.of(scene, energy))
+
+    def use(self, hessian: Hessian) -> None:
+        """Take the elastic elements and the free vertices of a Hessian."""
+        self._hessian = hessian
+        self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
 
     @property
     def block_pattern(self) -> BlockPattern:
         """The sparsity pattern of its Hessian."""
         return self._hessian.pattern
 
-    def body_distance(self, x: Tensor, inputs: StepInputs) -> SmoothedDistance | None:
-        """Return the distances of the samples of x to the body, to second order."""
-        return None if inputs.body is None else self.contacts.smoothed(self.cloth.positions(x), inputs.body)
+    def body_distance(
+        self, x: Tensor, inputs: StepInputs, allowance: float = math.inf
+    ) -> SmoothedDistance | None:
+        """Return the distances of the samples of x to the body, to second order.
+
+        Args:
+            allowance: what cloth may come nearer [m] while the distances are used; with less they cost less.
+        """
+        if inputs.body is None:
+            return None
+        return self.contacts.smoothed(self.cloth.positions(x), inputs.body, self.law.start + allowance)
 
     def body_distance_nearby(
         self, x: Tensor, inputs: StepInputs, known: SmoothedDistance | None, at: Tensor

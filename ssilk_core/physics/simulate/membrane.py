@@ -15,7 +15,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...scene.assets import Mesh
+from ...scene.assets import Ints, Mesh
 from ...scene.fabrics import Fabric
 from ..energy.stretch import deformation_gradient_operator, stretch_density, stretched_areas
 
@@ -24,11 +24,20 @@ MIN_SQUARED_LENGTH = 1e-12  # floor for squared column lengths, as in the densit
 
 
 class Membrane:
-    """The stretch energy of a garment; positions (V, 3, N), one result for each of N frames."""
+    """The stretch energy of a garment; positions (V, 3, N), one result for each of N frames.
+
+    Attributes:
+        corners: vertices of each triangle in ascending order, shape (F, 3).
+        weights: of these in both columns of F [1/m], shape (2, F, 3).
+    """
 
     def __init__(self, mesh: Mesh, fabric: Fabric, device: torch.device, dtype: torch.dtype) -> None:
         self.fabric = fabric
         self.operator = deformation_gradient_operator(mesh, device, dtype)
+        # A row of the operator has a face's corners in ascending order of vertex indices.
+        matrix = self.operator.matrix
+        self.corners: Ints = matrix.col_indices().cpu().numpy().reshape(2, -1, 3)[0]
+        self.weights = matrix.values().reshape(2, -1, 3)
         self.area = torch.as_tensor(stretched_areas(mesh), dtype=dtype, device=device)[:, None]
 
     def energy(self, x: Tensor) -> Tensor:
@@ -37,10 +46,17 @@ class Membrane:
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
+        return self.operator.adjoint(self._pull(x))
+
+    def corner_forces(self, x: Tensor) -> Tensor:
+        """Return the gradient of each triangle's energy at its `corners` [N], shape (F, 3, 3, N)."""
+        return torch.einsum("kfi,kfan->fian", self.weights, self._pull(x).unflatten(0, (2, -1)))
+
+    def _pull(self, x: Tensor) -> Tensor:
+        """Return the gradient in the columns of F [J], shape (2 F, 3, N)."""
         w_u, w_v = self.operator(x).chunk(2)
         uu, uv, vv = ((self.area * s)[:, None] for s in second_piola_kirchhoff(w_u, w_v, self.fabric))
-        stress = torch.cat([uu * w_u + uv * w_v, uv * w_u + vv * w_v])
-        return self.operator.adjoint(stress)
+        return torch.cat([uu * w_u + uv * w_v, uv * w_u + vv * w_v])
 
     def stiffness(self, x: Tensor, exact_hessian: Tensor | None = None) -> Tensor:
         """Return the positive semi-definite Hessian in the columns of F [J], float32.

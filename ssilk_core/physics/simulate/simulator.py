@@ -8,6 +8,7 @@ where single precision is finest; between steps positions are kept in world spac
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -21,6 +22,7 @@ from ...scene.assets import Floats, Motion, Scene
 from ...scene.fabrics import Fabric
 from ..constants import GRAVITY
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
+from .cubature import Cubature, sampled_potential
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
 
@@ -139,6 +141,13 @@ class Simulator:
         self.poser = CharacterPoser(scene, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
         self.dt = 1 / (self.options.fps * self.options.substeps)
+
+    def sampled(self, scene: Scene, cubature: Cubature) -> Simulator:
+        """Return a simulator of the same scene on the elements of a cubature, whose vertices alone it moves."""
+        part = copy.copy(self)
+        part.potential = sampled_potential(self.potential, scene, cubature)
+        part.poser = self.poser.only(cubature.vertices)
+        return part
 
     def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
         """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel."""

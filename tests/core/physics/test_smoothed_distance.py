@@ -225,3 +225,13 @@ def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeyp
     torch.testing.assert_close(found.distance(x.double()), expected.distance(x.double()), rtol=0, atol=3e-7)
     assert torch.equal(found.curvature[..., ::3], torch.zeros_like(found.curvature[..., ::3]))
     assert (found.curvature[..., 1::3].norm(dim=(1, 2)) > 0).any()
+
+
+def test_only_distances_that_matter_are_searched_for() -> None:
+    body = body_of(trimesh.creation.icosphere(2, 0.1))
+    x, within = near(trimesh.creation.icosphere(2, 0.1), 0.06)[..., None].to(DEVICE), 0.01
+    right, found = rounded(x, body), smoothed_planes(x, body, within=within).distance(x)
+    close = right < 0.95 * within
+    assert 50 < int(close.sum()) < 0.7 * close.numel() and bool((right[close] < 0).any())
+    torch.testing.assert_close(found[close], right[close])
+    assert bool((found[~close] > 0.9 * within).all())
