@@ -95,6 +95,15 @@ def test_the_same_number_of_iterations_is_the_same_shot_and_more_are_another(the
     assert left[1] < left[0]
 
 
+def test_few_elements_are_another_way_to_nearly_the_same_shot(there):
+    assert main([*BAKE, "-o", "few.usda", "--quality", "latent", "--latent-elements", "few"]) == 0
+    stated = {name: read_provenance(f"{name}.usda")["solved in latents"] for name in ("few", "latent")}
+    assert {name: each["elements"] for name, each in stated.items()} == {"few": "few", "latent": "all"}
+    away = np.linalg.norm(points_of("few.usda") - points_of("latent.usda"), axis=-1)
+    network = np.linalg.norm(points_of("network.usda") - points_of("latent.usda"), axis=-1)
+    assert 0 < np.sqrt((away**2).mean()) < np.sqrt((network**2).mean())
+
+
 def test_the_garment_is_on_its_way_when_a_range_begins(there):
     bake(replace(REQUEST, latent_iterations=2, range="4-8"), "part.usda")
     np.testing.assert_allclose(points_of("part.usda"), points_of("latent.usda")[-5:], atol=1e-5)
@@ -141,6 +150,7 @@ def test_solved_states_may_be_refined(there):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
+        (["--latent-elements", "some"], "'some'; it is one of all, few"),
         (["--latent-iterations", "-1"], "a whole number from 0 to 10000"),
         (["--latent-iterations", "2", "--lbs"], "linear blend skinning has no latents"),
     ],

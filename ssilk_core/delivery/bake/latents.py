@@ -23,6 +23,7 @@ def solved(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     found = roller.tally
     summary = LatentSummary(
         iterations=rollout.request.latent_iterations,
+        elements=rollout.request.latent_elements,
         frames=found.frames,
         energy_before_j=found.mean("start_energy"),
         energy_j=found.mean("energy"),

@@ -17,6 +17,7 @@ from .plain import from_plain
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
+LATENT_ELEMENTS = ("all", "few")
 MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
 MAX_REFINE = 10_000
@@ -49,6 +50,7 @@ class BakeRequest:
             network has it.
         latent_iterations: iterations per frame of the solver in the model's latents, which takes the place of the
             network's own steps (`network.latent_solver`); 0 for these.
+        latent_elements: "all" sums that solver's energy over the whole garment, "few" over a sample of its elements.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
@@ -74,6 +76,7 @@ class BakeRequest:
     refine: int = 0
     feedback: bool = False
     latent_iterations: int = 0
+    latent_elements: str = LATENT_ELEMENTS[0]
     refined_output: str = "joints"
     hide_covered: bool = False
     keep: ModelSize | None = None
@@ -105,6 +108,8 @@ class BakeRequest:
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")
+        if self.latent_elements not in LATENT_ELEMENTS:
+            fail_unknown("--latent-elements", f"'{self.latent_elements}'", self.latent_elements, LATENT_ELEMENTS)
         if self.feedback and not self.refine:
             found, allowed = "no --refine", "it says what refined frames look back on"
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")

@@ -159,6 +159,7 @@ class LatentSummary:
 
     Attributes:
         iterations: of the solver in each frame, at most; the first of a shot has more.
+        elements: over which the energies are summed, "all" or "few".
         frames: that were solved.
         energy_before_j, energy_j: mean energies of the best of the starts and of the solution [J].
         left: mean share of the energy that the solver's model still promised, of that and what was gained.
@@ -167,6 +168,7 @@ class LatentSummary:
     """
 
     iterations: int
+    elements: str
     frames: int
     energy_before_j: float
     energy_j: float
@@ -174,10 +176,11 @@ class LatentSummary:
     unconverged: int
     failed: int
 
-    def to_metadata(self) -> dict[str, float]:
+    def to_metadata(self) -> dict[str, float | str]:
         """Return figures of four digits, as a shot stores them."""
         return {
             "iterations": self.iterations,
+            "elements": self.elements,
             "frames": self.frames,
             "energy before [J]": float(f"{self.energy_before_j:.4g}"),
             "energy [J]": float(f"{self.energy_j:.4g}"),

@@ -142,7 +142,8 @@ class BakeRollout:
         from ...network.latent_solver import LatentOptions, LatentRoller
 
         assert self.model is not None
-        options = LatentOptions(iterations=self.request.latent_iterations)
+        request = self.request
+        options = LatentOptions(iterations=request.latent_iterations, sampled=request.latent_elements == "few")
         return LatentRoller(self.model, self.fabric, options, pre_roll=self.request.pre_roll, advanced=advanced)
 
     def latent_frames(self) -> int:

@@ -33,7 +33,7 @@ class LatentOptions:
     first_iterations: int = 20
     tolerance: float = 1e-2
     damping: float = 0.1
-    sampled: bool = True
+    sampled: bool = False
     exact_contact: bool = False
 
     def __post_init__(self) -> None:

@@ -61,7 +61,7 @@ def whole(
     toy_motion: Callable[..., Motion],
 ) -> Whole:
     model, motion = toy_model(patched_scene, translations=True), toy_motion(patched_scene, 12, speed=2.0)
-    made = LatentShots(model, CLOTH, LatentOptions(sampled=False), precision="float64")
+    made = LatentShots(model, CLOTH, LatentOptions(), precision="float64")
     poses = made.simulator.poser.pose(motion.rotations, motion.translations)
     return Whole(patched_scene, made, made._rolled(motion).double(), poses)
 
@@ -130,7 +130,7 @@ def test_it_goes_where_the_solver_on_all_elements_goes(scene, toy_model, toy_mot
 
 def test_no_frame_gains_the_energy_of_its_elements_in_an_iteration(scene, toy_model, toy_motion) -> None:
     model, motion = toy_model(scene), toy_motion(scene, 8, speed=3.0)
-    options = LatentOptions(iterations=1, first_iterations=1)
+    options = LatentOptions(iterations=1, first_iterations=1, sampled=True)
     found = [frame.solution for frame in LatentShots(model, CLOTH, options, precision="float64").frames([motion])]
     assert all(bool((each.energy <= each.start_energy).all()) for each in found)
     assert sum(bool((each.energy < each.start_energy).all()) for each in found) > 4
@@ -139,7 +139,7 @@ def test_no_frame_gains_the_energy_of_its_elements_in_an_iteration(scene, toy_mo
 def test_shots_of_several_lengths_have_their_elements_together(scene, toy_model, toy_motion, monkeypatch) -> None:
     monkeypatch.setattr("ssilk_core.network.latent_solver.shots.POSED", 2)
     motions = [toy_motion(scene, 5, speed=3.0), toy_motion(scene, 3), toy_motion(scene, 1)]
-    made = LatentShots(toy_model(scene), CLOTH, LatentOptions(first_iterations=2), precision="float64")
+    made = LatentShots(toy_model(scene), CLOTH, LatentOptions(first_iterations=2, sampled=True), precision="float64")
     assert [len(frame.lost) for frame in made.frames(motions)] == [3, 2, 2, 1, 1]
 
 

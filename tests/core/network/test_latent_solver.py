@@ -31,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("few_contacts")
 
 CLOTH = Fabric("toy", bending=1e-4, margin=0.02)
 EXACT = LatentOptions(
-    iterations=200, first_iterations=200, tolerance=1e-6, exact_contact=True, sampled=False
+    iterations=200, first_iterations=200, tolerance=1e-6, exact_contact=True
 )
 KINDS = {
     "turning": {},
@@ -142,7 +142,7 @@ def test_its_hessian_is_that_of_the_simulator_seen_by_the_latents(frames) -> Non
 @pytest.mark.parametrize(("exact", "precision"), [(True, "float64"), (False, "float32")])
 def test_no_frame_gains_energy(scene, toy_model, toy_motion, exact, precision) -> None:
     model, motion = toy_model(scene), toy_motion(scene, 8, speed=3.0)
-    options = LatentOptions(iterations=2, first_iterations=9, exact_contact=exact, sampled=False)
+    options = LatentOptions(iterations=2, first_iterations=9, exact_contact=exact)
     found = [frame.solution for frame in LatentShots(model, CLOTH, options, precision=precision).frames([motion])]
     assert all(bool((each.energy <= each.start_energy).all()) for each in found)
     assert sum(bool((each.energy < each.start_energy).all()) for each in found) > 4
@@ -243,7 +243,7 @@ def test_a_garment_at_rest_in_a_held_pose_stays_put(scene, toy_model, toy_motion
 
 
 def test_shots_that_are_solved_together_come_out_as_each_by_itself(scene, toy_model, toy_motion) -> None:
-    model, options = toy_model(scene), LatentOptions(iterations=2, first_iterations=3, sampled=False)
+    model, options = toy_model(scene), LatentOptions(iterations=2, first_iterations=3)
     motions = [toy_motion(scene, 5, speed=3.0), toy_motion(scene, 5), toy_motion(scene, 3, speed=2.0)]
     made = LatentShots(model, CLOTH, options, precision="float64")
     together = list(made.frames(motions))
@@ -283,7 +283,7 @@ def test_what_has_not_converged_says_so(frames, monkeypatch) -> None:
 
 def test_a_lost_state_rests_and_then_goes_on(scene, toy_model, toy_motion, monkeypatch) -> None:
     monkeypatch.setattr(shots, "RECOVERY_FRAMES", 2)
-    options = LatentOptions(first_iterations=2, sampled=False)
+    options = LatentOptions(first_iterations=2)
     made = LatentShots(toy_model(scene), CLOTH, options, precision="float64")
     inputs, calls = made.simulator.inputs, []
 
