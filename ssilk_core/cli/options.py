@@ -214,8 +214,8 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         "--latent-elements",
         choices=LATENT_ELEMENTS,
         default=LATENT_ELEMENTS[0],
-        help="that solver sums the energy over the whole garment (default), or over few of its elements: five times as "
-        "fast, less exact in wild motion",
+        help="that solver sums the energy over the whole garment (default), or over few of its elements: five "
+        "times as fast, less exact in wild motion",
     )
     verb.add_argument(
         "--refined-output",

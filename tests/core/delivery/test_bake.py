@@ -18,7 +18,8 @@ INPUTS = {"model": "cape.safetensors", "stage": "hero.usdc", "motion": "walk.usd
 CHANGED = BakeRequest(
     **INPUTS, root="/Hero", fps=24.0, samples_per_frame=2, pre_roll=0.5, target="game8", refine=3, feedback=True,
     latent_iterations=2, latent_elements="few", refined_output="points", hide_covered=True,
-    keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk", range="1001-1100", handles=8,
+    keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk",
+    range="1001-1100", handles=8,
 )  # fmt: skip
 
 
