@@ -184,3 +184,13 @@ class Figures:
     settling: Settling | None = None
     minimum: MinimumErrors | None = None
     loop_drift: LoopDrift | None = None
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """Figures of one method on one split."""
+
+    garment: str
+    method: str
+    split: str
+    figures: Figures

@@ -9,8 +9,16 @@ from typing import Any
 
 from ...physics.energy import TERMS
 from ...physics.skin.figures import ShownSkin
-from .figures import Figures, LoopDrift, MinimumErrors, PoseNovelty, ReferenceErrors, Settling, SolverErrors
-from .run import ResultRow
+from .figures import (
+    Figures,
+    LoopDrift,
+    MinimumErrors,
+    PoseNovelty,
+    ReferenceErrors,
+    ResultRow,
+    Settling,
+    SolverErrors,
+)
 from .solver_errors import AFTER
 
 
