@@ -149,8 +149,12 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     """Return the methods of one garment, named after their files where several have one name."""
     from ..quality.evaluation.methods import EvaluatedMethod
 
-    count = Counter(one.name for one in models)
-    names = [one.name if count[one.name] == 1 else f"{one.name} ({one.path.stem})" for one in models]
+    names = [one.name for one in models]
+    for told in (lambda path: path.stem, lambda path: path.with_suffix("")):
+        count = Counter(names)
+        names = [
+            name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)
+        ]
     return [EvaluatedMethod(name, one.file.joints, one.on) for name, one in zip(names, models)]
 
 

@@ -204,6 +204,19 @@ def test_several_models_of_a_garment_share_its_table(world, capsys):
     assert lines == ["LBS", "ssilk (model)", "ssilk (again)"]
 
 
+def test_models_whose_files_have_one_name_are_told_apart_and_given_twice_refused(world, capsys):
+    (world / "other").mkdir()
+    file = load_model(world / "model.safetensors")
+    halved = {name: (0.5 * value).astype(value.dtype) for name, value in file.parameters.items()}
+    save_model(world / "other" / "model.safetensors", replace(file, parameters=halved))
+    assert evaluated(f"other/model.safetensors {QUICK} --clips brief --json") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    totals = {row["method"]: row["figures"]["total"] for row in event["detail"]["figures"]}
+    assert [*totals] == ["LBS", "ssilk (model)", "ssilk (other/model)"] and len({*totals.values()}) == 3
+    assert evaluated(f"model.safetensors {QUICK} --clips brief") == 2
+    assert "several methods are called ssilk (model)" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
 from .asked import EvaluationClips, EvaluationOptions
 from .figures import Figures, ResultRow, SolverErrors
@@ -35,7 +37,7 @@ def evaluate(
         known: the first rows, as an evaluation of the same yielded them; they are not measured again.
 
     Raises:
-        SsilkError: no clip has four frames, or a point cache is not of its clip.
+        SsilkError: no clip has four frames, a point cache is not of its clip, or two methods have one name.
     """
     yield from _Run(dressed, methods, playlist, options or EvaluationOptions(), report, known).rows()
 
@@ -61,7 +63,9 @@ class _Run:
         cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
         self.takes = [take for takes in cut for take in takes]
         need_takes(self.takes)
-        joints = methods[0].joints
+        joints, names = methods[0].joints, [LBS, SIMULATOR, *(method.name for method in methods)]
+        if twice := [name for name, count in Counter(names).items() if count > 1]:
+            fail("evaluation", f"several methods are called {twice[0]}", "names tell rows apart", "name each once")
         self.methods = {
             LBS: EvaluatedMethod(LBS, joints, partial(LinearBlendSkinning, dressed)),
             **({SIMULATOR: EvaluatedMethod(SIMULATOR, joints, partial(CachedPoints, playlist.read, dressed))}
@@ -69,7 +73,7 @@ class _Run:
             **{method.name: method for method in methods},
         }  # fmt: skip
         self.planned = [*self._planned([name for name in (LBS, SIMULATOR) if name in self.methods], by_split=True),
-                        *self._planned([method.name for method in methods])]  # fmt: skip
+                        *self._planned(names[2:])]  # fmt: skip
         self.figures: dict[tuple[str, str], Figures] = {}
         for place, row in zip(self.planned, known):
             if place != (row.method, row.split):
