@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run 'ssilk train' with the paper's integration schemes.
+"""Run 'ssilk train' with the schemes that the paper compares its own with.
 
-python benchmarks/train_scheme.py STAGE --motions FOLDER --valid FOLDER -o verlet.safetensors --set scheme=verlet
+python benchmarks/train_scheme.py STAGE --motions FOLDER --valid FOLDER -o direct.safetensors --set scheme=direct
 """
 
 from __future__ import annotations

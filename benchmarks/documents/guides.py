@@ -21,6 +21,7 @@ PURPOSES = {
     "preview": "a look on a GPU",
     "light": "many characters",
     "final": "shots",
+    "paper": "the paper's own, for comparison",
 }
 
 

@@ -70,7 +70,7 @@ class Moment:
 
     def descriptors(self) -> Tensors:
         static = self.bank.static_descriptor(self.times, self.down)
-        pose = torch.cat([static, self.bank.dynamic[self.times]], dim=1)
+        pose = self.bank.described(static, self.times, self.down)
         return static, pose, self.bank.static_descriptor(self.single, self.single_down)
 
     @torch.no_grad()

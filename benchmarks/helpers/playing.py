@@ -65,7 +65,11 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
     for frames in spans(motion.frame_count, BLOCK):
         lookback = min(frames.start, 2)
         given = character_frames(
-            motion.clip(frames.start - lookback, frames.stop), player.skeleton, player.file.joints, lookback
+            motion.clip(frames.start - lookback, frames.stop),
+            player.skeleton,
+            player.file.joints,
+            lookback,
+            player.file.config.descriptors,
         )
         monitor.lap(DESCRIPTORS)
         course = player.stepper.prepare(player.quasi_static(given.static), given, before)

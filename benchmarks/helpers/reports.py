@@ -36,16 +36,23 @@ def write_results(options: argparse.Namespace, markdown: str, measured: Mapping[
 
 
 def save_results(options: argparse.Namespace, measured: Mapping[str, Any]) -> None:
-    """Write figures with command, hardware and versions; the hardware is `options.device`'s where none is named."""
-    command = "python benchmarks/" + shlex.join(map(_without_folders, sys.argv))
-    document = {
-        "command": command,
+    """Write figures to a result file with their `provenance`."""
+    write_document(RESULTS / f"{options.name}.json", provenance(options), measured)
+
+
+def provenance(options: argparse.Namespace) -> dict[str, str]:
+    """Return command, hardware and versions; the hardware is `options.device`'s where none is named."""
+    return {
+        "command": "python benchmarks/" + shlex.join(map(_without_folders, sys.argv)),
         "hardware": getattr(options, "hardware", None) or _hardware(options),
         "versions": f"ssilk {__version__}, torch {torch.__version__}, Python {platform.python_version()}",
-        "measured": rounded(measured),
     }
-    with replacing(RESULTS / f"{options.name}.json") as temporary:
-        temporary.write_text(indented(document) + "\n")
+
+
+def write_document(path: Path, source: Mapping[str, str], measured: Mapping[str, Any]) -> None:
+    """Write figures with where they come from."""
+    with replacing(path) as temporary:
+        temporary.write_text(indented({**source, "measured": rounded(measured)}) + "\n")
 
 
 def _without_folders(word: str) -> str:

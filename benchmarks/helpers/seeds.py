@@ -44,7 +44,7 @@ def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[lis
     words = [word for pair in given for word in pair]
     words += ["--clips", *options.clips] if options.clips else []
     command = parser().parse_args([str(word) for word in ("evaluate", *options.models, *words)])
-    asked = EvaluationOptions(sequence=options.sequence, stops=0, loop=0)
+    asked = EvaluationOptions(sequence=options.sequence, stops=0, loop=0, linearised=0)
     if probes:
         asked = EvaluationOptions(
             sequence=options.sequence, minimum=options.minimum, simulate=options.simulate_stops, loop=options.loop

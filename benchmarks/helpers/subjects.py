@@ -74,6 +74,29 @@ def open_subject(path: Path, stage: Path, device: str) -> Subject:
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
 
 
+def open_subjects(paths: Sequence[Path], stage: Path, device: str) -> list[Subject]:
+    """Load models of one garment, to be compared on the same motions; those of one file name get their folders' too.
+
+    Raises:
+        SsilkError: their garments, fabrics, rates or vertex classes differ.
+    """
+    subjects = [open_subject(path, stage, device) for path in paths]
+    stems = [path.stem for path in paths]
+    if len(set(stems)) < len(stems):
+        subjects = [replace(one, name=str(path.with_suffix(""))) for one, path in zip(subjects, paths)]
+    first = subjects[0]
+    for other, path in zip(subjects[1:], paths[1:]):
+        if _garment(other) != _garment(first):
+            fail(str(path), f"its garment, fabric or rate is not that of {paths[0]}", "models of one are compared")
+    return subjects
+
+
+def _garment(subject: Subject) -> tuple[object, ...]:
+    """Return what models must share so that one simulator serves them all."""
+    file, mesh = subject.file, subject.scene.garment.mesh
+    return mesh.points.tobytes(), mesh.faces.tobytes(), subject.scene.classes.tobytes(), file.fabric, file.config.fps
+
+
 def dressed_in(file: ModelFile, stage: Path, device: str) -> EvaluationScene:
     """Put the garment of a model or a baseline on the character of a stage."""
     skeleton = file.scene.character.skeleton

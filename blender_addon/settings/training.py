@@ -18,6 +18,7 @@ ABOUT = {
     "preview": "Nearly the final quality, after minutes on a GPU",
     "light": "A small network for many characters, after minutes on a GPU",
     "final": "What shots are made with, after ten to twenty minutes on a fast GPU",
+    "paper": "The paper's own model and training, for comparison; far slower",
 }
 CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in PRESETS]
 

@@ -4,8 +4,10 @@
 Models of one garment share their tables with linear blend skinning, on the character that they were trained with.
 Gravity is relative to linear blend skinning. --reference compares with the reference simulator. It names a folder of
 shots of the same clips, written by 'ssilk simulate --points' and named after the clips, or one with such a folder
-for each garment, under its name. Two probes follow. Poses are held after stops: a garment should come to rest at its
-own static state. The first seconds of clips are looped: a garment should repeat itself. --no-probes leaves them out.
+for each garment, under its name. Three probes follow. Poses are held after stops: a garment should come to rest at
+its own static state. The first seconds of clips are looped: a garment should repeat itself. Steps are linearised
+about states of rollouts: a disturbance of the two states before a step should not grow, so the spectral radius of the
+map from these to the next two should stay under one. --no-probes leaves them out.
 --solver continues the first two states of each clip, and of its most violent second, with the reference simulator. It
 tells how far the garment is from that after 5, 10, 30 and 60 frames, and what single steps from its own past miss.
 --output writes each row when it is measured, and says that it is unfinished until the last. The same command, given
@@ -47,7 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
     verb.add_argument("--reference", type=Path, metavar="FOLDER",
                       help="shots of 'ssilk simulate --points' to compare with")  # fmt: skip
-    verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without stops and loops")
+    verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without probes")
     verb.add_argument("--solver", action="store_true",
                       help="simulate from the garment's own states, and single steps (long on a CPU)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), in SI units")
@@ -63,7 +65,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, options.index)
-    asked = EvaluationOptions(stops=0, loop=0) if options.no_probes else EvaluationOptions()
+    asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
     results = evaluated(options, asked, open_model, report)
     if not options.json:

@@ -2,11 +2,11 @@
 """Write a trained model's network as ONNX, for engines that play it themselves.
 
 One call computes one frame of any number of characters. Inputs are the states of the two previous frames, the
-descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py), a flag for the first two
-frames of a shot, the skinning matrices of the character's joints about its root, and the root's position less twice
-the last one plus the one before. Outputs are the new state, the weights of the blendshapes and the local rotations of
-the proxy joints, as in a shot. Where proxies move, their local translations follow. Blendshapes and skinning weights
-are those of any baked shot.
+descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py) and a flag for the first two
+frames of a shot. Where the stepper sees points of the cloth, the skinning matrices of the character's joints about
+its root follow, and the root's position less twice the last one plus the one before. Outputs are the new state, the
+weights of the blendshapes and the local rotations of the proxy joints, as in a shot. Where proxies move, their local
+translations follow. Blendshapes and skinning weights are those of any baked shot.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     file = load_model(options.model)
     model = network(file)
     export_onnx(model, output)
-    static, rates = descriptor_sizes(file.scene, file.joints)
+    static, rates = descriptor_sizes(file.scene, file.joints, file.config.descriptors)
     report(
         Result(
             "export",

@@ -40,7 +40,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "-o", "--output", type=Path, required=True, metavar="MODEL", help="model to write (.safetensors)"
     )
     verb.add_argument(
-        "--preset", choices=PRESETS, help="schedule and size of the network (default: draft on a CPU, else preview)"
+        "--preset",
+        choices=PRESETS,
+        help="schedule and size of the network (default: draft on a CPU, else preview); 'paper' is the paper's own "
+        "model and training, with its fabric",
     )
     verb.add_argument(
         "--minutes",
@@ -127,6 +130,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         options.preset = default_preset(device)
         report(Message(f"preset '{options.preset}' is taken, the default on {select_device(device).type}"))
     model, train = configured(options)
+    _take_fabric(options, report)
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
     report(Message("the motions are read"))
@@ -152,6 +156,15 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         minutes=options.minutes,
         base=base,
     )
+
+
+def _take_fabric(options: argparse.Namespace, report: Reporter) -> None:
+    """Take the fabric that a preset means, where the options name none."""
+    preset = preset_named(options.preset)
+    if preset.fabric and not options.fabric:
+        options.fabric, options.material = preset.fabric, [*preset.material, *options.material]
+        text = " ".join([f"fabric '{preset.fabric}'", *(["with", *preset.material] if preset.material else [])])
+        report(Message(f"{text} is taken, which preset '{preset.name}' means"))
 
 
 def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:

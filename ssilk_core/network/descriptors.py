@@ -6,6 +6,11 @@ character and gravity together only rotates the result. The descriptors have the
 Gravity enters as its direction in the frame of each joint. The root enters through its angular motion and through
 accelerations, not through a position, a heading or a velocity. Augmentation by a rotation of the character is
 therefore equivalent to the inverse rotation of gravity, which costs nothing.
+
+Those of the paper are "absolute": beside the static descriptor S sees those of the two poses before, and the root's
+rotations and positions in the world. A garment then behaves differently where its character stands or faces
+otherwise. The paper does not say of how many poses the root is seen; here it is of the same three. It takes static
+descriptors from NCS, in which gravity stands for the root's rotation, as it does here.
 """
 
 from __future__ import annotations
@@ -19,6 +24,9 @@ from ..scene.assets import Floats, Motion, Skeleton
 from ..scene.kinematics import matrix_from_quaternion, motion_transforms
 
 RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
+VECTORS = (
+    9  # at the end of absolute descriptors, in the world: two axes and the position of the root, of three frames
+)
 SATURATION = 4.0  # limit of dynamic features, so that a teleport keeps the network within its trained range
 
 
@@ -28,13 +36,16 @@ class PoseFeatures:
 
     Attributes:
         static: 6D local rotations of the descriptor joints except the root, shape (F, S).
-        dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D).
+        dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D); absolute
+            ones are those of the two frames before (2 S), and `VECTORS` in the world.
         down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
+        earlier: likewise of the two frames before, shape (F, 2 J', 3, 3); none (F, 0, 3, 3) in relative ones.
     """
 
     static: Floats
     dynamic: Floats
     down: Floats
+    earlier: Floats
 
 
 def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
@@ -47,17 +58,25 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
 
 
 def pose_features(
-    motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None
+    motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None, kind: str = "relative"
 ) -> PoseFeatures:
     """Return the descriptors of every frame of a motion; frames before the first repeat it.
 
-    `world` is `motion_transforms` of the motion, if it is already computed.
+    Args:
+        world: `motion_transforms` of the motion, if it is already computed.
+        kind: of `settings.DESCRIPTORS`.
     """
     world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
     local = matrix_from_quaternion(motion.rotations[:, joints])
     inner = [i for i, joint in enumerate(joints) if skeleton.parents[joint] >= 0]
     static = six_d(local[:, inner]).reshape(len(local), -1)
-    root = world[:, 0, :3, :3]
+    root, down = world[:, 0, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
+    if kind == "absolute":
+        axes, places = six_d(root), world[:, 0, :3, 3]
+        past = [_past(static, steps) for steps in (1, 2)]
+        seen = [_past(values, steps) for values in (axes, places) for steps in (0, 1, 2)]
+        earlier = np.concatenate([_past(down, steps) for steps in (1, 2)], axis=1)
+        return PoseFeatures(static, np.concatenate([*past, *seen], axis=1), down, earlier)
     rate, change = _differences(static, motion.fps)
     turn = [
         six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
@@ -65,7 +84,7 @@ def pose_features(
     acceleration = _differences(world[..., :3, 3], motion.fps)[1] / (RATE_TIME**2 * GRAVITY)
     acceleration = np.einsum("fba,fjb->fja", root, acceleration).reshape(len(local), -1)
     dynamic = np.concatenate([rate, change, *turn, acceleration], axis=1)
-    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), np.swapaxes(world[..., :3, :3], -1, -2))
+    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0])
 
 
 def six_d(rotations: Floats) -> Floats:

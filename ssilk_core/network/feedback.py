@@ -11,6 +11,10 @@ is how far the free flight of each point departs from what the latents would do 
 R_t. It knows no position, no heading and no steady velocity. It is zero for a garment at rest on a body at rest, so
 that the quasi-static state stays an equilibrium. S sees m_t in `UNIT`, saturated at `LIMIT`; it knows gravity from
 the pose.
+
+In the paper each state is decoded to give the garment "and the proxy animation feedback to the stepper module", and
+no equation says in what form. With `feedback_proxies` S sees, after the points, the proxies of z_{t-2} and then those
+of z_{t-1}: of each its local 6D rotation less that of the rig, and its displacement [dm] where proxies move.
 """
 
 from __future__ import annotations
@@ -50,6 +54,8 @@ def bends(origins: Floats) -> Floats:
 
 
 def feedback_size(scene: Scene, config: ModelConfig) -> int:
-    """Return the number of features that S sees of the cloth: three for each vertex of `feedback_vertices`."""
-    free = int((scene.classes != PINNED).sum())
-    return 3 * min(config.feedback_points, free) if SCHEMES[config.scheme].states else 0
+    """Return the number of features that S sees: three for each vertex of `feedback_vertices`, and of proxies."""
+    if not SCHEMES[config.scheme].states:
+        return 0
+    proxies = 2 * config.proxy_outputs * scene.rig.proxy_count if config.feedback_proxies else 0
+    return 3 * min(config.feedback_points, int((scene.classes != PINNED).sum())) + proxies

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..scene.assets import PINNED, Ints, Scene
+from .descriptors import VECTORS
 from .feedback import feedback_size
 from .schemes import SCHEMES
 from .settings import ModelConfig
@@ -23,7 +24,7 @@ OUTPUT_SCALE = np.array([1, 1, 1, 1, 1, 1, 0.1, 0.1, 0.1], dtype=np.float32)
 def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     """Return the shape of each parameter of `model.network.GarmentModel` by name."""
     free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
-    static, dynamic = descriptor_sizes(scene, joints)
+    static, dynamic = descriptor_sizes(scene, joints, config.descriptors)
     scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
     inputs = scheme.states * z + static + dynamic + feedback_size(scene, config)
     reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
@@ -38,9 +39,11 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     }
 
 
-def descriptor_sizes(scene: Scene, joints: Ints) -> tuple[int, int]:
-    """Return the number of static features, including gravity, and the number of dynamic features."""
+def descriptor_sizes(scene: Scene, joints: Ints, kind: str = "relative") -> tuple[int, int]:
+    """Return the number of static features, including gravity, and that of dynamic features of a kind."""
     inner = int((scene.character.skeleton.parents[joints] >= 0).sum())
+    if kind == "absolute":
+        return 6 * inner + 3 * len(joints), 2 * (6 * inner + 3 * len(joints)) + 3 * VECTORS
     return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)
 
 

@@ -111,7 +111,7 @@ def _advance(
     """
     parameter, skeleton = next(model.parameters()), model.scene.character.skeleton
     world = motion_transforms(seen, skeleton.parents)
-    features = pose_features(seen, skeleton, model.joints, world)
+    features = pose_features(seen, skeleton, model.joints, world, model.config.descriptors)
     static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)

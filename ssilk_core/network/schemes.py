@@ -32,6 +32,9 @@ SCHEMES: dict[str, Scheme] = {
         parameters=("beta", "share"),
         bias=False,
     ),
+    "verlet": Scheme(
+        integrator="ssilk_core.network.model.integrators:Verlet", states=2, parameters=("alpha", "beta")
+    ),
     "quasi_static": Scheme(integrator="ssilk_core.network.model.integrators:QuasiStatic", states=0),
 }
 """All schemes by name. Other code may add its own before it reads settings or models that name them."""

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from ..errors import fail, fail_unknown
 from .schemes import need_scheme
 
+DESCRIPTORS = ("relative", "absolute")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 
@@ -16,6 +17,7 @@ NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
 MAX_OUTPUT = 100.0  # limit of each output of S: finite, and far above `max_latent_step`
 SPRING_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
+FREE_ACTIVATION = 32.0  # limit of activations without a tanh: a file needs some range, and trainings stay far within
 DIVERGENCE_BOUND = 1e3  # a latent beyond this has diverged; those of trained models stay below ten
 RECOVERY_FRAMES = 15  # frames at rest after a diverged state, half a second at 30 frames per second
 
@@ -38,11 +40,16 @@ class ModelConfig:
         shapes: number K of blendshapes; with zero only proxies deform the garment.
         activations: number of activations that D outputs, if it differs from K ("ssilk reduce"); zero for K.
         translations: whether proxies move as well as turn; in the paper they only turn.
+        tanh: whether activations pass a tanh; in the paper they do not, and `FREE_ACTIVATION` alone limits them.
         scheme: name of the integration scheme in `schemes.SCHEMES`: "spring_verlet" is Eq. 3 with a spring to the
-            quasi-static state, "quasi_static" is that state itself.
+            quasi-static state, "verlet" is Eq. 3 as in the paper, "quasi_static" is the quasi-static state itself.
+        descriptors: what S sees of the pose (`network.descriptors`): "relative", or "absolute" as in the paper, which
+            "spring_verlet" cannot take.
         latent_bound: bound on each latent dimension; zero for none, as in the paper.
         max_latent_step: soft bound on the sum of S and the spring in each dimension in one step; zero for none.
         feedback_points: points of the decoded cloth that S sees (`network.feedback`); zero for none.
+        feedback_proxies: whether S sees the proxies of the last two states, as in the paper's Figure 2, which
+            "spring_verlet" cannot take.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
         velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
             and the rates of the pose allow (`model.integrators.SpringVerlet`).
@@ -54,10 +61,13 @@ class ModelConfig:
     shapes: int = 64
     activations: int = 0
     translations: bool = False
+    tanh: bool = True
     scheme: str = "spring_verlet"
+    descriptors: str = "relative"
     latent_bound: float = 4.0
     max_latent_step: float = 1.0
     feedback_points: int = 64
+    feedback_proxies: bool = False
     stiffness: float = 0.2
     velocity_allowance: float = 0.9
     fps: float = 30.0
@@ -65,6 +75,12 @@ class ModelConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "widths", tuple(self.widths))
         need_scheme(self.scheme)
+        if self.descriptors not in DESCRIPTORS:
+            fail_unknown("model", f"descriptors '{self.descriptors}'", self.descriptors, DESCRIPTORS)
+        if self.scheme == "spring_verlet" and (self.descriptors == "absolute" or self.feedback_proxies):
+            # Neither is zero for a garment at rest, which would then not stay there.
+            found = "absolute descriptors" if self.descriptors == "absolute" else "feedback of proxies"
+            fail("model", f"{found} with the scheme 'spring_verlet'", "its garments rest", "take --set scheme=verlet")
         if not 1 <= min(self.widths) <= max(self.widths) <= MAX_SIZE:
             fail("model", f"widths = {self.widths}", f"each must be at least 1 and at most {MAX_SIZE}")
         need_between(self, 1, MAX_SIZE, "latent")
@@ -78,6 +94,11 @@ class ModelConfig:
     def activation_count(self) -> int:
         """Return the number of activations that D outputs."""
         return self.activations or self.shapes
+
+    @property
+    def activation_range(self) -> float:
+        """Return the limit of activations: one after a tanh or in a reduced model."""
+        return 1.0 if self.tanh or self.activations else FREE_ACTIVATION
 
     @property
     def proxy_outputs(self) -> int:

@@ -22,7 +22,10 @@ from .recombine import recombine_motions
 from .settings import TrainConfig
 from .state import json_round_trip, scene_digest
 
-STEPPER_SETTINGS = ("scheme", "max_latent_step", "feedback_points", "stiffness", "velocity_allowance")
+STEPPER_SETTINGS = (
+    "scheme", "descriptors", "max_latent_step", "feedback_points", "feedback_proxies", "stiffness",
+    "velocity_allowance",
+)  # fmt: skip
 SAME = 1e-4  # [m], and without unit; model files may store single precision
 MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extra motions are left out for it
 
@@ -31,7 +34,8 @@ MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extr
 class TrainJob:
     """All inputs of a training run, reduced to what the scene needs.
 
-    Garments without loose vertices are quasi-static: a stepper would add nothing to the initialiser.
+    Garments without loose vertices are quasi-static in place of "spring_verlet": a stepper would add nothing to the
+    initialiser. Other schemes stay, as in the paper.
 
     Attributes:
         scene: character with its body, garment, rig.
@@ -62,14 +66,16 @@ class TrainJob:
             own = {name: getattr(self.model, name) for name in STEPPER_SETTINGS}
             object.__setattr__(self, "model", replace(self.base.config, **own))
             # There is no P to train on single poses.
-            train = replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1)
+            train = replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1, initial_loss=False)
             object.__setattr__(self, "train", train)
-        if not self.has_loose:
+        if not self.has_loose and self.model.scheme == "spring_verlet":
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
         if self.model.scheme == "quasi_static":  # there are no previous states to vary
             object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
         if not self.is_trainable:
-            object.__setattr__(self, "model", replace(self.model, latent=1, widths=(1,), shapes=1))
+            object.__setattr__(
+                self, "model", replace(self.model, latent=1, widths=(1,), shapes=1, scheme="quasi_static")
+            )
             least = replace(
                 self.train,
                 iterations=1,

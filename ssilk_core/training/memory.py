@@ -90,6 +90,8 @@ class StepMemory:
         """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""
         most = decoded_frames(config, config.batch)
         frames = bisect_right(range(most + 1), PLANNED_SHARE * available, key=self.needed) - 1
+        if frames == most:
+            return config.batch, config.pretraining_batch
         return max(1, min(config.batch, int(frames / _frames_of_a_window(config)))), max(
             1, min(config.pretraining_batch, frames)
         )
@@ -119,7 +121,7 @@ def decoded_frames(config: TrainConfig, batch: int) -> int:
 
 def _frames_of_a_window(config: TrainConfig) -> float:
     """Return the decoded frames per window, with its share of the single poses."""
-    return config.window + config.static_batch / config.batch
+    return config.window + config.static_batch / config.batch + 2 * config.initial_loss
 
 
 def fits_in_memory(work: Callable[[], None]) -> bool:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..errors import fail
 from ..network.descriptors import pose_features
-from ..network.model.descriptors import gravity_features
+from ..network.model.descriptors import gravity_features, turned_vectors
 from ..network.model.feedback import BodyFrames
 from ..scene.assets import Motion, Skeleton
 from ..scene.kinematics import centred_matrices, resample, split_at_cuts
@@ -27,7 +27,7 @@ class MotionBank:
         matrices: skinning matrices of every frame, shape (F, J * 12), translated so that each clip's root starts at
             the origin, where single precision is finest.
         root: position of the first joint in the same coordinates [m], shape (F, 3).
-        static, dynamic, down: see `descriptors.PoseFeatures`.
+        static, dynamic, down, earlier: see `descriptors.PoseFeatures`.
         starts, stops: first frame and end of each clip, shape (clips,).
     """
 
@@ -36,12 +36,18 @@ class MotionBank:
     static: Tensor
     dynamic: Tensor
     down: Tensor
+    earlier: Tensor
     starts: Tensor
     stops: Tensor
 
     @property
     def frame_count(self) -> int:
         return len(self.static)
+
+    @property
+    def is_absolute(self) -> bool:
+        """Whether the descriptors are those of the paper."""
+        return self.earlier.shape[1] > 0
 
     @property
     def joint_count(self) -> int:
@@ -66,7 +72,18 @@ class MotionBank:
 
     def dynamic_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
         """Return dynamic descriptors (N, D) of frames (N,) under unit gravity directions (N, 3)."""
-        return torch.cat([self.static_descriptor(frames, direction), self.dynamic[frames]], dim=1)
+        return self.described(self.static_descriptor(frames, direction), frames, direction)
+
+    def described(self, static: Tensor, frames: Tensor, direction: Tensor, heading: Tensor | None = None) -> Tensor:
+        """Return dynamic descriptors (N, D) from static ones (N, S) of the same frames and directions.
+
+        Args:
+            heading: of absolute ones, where a motion is turned (`turned_vectors`); as it is without.
+        """
+        dynamic = self.dynamic[frames]
+        if heading is not None:
+            dynamic = turned_vectors(dynamic, direction, heading)
+        return torch.cat([static, gravity_features(self.earlier[frames], direction), dynamic], dim=1)
 
 
 def build_bank(
@@ -77,8 +94,9 @@ def build_bank(
     device: torch.device,
     *,
     max_joint_speed: float = np.inf,
+    kind: str = "relative",
 ) -> MotionBank:
-    """Resample the spans of `usable_spans` to `fps` and copy them to a device.
+    """Resample the spans of `usable_spans` to `fps` and copy them to a device, with descriptors of a kind.
 
     Raises:
         SsilkError: there is no motion.
@@ -89,7 +107,7 @@ def build_bank(
     if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     # In single precision clip by clip: a large bank in double precision does not fit a host.
-    parts = [_arrays(resample(span, fps), skeleton, joints) for span in spans]
+    parts = [_arrays(resample(span, fps), skeleton, joints, kind) for span in spans]
     ends = np.cumsum([len(part["root"]) for part in parts])
     starts = np.concatenate([[0], ends[:-1]])
 
@@ -103,9 +121,9 @@ def build_bank(
     )
 
 
-def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, np.ndarray]:
+def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
     """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
-    features, matrices = pose_features(clip, skeleton, joints), centred_matrices(clip, skeleton)[0]
+    features, matrices = pose_features(clip, skeleton, joints, kind=kind), centred_matrices(clip, skeleton)[0]
     root = matrices[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + matrices[:, 0, :3, 3]
     values = {
         "matrices": matrices[:, :, :3].reshape(len(matrices), -1),
@@ -113,6 +131,7 @@ def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray) -> dict[str, n
         "static": features.static,
         "dynamic": features.dynamic,
         "down": features.down,
+        "earlier": features.earlier,
     }
     return {name: value.astype(np.float32) for name, value in values.items()}
 

@@ -32,7 +32,7 @@ class Objective:
         body: the part of the body that the garment can touch, None for nothing. Pinned vertices do not collide,
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
-        clearance: see `settings.TrainConfig` [m].
+        clearance, patches: see `settings.TrainConfig`; `patches` is `contact_patches`.
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
     """
@@ -47,13 +47,19 @@ class Objective:
         newton_weight: float = 0.0,
         clearance: float = 0.0,
         buried: Tensor | None = None,
+        patches: bool = True,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface, self.clearance, self.buried = surface, clearance, buried
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
-                model.scene, energy.cloth.samples, vertices=body.vertices, pinned=False, device=device
+                model.scene,
+                energy.cloth.samples,
+                vertices=body.vertices,
+                pinned=False,
+                patches=patches,
+                device=device,
             )
         self.skin = None
         if len(tethered := energy.tethered.cpu().numpy()):
@@ -132,7 +138,8 @@ class Objective:
         times = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
         down = sampler.direction.repeat(length, 1)
         static = bank.static_descriptor(times, down)
-        pose = torch.cat([static, bank.dynamic[times]], dim=1).reshape(length, batch, -1)
+        heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
+        pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
         # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
         with torch.set_grad_enabled(not model.integrator.scheme.states):
             target = model.initial(static).reshape(length, batch, -1)

@@ -78,7 +78,7 @@ class TrainingParts:
         surface = config.closest_point == "triangles"
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
-            self.buried if surface else None,
+            self.buried if surface else None, config.contact_patches,
         )  # fmt: skip
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
@@ -105,8 +105,9 @@ def build_parts(
     if job.base:
         _keep_all_but_the_stepper(model, job.base)
     model = model.to(device)
-    bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED)
-    held = build_bank(job.held_out, skeleton, joints, fps, device)
+    kind = job.model.descriptors
+    bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
+    held = build_bank(job.held_out, skeleton, joints, fps, device, kind=kind)
     energy = GarmentEnergy(scene.garment.mesh, job.fabric, scene.classes, device=device)
     body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None
     if len(reach.vertices):

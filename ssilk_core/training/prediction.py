@@ -31,5 +31,5 @@ def step_seconds(samples: int, frames: int, device: str) -> float:
 
 
 def trained_frames(train: TrainConfig) -> int:
-    """Return the frames of a step of dynamic training, without the two given ones of each window."""
-    return train.batch * (train.window - 2) + train.static_batch
+    """Return the frames of a step of dynamic training; the two given ones of each window count if they are fitted."""
+    return train.batch * (train.window if train.initial_loss else train.window - 2) + train.static_batch

@@ -40,19 +40,25 @@ class TrainConfig:
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
+        initial_loss: whether P is fitted to the first two poses of each window, as in the paper.
         noise_probability: probability per frame of noise on a reused state. A new window always starts with noise.
         noise: standard deviation of the noise on the first two latents of a window.
         noise_correlation: correlation between the noise on the first and on the second latent; 0 in the paper.
         latent_regularization: weight [J] of the regularisation of the latents (Eq. 13); zero for none.
+        contact_patches: whether tight cloth collides with the part of the body beneath it alone
+            (`collision.contacts`); in the paper all cloth collides with all of the body.
         bptt: back-propagate through the whole window, as the paper does, instead of through each step by itself.
         optimiser: of the networks' matrices: "muon" (`training.muon`), or "adam", as for all other parameters and in
             the paper's recipe.
+        normalised_gradients: whether the gradient of a step is scaled to length one before the optimiser sees it; the
+            paper does not say so.
         static_learning_rate: initial learning rate in static training; it decays to a tenth.
         learning_rate, final_learning_rate: learning rate in dynamic training after the warm-up, and at the
             end of the cosine schedule.
         learning_rate_warmup: iterations over which the learning rate rises at the start of dynamic training.
         integrator_learning_rate_scale: factor on the learning rate of the integrator's own parameters.
         shape_learning_rate_scale: factor on the learning rate of blendshapes, each of which moves many vertices.
+        skinning_learning_rate_scale: factor on the learning rate of skinning weights, which act in all poses.
         shape_smoothing: length below which waves of blendshapes change slowly (`training.shape_smoothing`), relative
             to the diagonal of the garment's bounding box; zero for steps that differ from vertex to vertex, as in the
             paper.
@@ -81,18 +87,22 @@ class TrainConfig:
     newton_weight: float = 0.0
     clearance: float = 5e-3
     static_batch: int = 512
+    initial_loss: bool = False
     noise_probability: float = 0.03
     noise: float = 0.03
     noise_correlation: float = 0.99
     latent_regularization: float = 0.0
+    contact_patches: bool = True
     bptt: bool = False
     optimiser: str = "muon"
+    normalised_gradients: bool = True
     static_learning_rate: float = 1e-3
     learning_rate: float = 3e-4
     final_learning_rate: float = 2e-5
     learning_rate_warmup: int = 500
     integrator_learning_rate_scale: float = 3.0
     shape_learning_rate_scale: float = 0.3
+    skinning_learning_rate_scale: float = 0.1
     shape_smoothing: float = 0.03
     weight_decay: float = 0.0
     ema_decay: float = 0.998
@@ -108,7 +118,8 @@ class TrainConfig:
             fail_unknown("training", f"optimiser '{self.optimiser}'", self.optimiser, OPTIMISERS)
         if not self.window >= 3:
             fail("training", f"a window of {self.window} poses", "inertia needs at least 3")
-        need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "static_batch", "validate_every")
+        need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "validate_every")
+        need_between(self, 0 if self.initial_loss else 1, NO_BOUND, "static_batch")
         need_between(self, 3, NO_BOUND, "valid_frames")
         need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
         need_between(self, 0, 1, "shape_smoothing", "tumbling")
@@ -124,6 +135,7 @@ class TrainConfig:
             "learning_rate_warmup",
             "integrator_learning_rate_scale",
             "shape_learning_rate_scale",
+            "skinning_learning_rate_scale",
             "outlier_energy",
             "newton_weight",
             "clearance",
@@ -147,11 +159,18 @@ class TrainConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """A named pair of model and training settings."""
+    """A named pair of model and training settings.
+
+    Attributes:
+        fabric: the fabric that is meant, where the command names none; empty for that of the garment.
+        material: likewise "name=value" properties of it, before those that the command sets.
+    """
 
     name: str
     model: ModelConfig
     train: TrainConfig
+    fabric: str = ""
+    material: tuple[str, ...] = ()
 
 
 PRESETS = {
@@ -210,6 +229,52 @@ PRESETS = {
                 ema_decay=0.9995,
                 validate_every=2400,
             ),
+        ),
+        # The paper's own model and training; docs/training.md tells what it leaves open.
+        Preset(
+            name="paper",
+            model=ModelConfig(
+                tanh=False,
+                scheme="verlet",
+                descriptors="absolute",
+                latent_bound=0.0,
+                max_latent_step=0.0,
+                feedback_points=0,
+                feedback_proxies=True,
+            ),
+            train=TrainConfig(
+                iterations=250_000,
+                static_fraction=0.0,
+                batch=32,
+                window=32,
+                state_reuse=0.0,
+                rotated_fraction=1.0,
+                recombinations=0,
+                perturbations=0,
+                tumbling=0.0,
+                outlier_energy=0.0,
+                clearance=0.0,
+                static_batch=0,
+                initial_loss=True,
+                noise_probability=0.0,
+                noise=0.1,
+                noise_correlation=0.0,
+                contact_patches=False,
+                bptt=True,
+                optimiser="adam",
+                normalised_gradients=False,
+                final_learning_rate=3e-4,
+                learning_rate_warmup=0,
+                integrator_learning_rate_scale=1.0,
+                shape_learning_rate_scale=1.0,
+                skinning_learning_rate_scale=1.0,
+                shape_smoothing=0.0,
+                ema_decay=0.0,
+                closest_point="vertices",
+                validate_every=2500,
+            ),
+            fabric="paper",
+            material=("drag=0",),
         ),
     )
 }

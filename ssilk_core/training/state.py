@@ -62,7 +62,7 @@ class ReducedSettings:
             name: getattr(config, name) * self.pace
             for name in ("static_learning_rate", "learning_rate", "final_learning_rate")
         }
-        static_batch = max(1, config.static_batch * self.batch // config.batch)
+        static_batch = max(min(1, config.static_batch), config.static_batch * self.batch // config.batch)
         return replace(
             config, batch=self.batch, pretraining_batch=self.pretraining_batch, static_batch=static_batch, **rates
         )

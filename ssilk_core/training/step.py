@@ -20,7 +20,6 @@ from .skipped_steps import SkippedSteps
 from .windows import WindowSampler
 
 MIN_GRADIENT_NORM = 1e-30  # floor for the norm that gradients are divided by
-SKINNING_RATE = 0.1  # of the learning rate: a skinning weight acts in all poses, so it changes slowly
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
@@ -99,6 +98,8 @@ class Stepper:
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
+        if self.config.initial_loss:
+            poses = self.sampler.with_initial(*poses)
         dynamic, static, latents = self.objective.window(self.sampler, noise, *poses)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
@@ -127,7 +128,8 @@ class Stepper:
         bad = ~(norm.isfinite() & judged.isfinite())
         # Normalise the gradient: one a hundred times larger than usual, from a single torn garment, would otherwise
         # dominate Adam's update of all parameters.
-        torch._foreach_div_(gradients, norm.clamp_min(MIN_GRADIENT_NORM))
+        if self.config.normalised_gradients:
+            torch._foreach_div_(gradients, norm.clamp_min(MIN_GRADIENT_NORM))
         if self.smoothing:
             self.smoothing.before_step()
         for optimiser in self.optimisers.values():
@@ -196,7 +198,7 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
         "matrices": 1.0,
         "biases": 1.0,
         "integrator": config.integrator_learning_rate_scale,
-        "skinning": SKINNING_RATE,
+        "skinning": config.skinning_learning_rate_scale,
         "shapes": config.shape_learning_rate_scale,
     }
     parts: dict[str, list[nn.Parameter]] = {name: [] for name in scales}

@@ -24,12 +24,20 @@ def random_directions(count: int, rotated: float, generator: torch.Generator, de
     return torch.where(turned, anywhere, down)
 
 
+def random_headings(direction: Tensor, generator: torch.Generator) -> Tensor:
+    """Return directions (N, 3) for `turned_vectors`: at random where gravity was turned; else x turns nothing."""
+    draw = torch.randn(direction.shape, generator=generator, device=direction.device)
+    identity = torch.eye(3, device=direction.device)
+    return torch.where((direction == -identity[1]).all(1, keepdim=True), identity[0], draw)
+
+
 class WindowSampler:
     """Draws windows; a share of the slots continues its clip and gravity direction from the last window.
 
     Attributes:
         first: first frame of each slot's window, shape (batch,).
         direction: gravity direction of each slot, shape (batch, 3).
+        heading: likewise how a slot is turned about gravity, for absolute descriptors; None for relative ones.
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
     """
@@ -51,6 +59,7 @@ class WindowSampler:
             )
         self.first = self._fresh()
         self.direction = random_directions(config.batch, config.rotated_fraction, generator, device).clone()
+        self.heading = random_headings(self.direction, generator) if bank.is_absolute else None
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
 
@@ -64,6 +73,11 @@ class WindowSampler:
         draw = torch.rand(count, generator=self.generator, device=device)
         frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
         return frames, random_directions(count, self.config.rotated_fraction, self.generator, device)
+
+    def with_initial(self, frames: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Return single poses (M,), (M, 3) followed by the first two of each window."""
+        own = torch.cat([self.first, self.first + 1])
+        return torch.cat([frames, own]), torch.cat([direction, self.direction.repeat(2, 1)])
 
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
@@ -91,12 +105,15 @@ class WindowSampler:
         go_on = fits & wish & latents.isfinite().all(dim=2).all(dim=0)
         self.first.copy_(torch.where(go_on, following, chosen))
         self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
+        if self.heading is not None:
+            self.heading.copy_(torch.where(go_on[:, None], self.heading, random_headings(fresh, self.generator)))
         self.latents.copy_(latents.detach())
         self.carried.copy_(go_on)
 
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
-        return {name: getattr(self, name) for name in ("first", "direction", "latents", "carried")}
+        names = ("first", "direction", "latents", "carried", *(() if self.heading is None else ("heading",)))
+        return {name: getattr(self, name) for name in names}
 
     def state(self) -> dict[str, Tensor]:
         """Return all that a resumed run needs to continue exactly, random state included."""

@@ -161,7 +161,7 @@ def build_objective(scene: Scene, model: GarmentModel, *motions: Motion, surface
     cpu, skeleton = torch.device("cpu"), scene.character.skeleton
     energy = GarmentEnergy(scene.garment.mesh, Fabric("toy", bending=1e-4, margin=0.02), scene.classes)
     body = CollisionBody(scene.character.merged_body(), skeleton.joint_count, device=cpu)
-    bank = build_bank(motions, skeleton, model.joints, model.config.fps, cpu)
+    bank = build_bank(motions, skeleton, model.joints, model.config.fps, cpu, kind=model.config.descriptors)
     return Objective(model, energy, body, bank, surface)
 
 

@@ -78,21 +78,16 @@ def unfinished() -> list[Path]:
     return [path for path in Path("out").rglob(".*") if "partial" in path.name]
 
 
+def openjd_run(chunk: int) -> subprocess.CompletedProcess[str]:
+    parameters = "-p", f"Ssilk={BIN / 'ssilk'}", "-p", f"ChunkSize={chunk}", "--timestamp-format", "utc"
+    command = [BIN / "openjd", "run", "bundle/template.json", *parameters]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
 def test_a_bundle_runs_unchanged_with_openjd(farm):
     """Twice: the second time everything is current."""
-    command = [
-        BIN / "openjd",
-        "run",
-        "bundle/template.json",
-        "-p",
-        f"Ssilk={BIN / 'ssilk'}",
-        "-p",
-        "ChunkSize=2",
-        "--timestamp-format",
-        "utc",
-    ]
     for expected in ("largest error", "current True"):
-        done = subprocess.run(command, capture_output=True, text=True)
+        done = openjd_run(chunk=2)
         assert done.returncode == 0, done.stdout
         assert "Session ended successfully" in done.stdout and expected in done.stdout, done.stdout
         assert "openjd_progress: 100.0" in done.stdout and "openjd_status: bake b/model" in done.stdout
@@ -102,11 +97,26 @@ def test_a_bundle_runs_unchanged_with_openjd(farm):
     }  # fmt: skip
 
 
+def test_a_bad_shot_ends_no_session_and_fails_the_last_step(farm):
+    """The first chunk fails, those behind it are baked, and the last step says which shot is missing."""
+    whole = Path("a.usda").read_bytes()
+    Path("a.usda").write_bytes(whole[:300])
+    done = openjd_run(chunk=1)
+    assert done.returncode != 0 and "openjd_fail: a/model: error:" in done.stdout, done.stdout
+    assert "1 of 3 tasks are not done" in done.stdout and "(a/model)" in done.stdout, done.stdout
+    assert Path("bundle/layers/shots/b/shot.usda").is_file() and Path("bundle/layers/shots/c/shot.usda").is_file()
+    assert not Path("bundle/layers/shots/a").exists()
+    Path("a.usda").write_bytes(whole)
+    again = openjd_run(chunk=1)
+    assert again.returncode == 0 and again.stdout.count("current True") == 2, again.stdout
+
+
 def test_bad_input_fails_its_task_alone_and_what_is_done_stays_done(farm, capsys):
     whole = Path("b.usda").read_bytes()
     Path("b.usda").write_bytes(whole[:300])
+    assert task() == 4
     capsys.readouterr()
-    assert task("--openjd") == 4
+    assert task("--openjd") == 0
     said = capsys.readouterr().out
     assert said.count("openjd_fail: b/model: error:") == 1 and "b.usda" in said and said.count("openjd_fail") == 1
     assert Path("out/shots/a/model/anim.usdc").is_file() and Path("out/shots/c/model/anim.usdc").is_file()

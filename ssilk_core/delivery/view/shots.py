@@ -101,20 +101,27 @@ def sheet_of_shots(
     labels: Sequence[str] = (),
     columns: int = 6,
     rows: int = 1,
+    frames: Sequence[int] | None = None,
     look: Look | None = None,
     report: Reporter = silent,
 ) -> int:
     """Write a PNG with up to `columns` x `rows` moments spread over the shots and return how many it shows.
 
-    Each row of moments is one row of panels for each shot, so that two shots stand above each other.
-    The other arguments and the errors are those of `film_of_shots`, with .png for .mp4.
+    `frames` are shown in one row instead, where they are given. Each row of moments is one row of panels for each
+    shot, so that two shots stand above each other. The other arguments and the errors are those of `film_of_shots`,
+    with .png for .mp4.
     """
     check_suffix(path, (PICTURE,))
     if not (columns > 0 and rows > 0):
         fail("contact sheet", f"{columns} columns and {rows} rows", "both are at least 1")
     look = look or Look(width=320, height=440)
     count = need_matching(players)
-    frames = np.linspace(0, count - 1, min(columns * rows, count)).round().astype(int).tolist()
+    if frames is None:
+        frames = np.linspace(0, count - 1, min(columns * rows, count)).round().astype(int).tolist()
+    else:
+        columns = len(frames)
+        if not frames or not all(0 <= frame < count for frame in frames):
+            fail("contact sheet", f"frames {list(frames)}", f"one or more of 0 to {count - 1} are shown")
     panels = _panels(players, frames, labels, look, label_every=columns)
     images = list(_drawn(panels, look, len(frames) * len(players), report))
     strips = []

@@ -53,6 +53,7 @@ class FreeDecoder(nn.Module):
         decoder, device = copy.deepcopy(model.decoder).to(vertices.device, dtype), vertices.device
         joints = model.scene.character.skeleton.joint_count
         self.activation_count, self.proxy_outputs = decoder.activation_count, decoder.proxy_outputs
+        self.bounded, self.tanh = decoder.bounded, decoder.tanh
         self.proxy_count, self.reach, self.is_reduced = decoder.proxy_count, decoder.reach, decoder.is_reduced
         self.output = copy.deepcopy(model.output).requires_grad_(False)
         self.chain = ProxyChain(decoder.parent_indices, joints, device)
@@ -84,7 +85,7 @@ class FreeDecoder(nn.Module):
             character: skinning matrices of the character's joints, shape (J, 3, 4, N).
         """
         output = self.output(z)
-        activation = torch.tanh(output[:, : self.activation_count].T)
+        activation = self.bounded(output[:, : self.activation_count].T)
         values = self._values(output.T[self.activation_count :])
         moved = limited(values[:, 6:], self.reach) if self.proxy_outputs > 6 else torch.zeros_like(values[:, :3])
         own = self._about_pivots(rotation_from_six_d(values[:, :6]), moved)
@@ -97,8 +98,9 @@ class FreeDecoder(nn.Module):
         frames, latents = z.shape
         output, slopes = mlp_slopes(self.output, z)
         count, proxies = self.activation_count, self.proxy_count
-        activation = torch.tanh(output[:, :count].T)
-        d_activation = (1 - activation.T**2)[:, :, None] * slopes[:, :count]
+        activation = self.bounded(output[:, :count].T)
+        slope = 1 - activation.T**2 if self.tanh else (output[:, :count] == activation.T).to(output.dtype)
+        d_activation = slope[:, :, None] * slopes[:, :count]
         values = self._values(output.T[count:])
         d_values = slopes[:, count:].reshape(frames, proxies, self.proxy_outputs, latents).permute(1, 2, 0, 3)
         d_values = self.scale[..., None] * d_values

@@ -143,7 +143,8 @@ class LatentShots:
         model, parameter = self.model, next(self.model.parameters())
         seen = motion.clip(max(0, start - LOOK_BACK), stop)
         count = min(stop, motion.frame_count) - start
-        features = pose_features(seen, model.scene.character.skeleton, model.joints)
+        skeleton, kind = model.scene.character.skeleton, model.config.descriptors
+        features = pose_features(seen, skeleton, model.joints, kind=kind)
         static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
         rest = model.initial(static)
         sound = rest.abs().amax(dim=1, keepdim=True) < DIVERGENCE_BOUND  # NaN is not less than anything

@@ -64,7 +64,7 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     """Return the tensors of `MotionInputs` for one motion without cuts, frames first."""
     skeleton, parameter = model.scene.character.skeleton, next(model.parameters())
     world = motion_transforms(motion, skeleton.parents)
-    features = pose_features(motion, skeleton, model.joints, world)
+    features = pose_features(motion, skeleton, model.joints, world, model.config.descriptors)
     body = BodyFrames.of(world, skeleton, parameter)
     static, pose = upright_descriptors(features, parameter)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
@@ -87,7 +87,7 @@ class BatchPlayer:
         self.bend = like.bend[0].clone()
         self.before, self.now = self.rest.clone(), self.rest.clone()
         with torch.no_grad():  # of the last two frames
-            self.past = [model.decoded(self.rest, self.character) for _ in range(2)] if model.feedback.count else []
+            self.past = [model.decoded(self.rest, self.character) for _ in range(2)] if model.feedback.size else []
         self.begins = torch.ones_like(like.begins[0])
         self.network = torch.compile(self._network, dynamic=False) if self.rest.is_cuda else self._network
         self.advance = self._capture_graph() if self.rest.is_cuda else self._advance

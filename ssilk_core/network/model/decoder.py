@@ -19,7 +19,7 @@ from ...physics import kernels
 from ...physics.skinning import Skinning
 from ...scene.assets import PINNED, Scene
 from ..parameters import IDENTITY, OUTPUT_SCALE
-from ..settings import ModelConfig
+from ..settings import FREE_ACTIVATION, ModelConfig
 
 
 def rotation_from_six_d(values: Tensor) -> Tensor:
@@ -77,7 +77,7 @@ class Decoder(nn.Module):
         super().__init__()
         rig, shapes = scene.rig, config.shapes
         self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, config.activation_count
-        self.proxy_outputs, self.is_reduced = config.proxy_outputs, config.activations > 0
+        self.proxy_outputs, self.is_reduced, self.tanh = config.proxy_outputs, config.activations > 0, config.tanh
         self.reach = scene.garment.mesh.diagonal  # several times what trained models use
         self.parent_indices = tuple(rig.parents.tolist())  # as Python numbers, without a copy from the GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
@@ -117,18 +117,22 @@ class Decoder(nn.Module):
         return self.activation_count > 0
 
     def activations(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Split network output (N, K + C P) into activations (K, N) in [-1, 1] and transforms (P, 3, 4, N)."""
+        """Split network output (N, K + C P) into activations (K, N) and transforms (P, 3, 4, N)."""
         activation, values = self.split(output)
         return activation, transform_of(values)
 
     def split(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """Split network output (N, K + C P) into activations (K, N) and values of `transform_of` (P, C, N)."""
         delta = output[:, self.activation_count :].T.reshape(self.proxy_count, self.proxy_outputs, output.shape[0])
-        activation = torch.tanh(output[:, : self.activation_count].T)
+        activation = self.bounded(output[:, : self.activation_count].T)
         values = self.identity + self.scale * delta
         if values.shape[1] > 6:
             values = torch.cat([values[:, :6], limited(values[:, 6:], self.reach)], dim=1)
         return (self.readout @ activation).clamp(-1, 1) if self.is_reduced else activation, values
+
+    def bounded(self, activation: Tensor) -> Tensor:
+        """Return activations in [-1, 1], or without a tanh in a range that they do not leave."""
+        return torch.tanh(activation) if self.tanh else activation.clamp(-FREE_ACTIVATION, FREE_ACTIVATION)
 
     def _influence_weights(self) -> Tensor:
         """Return weights (V, I): a softmax over each vertex's support, pinned rows frozen."""

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ...scene.assets import Floats
-from ..descriptors import PoseFeatures
+from ..descriptors import VECTORS, PoseFeatures
 
 DOWN = (0.0, -1.0, 0.0)  # where gravity points, but in training
 
@@ -18,9 +18,24 @@ def upright_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, T
     def tensor(values: Floats) -> Tensor:
         return torch.as_tensor(values).to(like)
 
-    gravity = gravity_features(tensor(features.down), like.new_tensor(DOWN).expand(len(features.static), 3))
-    static = torch.cat([tensor(features.static), gravity], dim=1)
-    return static, torch.cat([static, tensor(features.dynamic)], dim=1)
+    direction = like.new_tensor(DOWN).expand(len(features.static), 3)
+    static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), direction)], dim=1)
+    earlier = gravity_features(tensor(features.earlier), direction)
+    return static, torch.cat([static, earlier, tensor(features.dynamic)], dim=1)
+
+
+def turned_vectors(dynamic: Tensor, direction: Tensor, heading: Tensor) -> Tensor:
+    """Return absolute features (N, D) of the motion turned as a whole about the origin of the world.
+
+    Args:
+        direction: unit gravity directions (N, 3), which the rotation turns to -y.
+        heading: directions (N, 3), whose part across gravity it turns to x.
+    """
+    across = heading - (heading * direction).sum(1, keepdim=True) * direction
+    x, y = torch.nn.functional.normalize(across, dim=1), -direction
+    rotation = torch.stack([x, y, torch.linalg.cross(x, y, dim=1)], dim=1)
+    vectors = dynamic[:, -3 * VECTORS :].reshape(-1, VECTORS, 3)
+    return torch.cat([dynamic[:, : -3 * VECTORS], (vectors @ rotation.mT).flatten(1)], dim=1)
 
 
 def gravity_features(down: Tensor, direction: Tensor) -> Tensor:

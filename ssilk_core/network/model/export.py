@@ -19,7 +19,7 @@ from .network import GarmentModel
 
 OPSET = 18
 INPUTS = ("before", "now", "static", "rates", "begins")
-BODY_INPUTS = ("matrices", "bend")  # where S sees the cloth
+BODY_INPUTS = ("matrices", "bend")  # where S sees points of the cloth
 OUTPUTS = ("state", "weights", "rotations", "translations")  # the last only where proxies move
 
 
@@ -45,7 +45,7 @@ class FrameNetwork(nn.Module):
         """Numbers in a state: latents, and where S sees the cloth the outputs of D and the points that it sees."""
         model = self.model
         return model.config.latent + (model.decoder.output_count + 3 * model.feedback.count) * (
-            model.feedback.count > 0
+            model.feedback.size > 0
         )
 
     def _decoded(self, state: Tensor) -> DecodedState:
@@ -56,7 +56,8 @@ class FrameNetwork(nn.Module):
 
     def _step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, body: BodyFrames | None) -> Tensor:
         model, latent = self.model, self.model.config.latent
-        seen = rest[:, :0] if body is None else model.seen((self._decoded(before), self._decoded(now)), body)
+        past = (self._decoded(before), self._decoded(now)) if model.feedback.size else None
+        seen = rest[:, :0] if past is None else model.feedback.seen(model.decoder, past, body)
         return model.step(before[:, :latent], now[:, :latent], rest, pose, seen)
 
     def forward(
@@ -77,7 +78,7 @@ class FrameNetwork(nn.Module):
             before, now: the two states before this frame, (N, state).
             static: static descriptors, gravity in each joint's frame included (N, S); rates: dynamic ones (N, R).
             begins: whether the garment is at rest in this frame, as in the first two frames of a shot (N, 1), bool.
-            matrices: skinning matrices of the character's joints about the root (N, J, 3, 4), where S sees the cloth.
+            matrices: skinning matrices of the character's joints about the root (N, J, 3, 4), where S sees points.
             bend: likewise the second difference of the root's position, r_t - 2 r_{t-1} + r_{t-2} (N, 3) [m].
         """
         model, body = self.model, None
@@ -88,10 +89,10 @@ class FrameNetwork(nn.Module):
         output = model.output(z)
         activation, transforms = model.decoder.activations(output)
         state = z
-        if body is not None:
-            points = model.feedback.decoded(model.decoder, output, body.matrices[0]).points
+        if model.feedback.size:
+            points = model.feedback.decoded(model.decoder, output, None if body is None else body.matrices[0]).points
             state = torch.cat([z, output, points.flatten(0, 1).T], dim=1)
-        weights = (activation.T + 1) / 2
+        weights = (activation.T / model.config.activation_range + 1) / 2
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)
         # Without proxies, engines refuse to load the reshaping of empty tensors.
@@ -105,7 +106,7 @@ class FrameNetwork(nn.Module):
 def export_onnx(model: GarmentModel, path: str | Path) -> None:
     """Write the network as ONNX, atomically; the first dimension is a batch of any size."""
     network, config = FrameNetwork(model).eval(), model.config
-    static, rates = descriptor_sizes(model.scene, model.joints)
+    static, rates = descriptor_sizes(model.scene, model.joints, config.descriptors)
     sizes = (network.state_size, network.state_size, static, rates)
     frame = (*(torch.zeros(5, size) for size in sizes), torch.zeros(5, 1, dtype=torch.bool))
     inputs: tuple[str, ...] = INPUTS

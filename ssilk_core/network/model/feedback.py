@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from ...physics.skinning import transform_points
 from ...scene.assets import Floats, Scene, Skeleton
 from ...scene.kinematics import skinning_matrices
-from ..feedback import LIMIT, UNIT, bends, feedback_vertices
+from ..feedback import LIMIT, UNIT, bends, feedback_size, feedback_vertices
 from ..settings import ModelConfig
-from .decoder import Decoder
+from .decoder import Decoder, transform_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +52,13 @@ class DecodedState:
 
 
 class Feedback(nn.Module):
-    """Decodes the points that S sees.
+    """Decodes the points and the proxies that S sees.
 
     Args:
         scene: the garment; config: of the network.
+
+    Attributes:
+        size: number of features of both.
     """
 
     rows: Tensor
@@ -63,7 +66,7 @@ class Feedback(nn.Module):
 
     def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
         super().__init__()
-        rows = torch.as_tensor(feedback_vertices(scene, config))
+        self.size, rows = feedback_size(scene, config), torch.as_tensor(feedback_vertices(scene, config))
         self.register_buffer("rows", rows, persistent=False)
         # Of each chosen vertex among those that are not pinned, which alone have blendshapes.
         self.register_buffer("places", torch.searchsorted(decoder.free, rows), persistent=False)
@@ -73,8 +76,10 @@ class Feedback(nn.Module):
         """Points that S sees."""
         return len(self.rows)
 
-    def decoded(self, decoder: Decoder, output: Tensor, matrices: Tensor) -> DecodedState:
-        """Return a state by its outputs (N, outputs), under a character (J, 3, 4, N)."""
+    def decoded(self, decoder: Decoder, output: Tensor, matrices: Tensor | None) -> DecodedState:
+        """Return a state by its outputs (N, outputs), under a character (J, 3, 4, N), which only points need."""
+        if matrices is None or not self.count:
+            return DecodedState(output, output.new_zeros(0, 3, output.shape[0]))
         activation, values = decoder.split(output)
         rest, shapes = decoder.free_rest()[self.places], decoder.shapes[self.places]
         points = rest[:, :, None] + torch.einsum("mak,kn->man", shapes, activation)
@@ -83,15 +88,28 @@ class Feedback(nn.Module):
         affine = decoder.skin.dense(weights, self.rows) @ joints.flatten(1)
         return DecodedState(output, transform_points(affine.reshape(self.count, *joints.shape[1:]), points))
 
-    def seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames) -> Tensor:
-        """Return what S sees (N, 3 M) from the two states before a frame, the older one first.
+    def seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames | None) -> Tensor:
+        """Return what S sees (N, size) from the two states before a frame, the older one first.
 
         Args:
-            body: the character in that frame alone, F = 1.
+            body: the character in that frame alone, F = 1, which only points need.
         """
+        points = [self._points_seen(decoder, past, body)] if body is not None and self.count else []
+        proxies = [_proxies(decoder, state.output) for state in past] if self.size > 3 * self.count else []
+        return torch.cat([*points, *proxies], dim=1)
+
+    def _points_seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames) -> Tensor:
         before, now = past
         carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0])
         away = 2 * now.points - before.points - carried.points - body.bend[0]
         turn = body.matrices[0, 0, :, :3]  # of the root, but for a constant
         own = torch.einsum("ban,mbn->man", turn, away)
         return LIMIT * torch.tanh(own.flatten(0, 1).T / (UNIT * LIMIT))
+
+
+def _proxies(decoder: Decoder, output: Tensor) -> Tensor:
+    """Return the proxies (N, C P) of outputs of D (N, outputs), as S sees them."""
+    transforms = transform_of(decoder.split(output)[1])
+    columns = transforms.transpose(1, 2)  # x, y, z axis and displacement
+    seen = [columns[:, :2], *([columns[:, 3:]] if decoder.proxy_outputs > 6 else [])]
+    return ((torch.cat(seen, dim=1).flatten(1, 2) - decoder.identity) / decoder.scale).flatten(0, 1).T

@@ -197,6 +197,26 @@ class SpringVerlet(Integrator):
         return stepper(torch.cat(inputs, dim=1)).clamp(-MAX_OUTPUT, MAX_OUTPUT)
 
 
+class Verlet(Integrator):
+    """The paper's own scheme: z_t = zbar + S([zbar, z_{t-1}, pose, cloth]) (Eqs. 2 and 3).
+
+    zbar = alpha z_{t-1} + beta (z_{t-1} - z_{t-2}), and `config.max_latent_step` limits what S adds in a step. The
+    paper does not say where alpha and beta start.
+    """
+
+    def __init__(self, config: ModelConfig, rates: int = 0) -> None:
+        super().__init__(config, rates)
+        self.alpha = nn.Parameter(torch.full((config.latent,), 1.0))
+        # 1 would turn noise on the first two states into a steady drift; with 0.9 it decays within a second.
+        self.beta = nn.Parameter(torch.full((config.latent,), 0.9))
+
+    def advance(self, stepper: nn.Module, before: Tensor, now: Tensor, seen: Tensor, *precomputed: Tensor) -> Tensor:
+        _, pose = precomputed
+        forward = self.alpha * now + self.beta * (now - before)
+        added = stepper(torch.cat([forward, now, pose, seen], dim=1))
+        return forward + soft_clamp(added, self.config.max_latent_step)
+
+
 class QuasiStatic(Integrator):
     """z_t = P(theta_t), with no stepper and no earlier states, for garments without loose vertices."""
 

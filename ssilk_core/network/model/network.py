@@ -53,13 +53,13 @@ class GarmentModel(nn.Module):
         self.axes = ProxyAxes.of(scene)
         generator = torch.Generator().manual_seed(seed)
         self.decoder = Decoder(scene, config, generator)
-        static, dynamic = descriptor_sizes(scene, self.joints)
+        static, dynamic = descriptor_sizes(scene, self.joints, config.descriptors)
         z = config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
         scheme, self.feedback = self.integrator.scheme, Feedback(scene, config, self.decoder)
-        inputs = scheme.states * z + static + dynamic + 3 * self.feedback.count
+        inputs = scheme.states * z + static + dynamic + self.feedback.size
         self.stepper = (
             mlp(inputs, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
         )
@@ -83,14 +83,14 @@ class GarmentModel(nn.Module):
         return self.feedback.decoded(self.decoder, self.output(z), matrices)
 
     def seen(self, past: tuple[DecodedState, DecodedState] | None, body: BodyFrames) -> Tensor:
-        """Return what S sees of the cloth in the frame of `body` (N, 3 M), from the two states before it."""
+        """Return what S sees of the cloth in the frame of `body` (N, size), from the two states before it."""
         if past is None:
             return body.bend.new_zeros(body.bend.shape[-1], 0)
         return self.feedback.seen(self.decoder, past, body)
 
     def seen_from(self, before: Tensor, now: Tensor, body: BodyFrames) -> Tensor:
         """Return what S sees in the last of three frames of `body`, from the latents of the first two."""
-        if not self.feedback.count:
+        if not self.feedback.size:
             return self.seen(None, body[2:])
         return self.seen((self.decoded(before, body.matrices[0]), self.decoded(now, body.matrices[1])), body[2:])
 
@@ -104,7 +104,7 @@ class GarmentModel(nn.Module):
             body: the character in the two frames before and in these, F + 2.
         """
         states, past = list(states), None
-        features = 3 * self.feedback.count
+        features = self.feedback.size
         precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1), features)
         if features and len(rest):
             past = self.decoded(states[-2], body.matrices[0]), self.decoded(states[-1], body.matrices[1])
@@ -116,7 +116,7 @@ class GarmentModel(nn.Module):
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Return activations (K, N) in [-1, 1] and proxy transforms (P, 3, 4, N) of latents (N, latent) (Eq. 7)."""
+        """Return activations (K, N) and proxy transforms (P, 3, 4, N) of latents (N, latent) (Eq. 7)."""
         return self.decoder.activations(self.output(z))
 
     def vertices(self, z: Tensor, character: Tensor) -> Tensor:
@@ -127,9 +127,9 @@ class GarmentModel(nn.Module):
     def deformer(self) -> Deformer:
         """Return the trained garment for files: shapes for weights in [0, 1], with W^g and W^p made sparse.
 
-        An activation a in [-1, 1] is the weight w = (a + 1) / 2 of the shape 2 B_k. The last shape, -sum_k B_k, has a
-        constant weight of one: it moves the middle of the range back to the rest shape, or to that of a reduced
-            model.
+        An activation a in [-r, r] is the weight w = (a / r + 1) / 2 of the shape 2 r B_k, with the range r of the
+        configuration. The last shape, -r sum_k B_k, has a constant weight of one: it moves the middle of the range
+        back to the rest shape, or to that of a reduced model.
         """
         scene, decoder = self.scene, self.decoder
         dense = np.zeros((scene.garment.mesh.vertex_count, len(scene.joint_names)))
@@ -137,7 +137,7 @@ class GarmentModel(nn.Module):
         skin = SkinWeights.from_dense(scene.rig.path, dense)
         free = decoder.shapes.double().permute(2, 0, 1).cpu().numpy()
         shapes = np.zeros((decoder.shape_count, scene.garment.mesh.vertex_count, 3))
-        shapes[:, decoder.free.cpu().numpy()] = 2 * free
+        shapes[:, decoder.free.cpu().numpy()] = 2 * self.config.activation_range * free
         if decoder.has_constant:
             constant = -shapes.sum(0, keepdims=True) / 2
             constant[0, decoder.free.cpu().numpy()] += decoder.offset.cpu().numpy()
@@ -153,7 +153,7 @@ class GarmentModel(nn.Module):
             None where proxies do not move.
         """
         turned, moved = self.axes.to_local(transforms.double().permute(3, 0, 1, 2).cpu().numpy())
-        weights = (activation.double().T.cpu().numpy() + 1) / 2
+        weights = (activation.double().T.cpu().numpy() / self.config.activation_range + 1) / 2
         if self.decoder.has_constant:
             weights = np.concatenate([weights, np.ones((len(weights), 1))], axis=1)
         return turned, weights.clip(0, 1), moved if self.config.translations else None
@@ -164,6 +164,7 @@ class GarmentModel(nn.Module):
         parameter = self.decoder.shapes
         transforms = self.axes.to_bind(pose.rotations, pose.translations)
         activation = 2 * pose.weights[:, : self.decoder.shape_count].astype(np.float64).T - 1
+        activation *= self.config.activation_range
         return (
             torch.as_tensor(activation, dtype=torch.float32, device=parameter.device),
             torch.as_tensor(transforms.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),

@@ -22,7 +22,8 @@ class CharacterFrames:
 
     Attributes:
         static: static descriptors, gravity included, shape (F, S), float32.
-        rates: dynamic part of the descriptors, zero while the character holds still, shape (F, R), float32.
+        rates: dynamic part of the descriptors, shape (F, R), float32; relative ones are zero while the character
+            holds still.
         all_matrices: skinning matrices relative to the root, of the two frames before and these, shape
             (J, 3, 4, F + 2), float32; the first frame stands for those before a motion.
         all_origins: positions of the root in these [m], shape (F + 2, 3).
@@ -49,18 +50,23 @@ class CharacterFrames:
         return bends(self.all_origins)[HISTORY:]
 
 
-def character_frames(motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0) -> CharacterFrames:
+def character_frames(
+    motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0, kind: str = "relative"
+) -> CharacterFrames:
     """Return descriptors and skinning matrices of a motion at the model's rate, with gravity along -y.
 
-    The first `lookback` frames, at most two, only serve what looks back, and are none of the F frames.
+    Args:
+        lookback: number of first frames, at most two, that only serve what looks back, and are none of the F frames.
+        kind: of the descriptors.
     """
     world = motion_transforms(motion, skeleton.parents)
-    features = pose_features(motion, skeleton, joints, world)
-    down = -features.down[..., 1].reshape(motion.frame_count, -1)
+    features = pose_features(motion, skeleton, joints, world, kind)
+    down, earlier = (-values[..., 1].reshape(len(values), -1) for values in (features.down, features.earlier))
     static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
+    rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback
     matrices, origins = _about_root(world[np.maximum(np.arange(-missing, len(world)), 0)], skeleton)
-    return CharacterFrames(static[lookback:], features.dynamic[lookback:].astype(np.float32), matrices, origins)
+    return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins)
 
 
 def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...scene.assets import Floats
 from ..checkpoint import ModelFile
-from ..feedback import LIMIT, UNIT, feedback_vertices
+from ..feedback import LIMIT, UNIT, feedback_size, feedback_vertices
 from .decoder import NumpyDecoder
 from .kinematics import ProxyKinematics
 from .networks import LayerBuffers, as_float32
@@ -49,6 +49,7 @@ class ClothPoints:
         self.decoder, self.kinematics = decoder, kinematics
         rows = feedback_vertices(file.scene, file.config)
         self.count, self.joints = len(rows), file.scene.character.skeleton.joint_count
+        self.size = feedback_size(file.scene, file.config)
         whole = tiles(file.scene, file.parameters)
         shapes = np.concatenate([tile.shapes.reshape(len(tile.shapes), 3, -1) for tile in whole], axis=2)
         self.shapes = as_float32(shapes[:, :, rows].transpose(2, 1, 0))  # (M, 3, K + 1), the rest shape last
@@ -70,6 +71,13 @@ class ClothPoints:
         affine += course.affine[frames].transpose(1, 2, 3, 0)
         rest = self.shapes[:, :, :-1] @ activations + self.shapes[:, :, -1:]
         return (affine[:, :, :3] * rest[:, None]).sum(2) + affine[:, :, 3]
+
+    def proxies(self, outputs: NDArray) -> NDArray:
+        """Return the proxies (C P, F) of outputs of D (outputs, F), as S sees them."""
+        decoder, transforms = self.decoder, self.decoder.pose_of(outputs)[1]
+        columns = transforms.swapaxes(1, 2)  # x, y, z axis and displacement
+        columns = columns[:, [0, 1, 3] if decoder.moves else [0, 1]].reshape(len(columns), -1, outputs.shape[1])
+        return ((columns - decoder.identity) / decoder.scale).reshape(-1, outputs.shape[1])
 
 
 class SeenCloth:
@@ -93,6 +101,13 @@ class SeenCloth:
 
     def look(self) -> None:
         """Write what S sees of the cloth in the next frame."""
+        points = 3 * self.points.count
+        if points:
+            self._look_at_points(self.into[:points])
+        if self.points.size > points:
+            self.into[points:] = self.points.proxies(np.stack([self.older, self.newer], axis=1)).T.reshape(-1)
+
+    def _look_at_points(self, into: NDArray) -> None:
         both = np.stack([self.newer, 2 * self.newer - self.older], axis=1)
         if self.before is None:
             self.before = self.points.points(self.older[:, None], self.course, self._past(0, 1))[..., 0]
@@ -102,9 +117,9 @@ class SeenCloth:
         away -= carried
         away -= self.course.bend[self.frame]
         away = away @ self.course.matrices[self.frame + 2, 0, :, :3]
-        np.divide(away.reshape(-1), SATURATION, self.into)
-        np.tanh(self.into, self.into)
-        np.multiply(self.into, np.float32(LIMIT), self.into)
+        np.divide(away.reshape(-1), SATURATION, into)
+        np.tanh(into, into)
+        np.multiply(into, np.float32(LIMIT), into)
         self.before = now
 
     def keep(self, state: NDArray) -> None:

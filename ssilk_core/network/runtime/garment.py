@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,9 @@ from .feedback import ClothPoints
 from .kinematics import ProxyKinematics
 from .networks import evaluate, layers
 from .skinning import tiles
-from .stepper import SoftClamp, SpringStepper, diverged
+from .stepper import NumpyStepper, SoftClamp, SpringStepper, VerletStepper, diverged
+
+STEPPERS = {"spring_verlet": SpringStepper, "verlet": VerletStepper, "quasi_static": None}  # by scheme
 
 
 class NumpyGarment:
@@ -28,11 +32,11 @@ class NumpyGarment:
 
     def __init__(self, file: ModelFile) -> None:
         scene, config = file.scene, file.config
-        if config.scheme not in ("spring_verlet", "quasi_static"):
+        if config.scheme not in STEPPERS:
             fail(
                 scene.garment.mesh.path,
                 f"the model's scheme is '{config.scheme}'",
-                "the runtime plays 'spring_verlet' and 'quasi_static'",
+                f"the runtime plays {', '.join(map(repr, STEPPERS))}",
                 "play it in PyTorch with ssilk_core.network.rollout, or train with one of these",
             )
         self.file, self.skeleton = file, scene.character.skeleton
@@ -40,10 +44,11 @@ class NumpyGarment:
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
-        self.stepper = None
-        if config.scheme == "spring_verlet":
+        self.stepper: NumpyStepper[Any] | None = None
+        if stepper := STEPPERS[config.scheme]:
             points = ClothPoints(file, self.decoder, self.kinematics)
-            self.stepper = SpringStepper(config, file.parameters, *descriptor_sizes(scene, file.joints), points)
+            sizes = descriptor_sizes(scene, file.joints, config.descriptors)
+            self.stepper = stepper(config, file.parameters, *sizes, points)
 
     def deformer(self) -> Deformer:
         """Return the trained garment's skin and shapes, as files and host applications hold them."""

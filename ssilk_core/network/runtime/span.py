@@ -95,6 +95,7 @@ class RolledSpan:
             self.player.skeleton,
             self.player.file.joints,
             lookback,
+            self.player.file.config.descriptors,
         )
 
     def _decoded(self, number: int) -> DecodedFrames:

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recurrence of `model.integrators.SpringVerlet`, one frame at a time, in few numpy calls.
+"""The recurrences of `model.integrators`, one frame at a time, in few numpy calls.
+
+Of `SpringVerlet`:
 
 With p the quasi-static state, w = z_{t-1} - p and v = z_{t-1} - z_{t-2}, the first layer of S is linear in w and v
 plus a part that the pose alone decides, as it decides all of what S gives to a garment at rest:
@@ -7,12 +9,16 @@ plus a part that the pose alone decides, as it decides all of what S gives to a 
     z_t = p + f + soft_clamp(u - k f),    f = w + beta v,    u = s (S(w, v, pose, m) - S(0, 0, pose held still, 0))
 
 with m what S sees of the cloth, and the norm of u clipped as there.
+
+Of `Verlet`, the first layer of S is linear in zbar, z_{t-1} and m plus what the pose decides.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from math import sqrt
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,68 +77,76 @@ class StepperInputs:
     Attributes:
         history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
         pose_sums: contribution of the pose to the sums of S's first layer, shape (F, hidden).
-        output_at_rest: s S(0, 0, pose held still), shape (F, latent).
-        rate_allowance: limit of |u| due to the pose's rates, shape (F,).
         course: the character as the points that S sees have it; None where it sees none.
         first: first frame that the stepper computes; the garment is at rest in earlier ones.
     """
 
     history: NDArray
     pose_sums: NDArray
-    output_at_rest: NDArray
-    rate_allowance: NDArray
     course: BodyCourse | None
     first: int
 
 
-class SpringStepper:
+@dataclass(frozen=True, eq=False)
+class SpringInputs(StepperInputs):
+    """What the spring needs besides.
+
+    Attributes:
+        output_at_rest: s S(0, 0, pose held still), shape (F, latent).
+        rate_allowance: limit of |u| due to the pose's rates, shape (F,).
+    """
+
+    output_at_rest: NDArray
+    rate_allowance: NDArray
+
+
+Inputs = TypeVar("Inputs", bound=StepperInputs)
+
+
+class NumpyStepper(ABC, Generic[Inputs]):
     """Rolls out latents.
 
     Args:
-        config: sizes and bounds; parameters: of the whole network.
-        static, rates: sizes of the parts of a dynamic descriptor.
-        points: of the cloth that S sees.
+        config: sizes and bounds; points: of the cloth that S sees.
+
+    Attributes:
+        first: weights of S's first layer for what changes with the states, shape (inputs, hidden).
+        later: its other layers.
     """
 
-    def __init__(
-        self, config: ModelConfig, parameters: Parameters, static: int, rates: int, points: ClothPoints
-    ) -> None:
-        self.points = points
-        beta, share = (parameters[f"integrator.{name}"] for name in ("beta", "share"))
-        first, *hidden, last = layers(parameters, "stepper")
-        blocks = np.cumsum([config.latent] * 3 + [static, rates])
-        of_now, of_speed, of_away, of_static, self.of_rates, of_seen = np.split(first.weights, blocks, axis=1)
-        speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
-        self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
-        self.first = as_float32(np.hstack([of_now - away, speed - away * beta, of_seen]).T)
-        self.later = [*hidden, Layer(as_float32(OUTPUT_SCALE * last.rows))]
-        self.beta = beta.astype(np.float32)
-        self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
-        self.config = config
+    first: NDArray
+    later: list[Layer]
 
-    def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> StepperInputs:
+    def __init__(self, config: ModelConfig, points: ClothPoints) -> None:
+        self.config, self.points = config, points
+
+    @abstractmethod
+    def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> Inputs:
         """Return the inputs of F frames.
 
         Args:
             rest: quasi-static latents (F, latent); character: in these frames.
             before: the two latents before the first frame (2, latent); None at the start of a motion, at rest.
         """
-        static, rates = character.static, character.rates
-        course = self.points.course(character.all_matrices, character.bend) if self.points.count else None
-        still = self.of_still @ np.hstack([rest, static]).T + self.bias
-        pose_sums = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
-        output = evaluate_tail(self.later, still).T
-        output_at_rest = np.ascontiguousarray(output.clip(-MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT))
-        rate_allowance = RATE_ALLOWANCE * np.linalg.norm(rates, axis=1)
+
+    @abstractmethod
+    def _advance(self, inputs: Inputs, start: int) -> None:
+        """Compute the latents from frame `start` on, and write them into `inputs`."""
+
+    def _given(
+        self, rest: NDArray, character: CharacterFrames, before: NDArray | None
+    ) -> tuple[NDArray, BodyCourse | None, int]:
+        """Return history, course and first frame of `StepperInputs`."""
+        course = self.points.course(character.all_matrices, character.bend) if self.points.size else None
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, course, 2)
+            return history, course, 2
         history[:2, 1] = before
-        return StepperInputs(history, pose_sums, output_at_rest, rate_allowance, course, 0)
+        return history, course, 0
 
-    def roll(self, inputs: StepperInputs) -> NDArray:
+    def roll(self, inputs: Inputs) -> NDArray:
         """Return the latents of all frames (F, latent), written into `inputs`."""
         z, rest, start = inputs.history[2:, 1], inputs.history[:-2, 0], inputs.first
         while start < len(z):
@@ -145,9 +159,47 @@ class SpringStepper:
             z[first:start] = rest[first:start]
         return z
 
-    def _advance(self, inputs: StepperInputs, start: int) -> None:
+    def _buffers(self) -> list[LayerBuffers]:
+        return [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
+
+
+class SpringStepper(NumpyStepper[SpringInputs]):
+    """Rolls out latents of `SpringVerlet`.
+
+    Args:
+        config: sizes and bounds; parameters: of the whole network.
+        static, rates: sizes of the parts of a dynamic descriptor.
+        points: of the cloth that S sees.
+    """
+
+    def __init__(
+        self, config: ModelConfig, parameters: Parameters, static: int, rates: int, points: ClothPoints
+    ) -> None:
+        super().__init__(config, points)
+        beta, share = (parameters[f"integrator.{name}"] for name in ("beta", "share"))
+        first, *hidden, last = layers(parameters, "stepper")
+        blocks = np.cumsum([config.latent] * 3 + [static, rates])
+        of_now, of_speed, of_away, of_static, self.of_rates, of_seen = np.split(first.weights, blocks, axis=1)
+        speed, away = VELOCITY_SCALE * of_speed, DISTANCE_SCALE * of_away
+        self.bias, self.of_still = first.bias, np.hstack([of_now, of_static])
+        self.first = as_float32(np.hstack([of_now - away, speed - away * beta, of_seen]).T)
+        self.later = [*hidden, Layer(as_float32(OUTPUT_SCALE * last.rows))]
+        self.beta = beta.astype(np.float32)
+        self.stiffness = (config.stiffness / (1 + np.exp(-share))).astype(np.float32)
+
+    def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> SpringInputs:
+        static, rates = character.static, character.rates
+        history, course, first = self._given(rest, character, before)
+        still = self.of_still @ np.hstack([rest, static]).T + self.bias
+        pose_sums = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
+        output = evaluate_tail(self.later, still).T
+        output_at_rest = np.ascontiguousarray(output.clip(-MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT))
+        rate_allowance = RATE_ALLOWANCE * np.linalg.norm(rates, axis=1)
+        return SpringInputs(history, pose_sums, course, first, output_at_rest, rate_allowance)
+
+    def _advance(self, inputs: SpringInputs, start: int) -> None:
         z, of_velocity, history = self.config.latent, self.config.velocity_allowance, inputs.history[start:]
-        buffers = [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
+        buffers = self._buffers()
         state = np.zeros(len(self.first), np.float32)
         differences, seen = state[: 2 * z].reshape(2, z), state[2 * z :]
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
@@ -186,6 +238,54 @@ class SpringStepper:
                 clamp_step(own)
                 np.add(own, along, own)
                 np.add(own, rest, new)
+                np.clip(new, -clamp, clamp, new)
+                if cloth:
+                    cloth.keep(new)
+
+
+class VerletStepper(NumpyStepper[StepperInputs]):
+    """Rolls out latents of `Verlet`; arguments as for `SpringStepper`."""
+
+    def __init__(
+        self, config: ModelConfig, parameters: Parameters, static: int, rates: int, points: ClothPoints
+    ) -> None:
+        super().__init__(config, points)
+        self.alpha, self.beta = (as_float32(parameters[f"integrator.{name}"]) for name in ("alpha", "beta"))
+        first, *self.later = layers(parameters, "stepper")
+        blocks = np.cumsum([config.latent] * 2 + [static + rates])
+        of_forward, of_now, self.of_pose, of_seen = np.split(first.weights, blocks, axis=1)
+        self.bias, self.first = first.bias, as_float32(np.hstack([of_forward, of_now, of_seen]).T)
+
+    def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> StepperInputs:
+        history, course, first = self._given(rest, character, before)
+        pose = np.hstack([character.static, character.rates])
+        return StepperInputs(history, as_float32((self.of_pose @ pose.T + self.bias).T), course, first)
+
+    def _advance(self, inputs: StepperInputs, start: int) -> None:
+        z, history, buffers = self.config.latent, inputs.history[start:, 1], self._buffers()
+        state, sums, last = np.zeros(len(self.first), np.float32), buffers[0].sums, self.later[-1].rows
+        forward, newest, seen = state[:z], state[z : 2 * z], state[2 * z :]
+        velocity, added = np.empty(z, np.float32), np.empty(z, np.float32)
+        clamp_step, clamp = SoftClamp(self.config.max_latent_step, (z,)), self.config.latent_bound or np.inf
+        with np.errstate(over="ignore", invalid="ignore"):  # `roll` handles diverged states
+            cloth = inputs.course and SeenCloth(self.points, inputs.course, start, history[:2], seen)
+            for past, now, new, pose_sum in zip(history, history[1:], history[2:], inputs.pose_sums[start:]):
+                np.subtract(now, past, velocity)
+                np.multiply(self.beta, velocity, velocity)
+                np.multiply(self.alpha, now, forward)
+                np.add(forward, velocity, forward)
+                newest[:] = now
+                if cloth:
+                    cloth.look()
+                np.dot(state, self.first, sums)
+                np.add(sums, pose_sum, sums)
+                hidden = buffers[0].activate()
+                for buffer in buffers[1:]:
+                    np.dot(hidden, buffer.rows, buffer.sums)
+                    hidden = buffer.activate()
+                np.dot(hidden, last, added)
+                clamp_step(added)
+                np.add(forward, added, new)
                 np.clip(new, -clamp, clamp, new)
                 if cloth:
                     cloth.keep(new)

@@ -52,6 +52,7 @@ class Contacts:
         samples: of the garment, which are queried; S positions are expected.
         vertices: the body vertices that are posed, all by default.
         pinned: whether pinned cloth collides too. Training, which cannot move them, leaves them out.
+        patches: whether tight cloth touches its patches alone; all of the body otherwise.
     """
 
     def __init__(
@@ -61,14 +62,15 @@ class Contacts:
         *,
         vertices: Ints | None = None,
         pinned: bool = True,
+        patches: bool = True,
         device: torch.device,
     ) -> None:
         body = scene.character.merged_body().mesh
         points, classes = samples.points(scene.garment.mesh.points), samples.classes(scene.classes)
         chosen = np.arange(body.vertex_count) if vertices is None else vertices
-        tight = np.flatnonzero(classes == TIGHT)
-        patches = patches_beneath(points[tight], body, chosen)
-        covered = patches[:, 0] > 0
+        tight = np.flatnonzero(classes == TIGHT)[: None if patches else 0]
+        beneath = patches_beneath(points[tight], body, chosen)
+        covered = beneath[:, 0] > 0
         elsewhere = np.ones(len(points), dtype=bool) if pinned else classes != PINNED
         elsewhere[tight[covered]] = False
 
@@ -81,7 +83,7 @@ class Contacts:
         self._piercing = Piercing(scene, samples, device=device) if len(loose_faces(scene)) else None
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
-            vertices = patches[covered]
+            vertices = beneath[covered]
             faces = faces_around(vertices, topology.faces_among(body, chosen), len(chosen))
             self._groups.append(group(tight[covered], Patches(tensor(vertices.astype(np.int32)), tensor(faces))))
 

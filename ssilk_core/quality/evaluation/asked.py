@@ -23,6 +23,7 @@ class EvaluationOptions:
         simulate: whether it plays the stops as well, to see how it settles.
         solver: whether it simulates from the methods' own states. These three take long on a CPU.
         loop: frames that the first seconds of each clip loop for, at least; none for zero.
+        linearised: states of each split about which a network's steps are linearised, at most; none for zero.
     """
 
     sequence: int | None = None
@@ -32,6 +33,7 @@ class EvaluationOptions:
     simulate: bool = False
     solver: bool = False
     loop: int = 2000
+    linearised: int = 16
 
     def __post_init__(self) -> None:
         if not (self.sequence is None or self.sequence >= 4):
@@ -42,6 +44,8 @@ class EvaluationOptions:
             fail("evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
         if not 0 <= self.loop <= 1_000_000:
             fail("evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
+        if not 0 <= self.linearised <= 10_000:
+            fail("evaluation", f"{self.linearised} states to linearise about", "0 to 10,000 are allowed")
 
 
 @dataclass(frozen=True, eq=False)

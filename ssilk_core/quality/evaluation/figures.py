@@ -147,6 +147,21 @@ class LoopDrift:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ClosedLoop:
+    """Steps of a network, linearised about states of its own rollouts (`closed_loop`).
+
+    Attributes:
+        states: how many.
+        median_radius, max_radius: spectral radius of the map from the two states before a step to those after it
+            [1], its median and the largest; above one a disturbance grows.
+    """
+
+    states: int
+    median_radius: float
+    max_radius: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Figures:
     """One method on one split; means over all frames of all clips.
 
@@ -161,8 +176,8 @@ class Figures:
         static_distance: RMS distance to the method's own static state of each pose [m].
         jerk: RMS jerk over mass and frames [m/s3]; `jerk_ratio`: relative to that of linear blend skinning.
         stretch_quantiles: 50, 95 and 99 % quantiles and the maximum of the larger principal stretch.
-        reference, solver, pose_novelty, settling, minimum, loop_drift: what else was measured, where the method has
-            it.
+        reference, solver, pose_novelty, settling, minimum, loop_drift, closed_loop: what else was measured, where
+            the method has it.
     """
 
     clips: int
@@ -184,6 +199,7 @@ class Figures:
     settling: Settling | None = None
     minimum: MinimumErrors | None = None
     loop_drift: LoopDrift | None = None
+    closed_loop: ClosedLoop | None = None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,9 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
+from ...network.latent_solver import LatentOptions
+from ...network.latent_solver.shots import LatentShots
+from ...network.model.network import GarmentModel
 from ...physics.collision import CollisionBody, Contacts, limb_axes
 from ...physics.constants import GRAVITY
 from ...physics.energy import GarmentEnergy
@@ -147,15 +150,16 @@ def need_takes(takes: Sequence[Take]) -> None:
         fail("clips", "none of four frames or more", "one at least is needed", "name longer ones")
 
 
-class Network:
-    """A recurrent network, rolled over all takes in one batch, each from its static state."""
+class LatentStates:
+    """States of a model over all takes, wherever they come from.
 
-    def __init__(self, model: LatentModel, take_set: TakeSet) -> None:
-        self.model, self.take_set = model, take_set
-        bank = self.take_set.bank
-        self.down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
-        clips = [range(int(start), int(stop)) for start, stop in zip(bank.starts, bank.stops)]
-        self.states = roll_states(model, bank, clips, self.down)
+    Args:
+        states: latents of each take, shape (F, m).
+    """
+
+    def __init__(self, model: LatentModel, take_set: TakeSet, states: Sequence[Tensor]) -> None:
+        self.model, self.take_set, self.states = model, take_set, states
+        self.down = torch.tensor([0.0, -1.0, 0.0], device=take_set.bank.root.device)
 
     @torch.no_grad()
     def vertices(self, take: int, frames: range) -> Tensor:
@@ -167,6 +171,50 @@ class Network:
         bank, index = self.take_set.bank, self.take_set.frames(take, frames)
         quiet = self.model.initial(bank.static_descriptor(index, self.down.expand(len(index), 3)))
         return self.model.vertices(quiet, self.take_set.character(take, frames))
+
+
+class Network(LatentStates):
+    """A recurrent network, rolled over all takes in one batch, each from its static state."""
+
+    def __init__(self, model: LatentModel, take_set: TakeSet) -> None:
+        bank = take_set.bank
+        clips = [range(int(start), int(stop)) for start, stop in zip(bank.starts, bank.stops)]
+        down = torch.tensor([0.0, -1.0, 0.0], device=bank.root.device)
+        super().__init__(model, take_set, roll_states(model, bank, clips, down))
+
+
+class SolvedNetwork(LatentStates):
+    """The solver in a model's latents, over all takes in one batch, each from its static state.
+
+    Args:
+        model: on the device of the takes, and on the character that their motions move.
+        fabric: of its garment.
+        advanced: called after each frame of the longest take.
+
+    Attributes:
+        lost: frames whose energy was not finite, and that the network's static state replaces.
+    """
+
+    model: GarmentModel
+
+    def __init__(
+        self,
+        model: GarmentModel,
+        fabric: Fabric,
+        options: LatentOptions,
+        take_set: TakeSet,
+        advanced: Callable[[], object] = lambda: None,
+    ) -> None:
+        takes = take_set.takes
+        order = sorted(range(len(takes)), key=lambda take: -takes[take].frame_count)
+        states: list[list[Tensor]] = [[] for _ in takes]
+        self.lost = 0
+        for frame in LatentShots(model, fabric, options).frames([takes[take].motion for take in order]):
+            for take, z in zip(order, frame.solution.z.to(take_set.bank.root.dtype)):
+                states[take].append(z)
+            self.lost += int(frame.lost.sum())
+            advanced()
+        super().__init__(model, take_set, [torch.stack(each) for each in states])
 
 
 class LinearBlendSkinning:

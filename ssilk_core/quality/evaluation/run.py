@@ -11,10 +11,20 @@ from typing import Any
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
+from ...network.model.network import GarmentModel
 from .asked import EvaluationClips, EvaluationOptions
-from .figures import Figures, ResultRow, SolverErrors
+from .closed_loop import closed_loop
+from .figures import ClosedLoop, Figures, ResultRow, SolverErrors
 from .measured import MeasuredMethod, Probes
-from .methods import CachedPoints, EvaluatedMethod, EvaluationScene, LinearBlendSkinning, Simulated, need_takes
+from .methods import (
+    CachedPoints,
+    EvaluatedMethod,
+    EvaluationScene,
+    LinearBlendSkinning,
+    Network,
+    Simulated,
+    need_takes,
+)
 from .probes import joined_loop_drift, joined_minimum_errors, joined_settling
 from .solver_errors import solver_errors, windows_of
 from .takes import Take, takes_of
@@ -129,6 +139,7 @@ class _Run:
             pose_novelty=pose_novelty(tally, measured.distances) if measured.distances else None,
             loop_drift=joined_loop_drift(self._probed(method).loops.of(names)),
             solver=self._solver_errors(measured, tally),
+            closed_loop=self._closed_loop(measured, tally),
         )
 
     def _base(self, method: str, split: str) -> Figures:
@@ -182,3 +193,10 @@ class _Run:
             return None
         self.report(Message(f"the solver plays {len(windows)} windows and single steps from the method's own states"))
         return solver_errors(self.dressed, take_set, measured.played, windows, self.report)
+
+    def _closed_loop(self, measured: MeasuredMethod, tally: Tally) -> ClosedLoop | None:
+        """Return the closed loop of single steps on some takes; None but for networks with states of two frames."""
+        method = measured.played
+        if not (isinstance(method, Network) and isinstance(method.model, GarmentModel)):
+            return None
+        return closed_loop(method, list(tally.records), self.options.linearised)

@@ -10,6 +10,7 @@ from typing import Any
 from ...physics.energy import TERMS
 from ...physics.skin.figures import ShownSkin
 from .figures import (
+    ClosedLoop,
     Figures,
     LoopDrift,
     MinimumErrors,
@@ -73,6 +74,7 @@ MINIMUM = ("stops", "static energy excess over minimum [J]", "gravity excess ove
            "maximum static residual [g]")  # fmt: skip
 LOOP_DRIFT = ("clips", "frames", "L_tot of second loop [J]", "L_tot of last loop [J]", "L_tot drift [J]",
               "largest L_tot drift [J]", "RMS distance between loops [mm]")  # fmt: skip
+CLOSED_LOOP = ("states", "spectral radius of a step, median", "largest")
 POSE_NOVELTY = ("distance to training poses, mean [deg]", "95th percentile [deg]", "L_tot, nearest half [J]",
                 "L_tot, furthest tenth [J]")  # fmt: skip
 
@@ -125,6 +127,10 @@ def _loop_drift(f: LoopDrift) -> list[str]:
             f"{f.total_drift:+.2g}", f"{f.max_total_drift:+.2g}", _millimetres(f.loop_distance)]  # fmt: skip
 
 
+def _closed_loop(f: ClosedLoop) -> list[str]:
+    return [str(f.states), f"{f.median_radius:.3f}", f"{f.max_radius:.3f}"]
+
+
 def _pose_novelty(f: PoseNovelty) -> list[str]:
     angles = [f"{degrees(angle):.1f}" for angle in (f.mean_distance, f.p95_distance)]
     return [*angles, f"{f.nearest_half_total:.4g}", f"{f.furthest_tenth_total:.4g}"]
@@ -151,5 +157,6 @@ KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list
     (lambda figures: figures.settling, SETTLING, _settling),
     (lambda figures: figures.minimum, MINIMUM, _minimum),
     (lambda figures: figures.loop_drift, LOOP_DRIFT, _loop_drift),
+    (lambda figures: figures.closed_loop, CLOSED_LOOP, _closed_loop),
     (lambda figures: figures.pose_novelty, POSE_NOVELTY, _pose_novelty),
 )

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ...errors import fail
 from ...network.checkpoint import ModelFile
 from ...scene.assets import PINNED, Floats, ProxyRig, Scene, SkinWeights
 from .shapes import Basis
@@ -26,7 +27,17 @@ def with_weights(file: ModelFile, weights: Floats, gone: list[int]) -> ModelFile
     Args:
         weights: of all joints, shape (V, J + P), zero for those that go.
         gone: combined indices of the proxies that go, none of which carries one that stays.
+
+    Raises:
+        SsilkError: one would go that the model's stepper sees.
     """
+    if gone and file.config.feedback_proxies:
+        fail(
+            file.scene.garment.mesh.path,
+            "a model whose stepper sees its proxies",
+            "none of them can go",
+            "keep all joints, or train with --set feedback_proxies=false",
+        )
     scene, character = file.scene, file.scene.character.skeleton.joint_count
     stays = np.setdiff1d(np.arange(len(scene.parents)), gone)
     skin = SkinWeights.from_dense(scene.rig.path, weights[:, stays])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's integration schemes: by hand numbers, in whole networks, and refused where they are not registered."""
+"""The schemes of the paper's Figure 11: by hand numbers, in whole networks, and refused where not registered."""
 
 import numpy as np
 import pytest
@@ -92,7 +92,7 @@ def test_one_step_of_verlet_goes_no_further_than_allowed():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("scheme", PAPER_SCHEMES)
+@pytest.mark.parametrize("scheme", [*PAPER_SCHEMES, "verlet"])
 @pytest.mark.parametrize("answer", [1e6, float("inf")])
 def test_no_stepper_can_drive_the_state_out_of_its_bound(scheme, answer):
     step = scheme_of(scheme, latent_bound=4.0, max_latent_step=0.3)
@@ -115,7 +115,7 @@ def test_training_starts_from_verlet_without_a_stepper(scene, toy_model):
     np.testing.assert_allclose(stepped, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("scheme", PAPER_SCHEMES)
+@pytest.mark.parametrize("scheme", [*PAPER_SCHEMES, "verlet"])
 def test_networks_roll_as_they_step_and_have_the_parameters_of_their_sizes(scene, toy_model, toy_body, scheme):
     model = toy_model(scene, scheme=scheme)
     found = {name: tuple(value.shape) for name, value in model.state_dict().items()}
@@ -131,7 +131,7 @@ def test_networks_roll_as_they_step_and_have_the_parameters_of_their_sizes(scene
     torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("scheme", PAPER_SCHEMES)
+@pytest.mark.parametrize("scheme", [*PAPER_SCHEMES, "verlet"])
 def test_training_reaches_every_parameter(scene, toy_motion, toy_model, toy_objective, scheme):
     objective = toy_objective(scene, toy_model(scene, scheme=scheme), toy_motion(scene, 50))
     config = TrainConfig(batch=3, window=6, static_batch=6)

@@ -92,6 +92,22 @@ def test_a_sheet_of_two_shots(tmp_path):
     assert size == (3 * 60 + 2 * GAP, 4 * 80 + 3 * GAP)
 
 
+def test_a_sheet_of_chosen_frames(tmp_path):
+    """In one row, each as in a sheet of all frames, and cut from the same camera."""
+    whole, chosen = tmp_path / "whole.png", tmp_path / "chosen.png"
+    sheet_of_shots(whole, [ToyShot()], columns=8, look=SMALL)
+    assert sheet_of_shots(chosen, [ToyShot()], frames=[5, 2], look=SMALL) == 2
+    panels = [np.asarray(Image.open(path)) for path in (whole, chosen)]
+    for place, frame in enumerate((5, 2)):
+        found, expected = (
+            part[:, at * (60 + GAP) : at * (60 + GAP) + 60] for part, at in ((panels[1], place), (panels[0], frame))
+        )
+        np.testing.assert_array_equal(found, expected)
+    for frames in ([], [8], [-1]):
+        with pytest.raises(SsilkError, match="one or more of 0 to 7 are shown"):
+            sheet_of_shots(chosen, [ToyShot()], frames=frames, look=SMALL)
+
+
 def test_a_short_shot_gives_a_short_sheet(tmp_path):
     assert sheet_of_shots(tmp_path / "sheet.png", [ToyShot(frames=1)], look=SMALL) == 1
     assert Image.open(tmp_path / "sheet.png").size == (60, 80)

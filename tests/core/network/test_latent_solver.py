@@ -36,6 +36,7 @@ KINDS = {
     "moving": {"translations": True},
     "reduced": {"activations": 6, "translations": True},
     "no shapes": {"shapes": 0},
+    "no tanh": {"tanh": False},
 }
 
 

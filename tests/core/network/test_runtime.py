@@ -278,8 +278,7 @@ def test_loading_and_playing_load_no_torch(model, motion, tmp_path: Path):
 
 def test_other_schemes_are_refused(scene, toy_model, monkeypatch):
     from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
-    from ssilk_core.network.schemes import SCHEMES
 
-    monkeypatch.setitem(SCHEMES, "verlet", PAPER_SCHEMES["verlet"])
-    with pytest.raises(SsilkError, match="the model's scheme is 'verlet'; the runtime plays 'spring_verlet'"):
-        player_of(toy_model(scene, scale=0.1, scheme="verlet"))
+    monkeypatch.setitem(SCHEMES, "direct", PAPER_SCHEMES["direct"])
+    with pytest.raises(SsilkError, match="scheme is 'direct'; the runtime plays 'spring_verlet', 'verlet'"):
+        player_of(toy_model(scene, scale=0.1, scheme="direct"))

@@ -287,3 +287,13 @@ def test_the_faces_around_a_patch_are_those_with_a_corner_in_it():
         assert set(faces) - {-1} == set(np.flatnonzero(np.isin(shape.faces, row[:size]).any(axis=1)))
     alone = faces_around(np.array([[1, count, count]]), shape.faces, count + 1)
     assert (alone == -1).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"exact": True}, {"surface": False}])
+def test_without_patches_tight_cloth_meets_all_of_the_body(scene, options):
+    dressed, body = on_limb(scene, np.array([THIN + 0.005, 0, 0.01]), TIGHT, plate())
+    x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]
+    pulled, posed = x - torch.tensor([THIN + 0.009, 0, 0])[:, None], still(body, **options)
+    contacts = Contacts(dressed, vertex_samples(len(dressed.classes)), patches=False, device=CPU)
+    for found, expected in zip(contacts.planes(pulled, posed), nearest_planes(pulled, posed)):
+        torch.testing.assert_close(found, expected)

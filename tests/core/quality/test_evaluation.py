@@ -18,6 +18,8 @@ from benchmarks.baselines.evaluation import method_over
 from benchmarks.baselines.networks import METHODS, BaselineConfig, baseline
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Progress, finite
+from ssilk_core.network.latent_solver import LatentOptions
+from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.physics.skin.figures import ShownSkin
@@ -29,10 +31,12 @@ from ssilk_core.quality.evaluation.methods import (
     EvaluationScene,
     LinearBlendSkinning,
     Simulated,
+    SolvedNetwork,
     TakeSet,
     build_take_set,
 )
 from ssilk_core.quality.evaluation.minimum import minima, minimum_errors
+from ssilk_core.quality.evaluation.own_starts import MethodWindow, departures
 from ssilk_core.quality.evaluation.probes import (
     REST_SPEED,
     joined_loop_drift,
@@ -383,6 +387,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     assert model.minimum.static_energy_excess > 0
     assert by_name["LBS", "valid"].settling is None and simulated.settling.stops == 2
     # The training saw 'sway' and not 'slow', which is why the whole is nearer than the part.
+    assert model.closed_loop.states == 12 and by_name["ncs", "valid"].closed_loop is None
     assert model.pose_novelty.mean_distance < by_name["ssilk", "flips"].pose_novelty.mean_distance
     assert model.clip_totals[0] <= model.total <= model.clip_totals[2]
     # Whatever part of the rows is known, the others come out as before, up to the rounding of smaller batches.
@@ -401,7 +406,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 8 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 9 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def leaves(value: object) -> tuple[list[object], list[float]]:
@@ -417,16 +422,25 @@ def leaves(value: object) -> tuple[list[object], list[float]]:
 def test_a_character_that_never_moves_has_no_jerk_to_compare_with(scene, dressed, motion, toy_model):
     frozen = replace(motion, rotations=motion.rotations[[5] * 12], translations=motion.translations[[5] * 12])
     played = EvaluationClips(clips={"frozen": frozen}, splits={"all": ["frozen"]})
-    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
+    rows = list(
+        evaluate(
+            dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0, linearised=0)
+        )
+    )
     assert rows[0].figures.jerk == 0 and math.isnan(rows[1].figures.jerk_ratio) and "nan" in tables(rows)
 
 
 def test_nothing_is_asked_for_nothing_is_computed(scene, dressed, motion, toy_model):
     played = EvaluationClips(clips={"sway": motion}, splits={"all": ["sway"]})
-    rows = list(evaluate(dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0)))
+    rows = list(
+        evaluate(
+            dressed, [evaluated("ssilk", toy_model(scene))], played, EvaluationOptions(stops=0, loop=0, linearised=0)
+        )
+    )
     assert [row.method for row in rows] == ["LBS", "ssilk"]
     found = rows[1].figures
-    assert (found.reference, found.pose_novelty, found.settling, found.loop_drift) == (None, None, None, None)
+    kinds = found.reference, found.pose_novelty, found.settling, found.loop_drift, found.closed_loop
+    assert kinds == (None,) * 5
 
 
 def test_an_index_says_which_clips_are_in_which_split(tmp_path):
@@ -452,12 +466,15 @@ def test_a_written_row_is_read_again_and_what_was_not_finite_is_no_number():
         "garment": "Cape", "method": "ssilk", "split": "valid", "model": "a.safetensors",
         "figures": {"clips": 1, "frames": 2, "terms": {"gravity": None}, "clip_totals": [1, 2.0, None],
                     "stretch_quantiles": [1.0], "shown_skin": skin, **numbers, **others,
-                    "settling": {"stops": 1, "settling_time": None, **stop}},
+                    "settling": {"stops": 1, "settling_time": None, **stop},
+                    "closed_loop": {"states": 3, "median_radius": 0.9, "max_radius": None}},
     }  # fmt: skip
     found = restored(ResultRow, written)
     assert found.figures.shown_skin == ShownSkin(**skin) and found.figures.reference is None
     assert math.isnan(found.figures.settling.settling_time) and found.figures.settling.stops == 1
     assert found.figures.clip_totals[:2] == (1, 2.0) and math.isnan(found.figures.clip_totals[2])
+    loop = found.figures.closed_loop
+    assert (loop.states, loop.median_radius) == (3, 0.9) and math.isnan(loop.max_radius)
     assert math.isnan(found.figures.terms["gravity"]) and found.figures.static_distance is None
     for broken in ({"total": "much"}, {"clips": None}, {"shown_skin": {}}):
         with pytest.raises((TypeError, KeyError)):
@@ -484,6 +501,7 @@ def test_a_malformed_index_is_refused(tmp_path, text):
         ({"hold": 0.0}, "a hold of 0 s"),
         ({"hold": math.nan}, "a hold of nan s"),
         ({"loop": -5}, "loops of -5 frames"),
+        ({"linearised": -1}, "-1 states to linearise about"),
     ],
 )
 def test_options_out_of_range_are_refused(options, complaint):
@@ -529,3 +547,41 @@ def test_windows_begin_with_a_take_and_with_its_most_violent_second(dressed, sce
     windows = windows_of(dressed, build_take_set([take], dressed, JOINTS), [0])
     assert windows[0] == (0, range(62))
     assert 65 <= windows[1][1].start <= 85
+
+
+def test_departures_are_those_of_cloth_that_leaves_the_simulation(scene, dressed, toy_motion):
+    """A method that follows its own simulation, then is moved by steps of a millimetre; windows of two lengths."""
+    take_set = build_take_set(takes_of("sway", toy_motion(scene, 12), FPS), dressed, JOINTS)
+    simulated = Simulated(dressed, take_set)
+    windows = [MethodWindow(dressed, take_set, simulated, (0, frames)) for frames in (range(9), range(3, 8))]
+    for window in windows:
+        window.x = window.x + 1e-3 * torch.arange(-1, len(window.x) - 1).clamp_min(0)[:, None, None] / 3**0.5
+    counts: list[int] = []
+    found = departures(dressed.simulator, windows, dressed.energy.mass, counts.append)
+    assert counts == [2, 2, 2, 1, 1, 1, 1]
+    expected = torch.arange(1, 8) * 1e-3
+    np.testing.assert_allclose(found.position[:, 0].sqrt(), expected, rtol=0.05)
+    np.testing.assert_allclose(found.position[:3, 1].sqrt(), expected[:3], rtol=0.05)
+    np.testing.assert_allclose(found.velocity[:, 0].sqrt(), torch.full((7,), 1e-3), rtol=0.1)
+    assert found.position[3:, 1].isnan().all() and found.position_after(8).isnan().all()
+    assert torch.equal(found.position_after(3), found.position[2])
+
+
+def test_solved_latents_are_a_method(scene, dressed, toy_motion, toy_model):
+    """Over takes of two lengths at once, each as it is solved alone, and lower in energy than the network."""
+    model, fabric, options = toy_model(scene), dressed.fabric, LatentOptions(iterations=4)
+    takes = [Take("short", 0, toy_motion(scene, 5)), Take("long", 0, toy_motion(scene, 7, speed=2.0))]
+    take_set, ticks = build_take_set(takes, dressed, JOINTS), []
+    solved = SolvedNetwork(model, fabric, options, take_set, lambda: ticks.append(1))
+    assert [len(states) for states in solved.states] == [5, 7] and len(ticks) == 7 and solved.lost == 0
+    for number, take in enumerate(takes):
+        alone = list(LatentShots(model, fabric, options).frames([take.motion]))
+        points = torch.cat([frame.solution.x for frame in alone], dim=-1)
+        roots = torch.as_tensor(take.motion.translations[:, 0] - take.motion.translations[0, 0]).T
+        found = solved.vertices(number, range(take.frame_count))
+        np.testing.assert_allclose(found, points + roots, atol=2e-3)
+    energies = [
+        sum(recorded(dressed, take_set, method, 1).values[name].mean() for name in TERMS)
+        for method in (solved, method_over(model, take_set))
+    ]
+    assert energies[0] < energies[1]

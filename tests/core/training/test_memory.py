@@ -94,6 +94,8 @@ def test_the_larger_phase_counts():
 
 def test_what_fits_is_left_as_it_is(scene):
     assert StepMemory(scene, MODEL, 1000, 200).fitting_batch(CONFIG, 1 << 40) == (32, 700)
+    moving = replace(CONFIG, static_fraction=0.0, batch=2)  # no step decodes the 700
+    assert StepMemory(scene, MODEL, 1000, 200).fitting_batch(moving, 1 << 40) == (2, 700)
 
 
 @pytest.mark.parametrize("megabytes", [450, 600, 900])
