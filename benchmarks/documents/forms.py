@@ -10,6 +10,9 @@ from math import floor, log10
 from pathlib import Path
 from typing import Any
 
+from ssilk_core.errors import fail
+from ssilk_core.quality.evaluation.results import UNFINISHED
+
 RESULTS = Path(__file__).parents[1] / "results"
 GARMENTS = {"cape": "cape", "fringe_skirt": "fringe skirt", "hooded_dress": "hooded dress"}
 """Garments that ship: the names of their files, and those that tables show."""
@@ -17,8 +20,16 @@ GARMENTS = {"cape": "cape", "fringe_skirt": "fringe skirt", "hooded_dress": "hoo
 
 @cache
 def document(name: str) -> Any:
-    """Return a result file as it is."""
-    return json.loads((RESULTS / f"{name}.json").read_text())
+    """Return a result file as it is.
+
+    Raises:
+        SsilkError: 'ssilk evaluate' has not finished it.
+    """
+    path = RESULTS / f"{name}.json"
+    found = json.loads(path.read_text())
+    if UNFINISHED in found:
+        fail(path.name, "this evaluation is unfinished", "tables are made of finished ones", "finish it")
+    return found
 
 
 def result(name: str) -> Any:

@@ -14,7 +14,7 @@ from ssilk_core.cli import evaluate as verb
 from ssilk_core.cli.main import parser
 from ssilk_core.errors import fail
 from ssilk_core.events import silent
-from ssilk_core.quality.evaluation.run import EvaluationOptions
+from ssilk_core.quality.evaluation.asked import EvaluationOptions
 from ssilk_core.quality.evaluation.tables import tables
 
 from .records import Row, Settings, read_records, settings_of
@@ -49,8 +49,8 @@ def evaluated(options: argparse.Namespace, *, probes: bool = False) -> tuple[lis
         asked = EvaluationOptions(
             sequence=options.sequence, minimum=options.minimum, simulate=options.simulate_stops, loop=options.loop
         )
-    rows, found = verb.evaluated(command, asked, open_network, silent, exact=options.exact)
-    return found, tables(rows)
+    results = verb.evaluated(command, asked, open_network, silent, exact=options.exact)
+    return results.figures, tables([row for _, row in results.rows])
 
 
 @dataclass(frozen=True, eq=False)

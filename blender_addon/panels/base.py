@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Functions and the base class that all panels share."""
+"""Functions and base classes that panels share."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import bpy
 from ssilk_core.errors import SsilkError
 
 from ..operators import tasks
+from ..scene.garment import unusable
 
 LETTER = 7  # how wide a letter is on average [pixels, at an interface scale of one]
 MARGIN = 40  # beside text in a panel [pixels, likewise]
@@ -81,3 +82,11 @@ class SidebarPanel:
     def draw_header_preset(self, _: bpy.types.Context) -> None:
         """Draw a button that opens the guide, at the right end of the panel's header."""
         self.layout.operator("ssilk.open_guide", text="", icon="HELP", emboss=False).section = self.section
+
+
+class UsableGarmentPanel(SidebarPanel):
+    """Base of the panels that are there for a garment alone, and not for one that cannot be used."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unusable(context.object)

@@ -13,11 +13,10 @@ from ..arrays.classes import COLORS, LEVELS, adrift, counts
 from ..errors import SetupError
 from ..operators.classes import CHOICES
 from ..scene.classes import current_classes, is_chosen
-from ..scene.garment import unusable
 from ..scene.meshes import rest_points, triangles_of
 from ..scene.overlay import shown
 from ..scene.stitched import unstitched
-from .base import SidebarPanel, draw_text, saying_errors
+from .base import UsableGarmentPanel, draw_text, saying_errors
 
 _adrift: tuple[object, int] = (None, 0)  # what was looked at last, and what was found
 
@@ -63,14 +62,10 @@ def class_counts(thing: bpy.types.Object) -> tuple[int, int, int] | None:
     return None if values is None else counts(values)
 
 
-class ClassesPanel(SidebarPanel, bpy.types.Panel):
+class ClassesPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_classes"
     bl_label = "Classes"
     section = "3-classes"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

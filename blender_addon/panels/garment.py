@@ -11,7 +11,7 @@ from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
 from ..scene.garment import armature_of, garments_of, unusable
-from .base import SidebarPanel, draw_text, draw_work, saying_errors
+from .base import SidebarPanel, UsableGarmentPanel, draw_text, draw_work, saying_errors
 from .training import draw_bar
 
 
@@ -87,16 +87,12 @@ MEMBRANE = {"stvk": ("lame_mu", "lame_lambda"), "baraff_witkin": ("stretch", "sh
 CONTACT = {"surface": ("contact", "loose_contact"), "vertex": ("collision",)}  # likewise
 
 
-class FabricPanel(SidebarPanel, bpy.types.Panel):
+class FabricPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_fabric"
     bl_label = "Fabric"
     section = "2-garment"
     bl_parent_id = "SSILK_PT_garment"
     bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

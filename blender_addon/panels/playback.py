@@ -7,8 +7,7 @@ import bpy
 
 from ..playback import playing
 from ..playback.models import no_model
-from ..scene.garment import unusable
-from .base import SidebarPanel, draw_text, saying_errors
+from .base import UsableGarmentPanel, draw_text, saying_errors
 
 
 def live_line(garment: bpy.types.Object) -> str:
@@ -21,14 +20,10 @@ def live_line(garment: bpy.types.Object) -> str:
     return "The motion changed since it was read" if played.stale else "Follows the armature"
 
 
-class PlaybackPanel(SidebarPanel, bpy.types.Panel):
+class PlaybackPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_playback"
     bl_label = "Live Playback"
     section = "7-look"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
@@ -49,14 +44,10 @@ def model_line(garment: bpy.types.Object) -> str:
     return no_model(garment) or own
 
 
-class BakingPanel(SidebarPanel, bpy.types.Panel):
+class BakingPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
     section = "6-bake"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

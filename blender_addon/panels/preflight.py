@@ -10,9 +10,8 @@ from ssilk_core.events import format_count
 from ..operators.preflight import fixer
 from ..quality.heat import PUSHED_OUT
 from ..quality.repairs import DISPLACEMENT
-from ..scene.garment import unusable
 from ..settings.preflight import shown_finding
-from .base import SidebarPanel, draw_text, saying_errors
+from .base import UsableGarmentPanel, draw_text, saying_errors
 
 ICONS = {"error": "CANCEL", "warning": "ERROR", "info": "INFO"}
 
@@ -24,15 +23,11 @@ class FindingList(bpy.types.UIList):
         layout.label(text=sentence(line(item)), icon=ICONS.get(item.severity, "INFO"), translate=False)
 
 
-class PreflightPanel(SidebarPanel, bpy.types.Panel):
+class PreflightPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_preflight"
     bl_label = "Preflight"
     section = "2-garment"
     bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

@@ -8,8 +8,7 @@ import bpy
 from ..quality.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..quality.lbs_copy import find_copy
 from ..quality.repairs import DISPLACEMENT
-from ..scene.garment import unusable
-from .base import SidebarPanel, draw_text, saying_errors
+from .base import UsableGarmentPanel, draw_text, saying_errors
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -19,15 +18,11 @@ def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
     row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
 
 
-class QualityPanel(SidebarPanel, bpy.types.Panel):
+class QualityPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_quality"
     bl_label = "Quality"
     section = "7-look"
     bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

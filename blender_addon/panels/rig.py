@@ -9,8 +9,8 @@ from ..arrays.classes import counts
 from ..errors import SetupError
 from ..scene.armature import proxy_names
 from ..scene.classes import current_classes
-from ..scene.garment import armature_of, unusable
-from .base import SidebarPanel, draw_text, saying_errors
+from ..scene.garment import armature_of
+from .base import UsableGarmentPanel, draw_text, saying_errors
 
 
 def rig_line(garment: bpy.types.Object) -> str:
@@ -27,14 +27,10 @@ def rig_line(garment: bpy.types.Object) -> str:
     return f"No proxies yet on '{armature.name}'"
 
 
-class RigPanel(SidebarPanel, bpy.types.Panel):
+class RigPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_rig"
     bl_label = "Proxy Rig"
     section = "4-proxy-rig"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:

@@ -12,8 +12,8 @@ from ..outside.jobs import JobState
 from ..outside.training_report import findings, progress
 from ..playback.models import TrainingProgress, progress_of
 from ..scene.armature import proxy_names
-from ..scene.garment import armature_of, unusable
-from .base import SidebarPanel, draw_text, saying_errors
+from ..scene.garment import armature_of
+from .base import UsableGarmentPanel, draw_text, saying_errors
 from .plot import plot, swatch
 
 ICONS = {"TIMELINE": "TIME", "ACTION": "ACTION", "STRIP": "NLA", "FILE": "FILE"}
@@ -96,14 +96,10 @@ def draw_energies(layout: bpy.types.UILayout, training: TrainingProgress) -> Non
         layout.label(text=f"{name.capitalize()}: {values[-1, 1]:.3g} J", icon_value=swatch(index), translate=False)
 
 
-class TrainingPanel(SidebarPanel, bpy.types.Panel):
+class TrainingPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_training"
     bl_label = "Training"
     section = "5-train"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return not unusable(context.object)
 
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
@@ -119,7 +115,7 @@ class TrainingPanel(SidebarPanel, bpy.types.Panel):
             draw_training(layout, training, moves=has_proxies(garment))
 
 
-class EnergiesPanel(SidebarPanel, bpy.types.Panel):
+class EnergiesPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_energies"
     bl_label = "Energies"
     section = "5-train"
@@ -128,7 +124,7 @@ class EnergiesPanel(SidebarPanel, bpy.types.Panel):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        training = None if unusable(context.object) else progress_of(context.object)
+        training = progress_of(context.object) if super().poll(context) else None
         return bool(training and training.state)
 
     @saying_errors

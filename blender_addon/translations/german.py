@@ -344,6 +344,10 @@ WORDS = {
     "For many characters, far away: few shapes and proxies, four influences": (
         "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
+    "Latent": "Latent",
+    "The model's own bones and shapes, with motion from a solver; takes a while": (
+        "Knochen und Formen des Modells selbst, Bewegung von einem Löser; dauert eine Weile"
+    ),
     "Hero": "Hauptfigur",
     "Carried on by a solver, on bones and shape keys of this shot's own; takes long": (
         "Von einem Löser weitergeführt, auf Knochen und eigenen Formschlüsseln dieses Shots; dauert lange"

@@ -18,6 +18,20 @@ if TYPE_CHECKING:
 OPEN = 4  # shots at once; clips are read one after the other
 
 
+def shots(folder: Path, garment: str) -> dict[str, Path]:
+    """Return the files of a garment's shots by clip: in its own subfolder, where there is one.
+
+    Raises:
+        SsilkError: there is no such folder.
+    """
+    from ssilk_usd.opening.stage import LAYER_SUFFIXES
+
+    if not folder.is_dir():
+        fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate --points' is needed")
+    within = folder / garment if (folder / garment).is_dir() else folder
+    return {path.stem: path for path in sorted(within.iterdir()) if path.suffix in LAYER_SUFFIXES}
+
+
 class References:
     """Shots of one garment, named after their clips, in a folder or in its subfolder named after the garment.
 
@@ -31,12 +45,7 @@ class References:
         Raises:
             SsilkError: there is no such folder.
         """
-        from ssilk_usd.opening.stage import LAYER_SUFFIXES
-
-        if not folder.is_dir():
-            fail(str(folder), "there is no such folder", "one with shots of 'ssilk simulate --points' is needed")
-        within = folder / garment if (folder / garment).is_dir() else folder
-        self._paths = {path.stem: path for path in sorted(within.iterdir()) if path.suffix in LAYER_SUFFIXES}
+        self._paths = shots(folder, garment)
         self.vertex_count, self.fps = vertex_count, fps
         self._shot = lru_cache(OPEN)(self._opened)
 

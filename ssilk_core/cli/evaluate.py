@@ -10,30 +10,31 @@ about states of rollouts: a disturbance of the two states before a step should n
 map from these to the next two should stay under one. --no-probes leaves them out.
 --solver continues the first two states of each clip, and of its most violent second, with the reference simulator. It
 tells how far the garment is from that after 5, 10, 30 and 60 frames, and what single steps from its own past miss.
+--output writes each row when it is measured, and says that it is unfinished until the last. The same command, given
+again, goes on from there. A file of other models, motions or settings is begun anew.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result, Started, finite
-from ..files import replacing
+from ..events import Message, Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
     import torch
 
     from ..network.checkpoint import ModelFile
+    from ..quality.evaluation.asked import EvaluationClips, EvaluationOptions
     from ..quality.evaluation.methods import EvaluatedMethod, EvaluationScene, Method, TakeSet
-    from ..quality.evaluation.run import EvaluationClips, EvaluationOptions, ResultRow
+    from ..quality.evaluation.results import EvaluationResults
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -57,7 +58,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
-    from ..quality.evaluation.run import EvaluationOptions
+    from ..quality.evaluation.asked import EvaluationOptions
     from ..quality.evaluation.tables import tables
 
     if options.output:
@@ -66,12 +67,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         shared.check_output(options.output, *options.models, options.index)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
-    rows, found = evaluated(options, asked, open_model, report)
-    if options.output:
-        _write(options, asked, found)
+    results = evaluated(options, asked, open_model, report)
     if not options.json:
-        print(tables(rows))
-    report(Result("evaluate", {"figures": found} if options.json else {}))
+        print(tables([row for _, row in results.rows]))
+    report(Result("evaluate", {"figures": results.figures} if options.json else {}))
     return EXIT_OK
 
 
@@ -87,8 +86,12 @@ class OpenedModel:
     @property
     def garment(self) -> tuple[object, ...]:
         """What models must share to be measured on the same takes: mesh, fabric and rate."""
-        mesh = self.file.scene.garment.mesh
-        return mesh.path.rpartition("/")[2], mesh.points.tobytes(), self.file.fabric, self.file.config.fps
+        return self.prim, self.file.scene.garment.mesh.points.tobytes(), self.file.fabric, self.file.config.fps
+
+    @property
+    def prim(self) -> str:
+        """Name of the garment's prim."""
+        return self.file.scene.garment.mesh.path.rpartition("/")[2]
 
 
 Opener = Callable[[Path, "torch.device"], OpenedModel]
@@ -106,28 +109,34 @@ def open_model(path: Path, device: torch.device) -> OpenedModel:
 
 def evaluated(
     options: argparse.Namespace, asked: EvaluationOptions, opener: Opener, report: Reporter, *, exact: bool = False
-) -> tuple[list[ResultRow], list[dict[str, Any]]]:
-    """Evaluate the models that options name; return the rows, and the same as files hold them.
+) -> EvaluationResults:
+    """Evaluate the models that options name, and write their output where they name one.
 
     Args:
         exact: see `evaluation.methods.EvaluationScene`.
     """
     from ..devices import select_device
+    from ..quality.evaluation.results import GO_ON
     from ..quality.evaluation.run import evaluate
 
     device = select_device(options.device)
-    opened = [opener(path, device) for path in options.models]
-    rows: list[ResultRow] = []
-    found: list[dict[str, Any]] = []
+    opened, listed = [opener(path, device) for path in options.models], _listed(options)
+    results = _results(options, asked, opened, listed)
+    known = results.known(report)
     for models in _by_garment(opened):
         dressed, methods = _dressed(models[0].file, options, device, exact), _methods(models)
-        playlist = _playlist(options, dressed)
+        playlist = _playlist(options, dressed, listed)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
-        for row in evaluate(dressed, methods, playlist, asked, report):
-            rows.append(row)
-            found.append({"model": paths.get(row.method), **asdict(row)})
-    return rows, found
+        try:
+            for row in evaluate(dressed, methods, playlist, asked, report, known[len(results.rows) :]):
+                results.add(paths.get(row.method), row)
+        except KeyboardInterrupt:
+            if options.output and results.rows:
+                report(Message(f"{options.output}: {len(results.rows)} rows are kept; other {GO_ON}"))
+            raise
+    results.finish()
+    return results
 
 
 def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
@@ -142,8 +151,12 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     """Return the methods of one garment, named after their files where several have one name."""
     from ..quality.evaluation.methods import EvaluatedMethod
 
-    count = Counter(one.name for one in models)
-    names = [one.name if count[one.name] == 1 else f"{one.name} ({one.path.stem})" for one in models]
+    names = [one.name for one in models]
+    for told in (lambda path: path.stem, lambda path: path.with_suffix("")):
+        count = Counter(names)
+        names = [
+            name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)
+        ]
     return [EvaluatedMethod(name, one.file.joints, one.on) for name, one in zip(names, models)]
 
 
@@ -158,31 +171,38 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device,
     return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact)
 
 
-def _playlist(options: argparse.Namespace, dressed: EvaluationScene) -> EvaluationClips:
+@dataclass(frozen=True)
+class ListedClips:
+    """Names of clips by split, the files of the clips by name, and the motions of the training."""
+
+    splits: dict[str, list[str]]
+    files: dict[str, Path]
+    seen: list[Path]
+
+
+def _playlist(options: argparse.Namespace, dressed: EvaluationScene, listed: ListedClips) -> EvaluationClips:
     """Read the clips that options name, and find the simulator's shots of them."""
     from ssilk_usd.reading.motion import read_motion, read_motions
 
-    from ..quality.evaluation.run import EvaluationClips
+    from ..quality.evaluation.asked import EvaluationClips
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
-    splits, files, seen = _splits(options)
-    names = dict.fromkeys(name for split in splits.values() for name in split)
     reference = None
     if options.reference:
         vertices = dressed.scene.garment.mesh.vertex_count
         reference = References(options.reference, dressed.name, vertices, dressed.fps)
     return EvaluationClips(
-        clips={name: read_motion(files[name], skeleton) for name in names},
-        splits=splits,
-        simulated=reference.clips & names.keys() if reference else frozenset(),
+        clips={name: read_motion(path, skeleton) for name, path in listed.files.items()},
+        splits=listed.splits,
+        simulated=reference.clips & listed.files.keys() if reference else frozenset(),
         read=reference.read if reference else None,
-        seen=read_motions(seen, skeleton),
+        seen=read_motions(listed.seen, skeleton),
     )
 
 
-def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str, Path], list[Path]]:
-    """Return the names of clips by split, their files, and the motions of the training."""
+def _listed(options: argparse.Namespace) -> ListedClips:
+    """Find the clips that options name."""
     from ssilk_usd.reading.motion import motion_files
 
     from ..quality.evaluation.splits import SPLITS, chosen, read_index, splits_of
@@ -195,33 +215,67 @@ def _splits(options: argparse.Namespace) -> tuple[dict[str, list[str]], dict[str
     splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}
     if not splits:
         fail(str(options.index), f"no clip of {', '.join(SPLITS)} is chosen", "one at least is needed")
-    missing = sorted({name for names in splits.values() for name in names} - files.keys())
+    names = dict.fromkeys(name for split in splits.values() for name in split)
+    missing = sorted(names.keys() - files.keys())
     if missing:
         fail(
             str(folder),
             f"{len(missing)} clips are missing ({', '.join(missing[:3])})",
             f"it holds {', '.join(list(files)[:3])} and so on",
         )
-    return splits, files, [files[name] for name in chosen(index, "train") if name in files]
+    seen = [files[name] for name in chosen(index, "train") if name in files]
+    return ListedClips(splits, {name: files[name] for name in names}, seen)
 
 
-def _write(options: argparse.Namespace, asked: EvaluationOptions, rows: list[dict[str, Any]]) -> None:
-    """Write the figures with their provenance."""
+def _results(
+    options: argparse.Namespace, asked: EvaluationOptions, opened: Sequence[OpenedModel], listed: ListedClips
+) -> EvaluationResults:
+    """Return the results to write, with their provenance; their inputs are told by content, wherever they lie."""
     import torch
 
     from .. import __version__
+    from ..delivery.bake.inputs import stage_contents
     from ..devices import device_name, select_device
     from ..files import sha256
+    from ..quality.evaluation.results import EvaluationResults
+    from ._reference import shots
 
-    document = {
-        "units": "SI",
-        "models": {str(path): sha256(path) for path in options.models},
-        "stage": {str(options.stage): sha256(options.stage)},
-        "reference": options.reference and str(options.reference),
-        "options": {**asdict(asked), "clips": options.clips},
-        "hardware": device_name(select_device(options.device)),
-        "versions": {"ssilk": __version__, "torch": torch.__version__},
-        "figures": rows,
-    }
-    with replacing(options.output) as temporary:
-        temporary.write_text(json.dumps(finite(document), indent=1, allow_nan=False) + "\n")
+    if not options.output:
+        return EvaluationResults(None, {}, {})
+    models, stage = [sha256(path) for path in options.models], stage_contents(str(options.stage))
+    garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
+    simulated = {name: shots(options.reference, name) for name in garments}
+    settings = {**asdict(asked), "clips": options.clips, "root": options.root}
+    hardware = device_name(select_device(options.device))
+    versions = {"ssilk": __version__, "torch": torch.__version__}
+
+    def contents(paths: Iterable[Path]) -> list[str]:
+        return [stage_contents(str(path)).digest for path in paths]
+
+    return EvaluationResults(
+        options.output,
+        {
+            "units": "SI",
+            "models": dict(zip(map(str, options.models), models)),
+            "stage": {str(options.stage): stage.first},
+            "reference": options.reference and str(options.reference),
+            "options": settings,
+            "hardware": hardware,
+            "versions": versions,
+        },
+        {
+            "models": list(zip((path.stem for path in options.models), models)),
+            "stage": stage.digest,
+            "motions": dict(zip(listed.files, contents(listed.files.values()))),
+            "splits": listed.splits,
+            "motions of the training": contents(listed.seen),
+            "simulated shots": {
+                name: dict(zip(used, contents(files[clip] for clip in used)))
+                for name, files in simulated.items()
+                if (used := [clip for clip in files if clip in listed.files])
+            },
+            "options": settings,
+            "hardware": hardware,
+            "versions": versions,
+        },
+    )

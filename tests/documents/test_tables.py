@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
+
+from ssilk_core.errors import SsilkError
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -51,6 +55,14 @@ def test_a_table_that_does_not_exist_is_named(tables, copied, capsys):
     (copied / "README.md").write_text("<!-- table: nowhere -->\n<!-- end -->\n")
     assert tables.main(["--check"], copied) == 2
     assert "'nowhere'" in capsys.readouterr().err
+
+
+def test_an_unfinished_evaluation_makes_no_table(tables, tmp_path, monkeypatch):
+    unfinished = {"unfinished": "rows are missing", **json.loads((RESULTS / "evaluate_cape.json").read_text())}
+    (tmp_path / "evaluate_cape.json").write_text(json.dumps(unfinished))
+    monkeypatch.setattr(sys.modules["documents.forms"], "RESULTS", tmp_path)
+    with pytest.raises(SsilkError, match=r"evaluate_cape.json: this evaluation is unfinished"):
+        tables.TABLES["rest"]()
 
 
 def test_every_table_is_shown(tables):

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 
 import pytest
 from pxr import Usd
 
 from ssilk_core.cli import main
 from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.quality.evaluation.record import recorded
 
 WORLD = "--stage rigged.usda --motions clips"
 QUICK = f"{WORLD} --no-probes"
@@ -49,6 +52,100 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
     assert {row["garment"] for row in document["figures"]} == {"Skirt"} and found["loop_drift"]["clips"] == 1
     assert found["settling"]["stops"] == document["options"]["stops"] == 2
     assert 0 < found["closed_loop"]["median_radius"] <= found["closed_loop"]["max_radius"]
+
+
+@pytest.fixture
+def stopped(world, monkeypatch, capsys):
+    """figures.json of a run that was stopped after a row; return its command, and the takes measured since."""
+    words, measured, out = f"{WORLD} --index index.json -o figures.json", [], world / "figures.json"
+
+    def interrupted(*args):
+        if out.exists() and not measured:
+            raise KeyboardInterrupt
+        return recorded(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ssilk_core.quality.evaluation.measured.recorded", interrupted)
+        assert evaluated(words) == 130
+    assert "figures.json: 2 rows are kept; other rows are missing; the same command" in capsys.readouterr().err
+
+    def counted(*args):
+        measured.append(args)
+        return recorded(*args)
+
+    monkeypatch.setattr("ssilk_core.quality.evaluation.measured.recorded", counted)
+    return words, measured
+
+
+def test_a_run_that_was_stopped_goes_on(world, stopped, capsys):
+    """Its file says that it is unfinished, and the rest of the rows make it what an uninterrupted run writes."""
+    words, measured = stopped
+    path = world / "figures.json"
+    begun = json.loads(path.read_text())
+    assert [(row["method"], row["split"]) for row in begun["figures"]] == [("LBS", "valid"), ("LBS", "inertia")]
+    assert "the same command, given again" in begun["unfinished"]
+    assert main(["report", "model.safetensors", "--figures", "figures.json", "-o", "report.html"]) == 0
+    assert "<h2>Evaluation, unfinished</h2>" in (world / "report.html").read_text()
+
+    (world / "elsewhere").mkdir()
+    (world / "elsewhere" / "model.safetensors").write_bytes((world / "model.safetensors").read_bytes())
+    capsys.readouterr()
+    assert main(["evaluate", "elsewhere/model.safetensors", *words.split(), "--json"]) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    said = [event["text"] for event in events if event["event"] == "message"]
+    assert said == ["figures.json: 2 rows were measured before and are taken over; the others are measured"]
+    progress = [(event["done"], event["total"]) for event in events if event["event"] == "progress"]
+    assert progress == [(2, 4), (3, 4), (4, 4)] and len(measured) == 3
+    document = json.loads(path.read_text())
+    assert "unfinished" not in document and document["figures"] == events[-1]["detail"]["figures"]
+
+    assert evaluated(words.replace("figures.json", "whole.json")) == 0
+    whole = json.loads((world / "whole.json").read_text())
+    assert {**document, "models": whole["models"]} == {
+        **whole,
+        "figures": [{**row, "model": row["model"] and "elsewhere/model.safetensors"} for row in whole["figures"]],
+    }
+
+
+def test_a_finished_file_is_taken_over_as_a_whole(world, stopped, capsys):
+    words, measured = stopped
+    assert evaluated(words) == 0
+    shown, written, count = capsys.readouterr().out, (world / "figures.json").read_bytes(), len(measured)
+    assert evaluated(words) == 0
+    again = capsys.readouterr()
+    assert again.out == shown and "6 rows were measured before and are taken over; it is complete" in again.err
+    assert (world / "figures.json").read_bytes() == written and len(measured) == count
+
+
+@pytest.mark.parametrize(
+    ("change", "other"),
+    [
+        (lambda world: (world / "index.json").write_text(json.dumps(INDEX[:1])), "motions, splits"),
+        (lambda world: (world / "clips" / "turn.usda").write_bytes((world / "clips" / "brief.usda").read_bytes()),
+         "motions"),
+        (lambda world: _renoted(world / "model.safetensors"), "models"),
+    ],
+)  # fmt: skip
+def test_a_file_of_other_inputs_is_begun_anew(world, stopped, capsys, change, other):
+    words, _ = stopped
+    change(world)
+    assert evaluated(words) == 0
+    assert f"warning: figures.json: begun anew, its figures are of other {other}\n" in capsys.readouterr().err
+    assert "unfinished" not in json.loads((world / "figures.json").read_text())
+
+
+def test_a_file_of_something_else_stays(world, capsys):
+    for text in ('{"points": []}', '{"figures": [{"garment": "Skirt"}]}', "[]", "{"):
+        (world / "figures.json").write_text(text)
+        assert evaluated(f"{QUICK} -o figures.json") == 2
+        assert "figures.json: not figures of 'ssilk evaluate'" in capsys.readouterr().err
+        assert (world / "figures.json").read_text() == text
+
+
+def _renoted(path) -> None:
+    """Change the metadata of a model, and nothing that it computes."""
+    file = load_model(path)
+    save_model(path, replace(file, provenance={**file.provenance, "note": "again"}))
 
 
 def test_poses_of_the_index_that_were_trained_on_are_near(world, capsys):
@@ -106,6 +203,19 @@ def test_several_models_of_a_garment_share_its_table(world, capsys):
     assert evaluated(f"again.safetensors {QUICK} --clips brief") == 0
     lines = [line.split("|")[3].strip() for line in capsys.readouterr().out.split("\n\n")[0].splitlines()[2:]]
     assert lines == ["LBS", "ssilk (model)", "ssilk (again)"]
+
+
+def test_models_whose_files_have_one_name_are_told_apart_and_given_twice_refused(world, capsys):
+    (world / "other").mkdir()
+    file = load_model(world / "model.safetensors")
+    halved = {name: (0.5 * value).astype(value.dtype) for name, value in file.parameters.items()}
+    save_model(world / "other" / "model.safetensors", replace(file, parameters=halved))
+    assert evaluated(f"other/model.safetensors {QUICK} --clips brief --json") == 0
+    event = json.loads(capsys.readouterr().out.splitlines()[-1])
+    totals = {row["method"]: row["figures"]["total"] for row in event["detail"]["figures"]}
+    assert [*totals] == ["LBS", "ssilk (model)", "ssilk (other/model)"] and len({*totals.values()}) == 3
+    assert evaluated(f"model.safetensors {QUICK} --clips brief") == 2
+    assert "several methods are called ssilk (model)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

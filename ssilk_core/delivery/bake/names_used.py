@@ -37,16 +37,34 @@ def write_use(folder: Path, garment: str, use: GarmentUse) -> None:
     Raises:
         SsilkError: the file cannot be written.
     """
-    if read_use(folder, garment) == use:
+    if _stated(_place(folder, garment)) == use:
         return
     with replacing(_place(folder, garment)) as temporary:
         temporary.write_text(json.dumps(asdict(use), indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read_use(folder: Path, garment: str) -> GarmentUse | None:
-    """Return what a garment was baked from; None where no file says so, or it is damaged."""
+    """Return what a garment was baked from; None where no file says so, and the name is free.
+
+    Raises:
+        SsilkError: the file is damaged.
+    """
+    path = _place(folder, garment)
+    found = _stated(path)
+    if found is None and path.exists():
+        fail(
+            str(path),
+            f"it does not tell what the garment '{garment}' was baked from",
+            "a name stays with its input",
+            "name this garment with --garment-name, or use the name all the same with --replace",
+        )
+    return found
+
+
+def _stated(path: Path) -> GarmentUse | None:
+    """Return what a file says; None where there is none, or it is damaged."""
     try:
-        return from_plain(GarmentUse, json.loads(_place(folder, garment).read_text(encoding="utf-8")))
+        return from_plain(GarmentUse, json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError, RecursionError):
         return None
 
@@ -97,11 +115,12 @@ class UsedNames:
         """Raise `SsilkError` where the names of a task were used for another motion, model or SkelRoot, or where it
         would replace a garment of which no record tells what it was baked from."""
         request, shot = task.request, self._shot(task.shot)
-        motions = [record.inputs["motion"] for record in shot.values() if record and "motion" in record.inputs]
+        motions = [record.inputs["motion"] for record in shot.values() if record]
         for motion in motions:
             if not self._same(motion, request.motion, stage_contents):
                 self._fail("shot", task.shot, motion.path, request.motion)
-        used = _use(shot.get(task.garment)) or self._garment(task.garment)
+        own = shot.get(task.garment)
+        used = GarmentUse(own.inputs["model"], own.root) if own else self._garment(task.garment)
         if task.garment in shot and not (used and motions):
             fail(
                 str(self.folder / "shots" / task.shot / task.garment / RECORD),
@@ -127,29 +146,8 @@ class UsedNames:
     def _garment(self, name: str) -> GarmentUse | None:
         """Return what a garment was baked from in any of its shots, which share its asset."""
         if name not in self._garments:
-            self._garments[name] = read_use(self.folder, name) or self._used_in_shots(name)
+            self._garments[name] = read_use(self.folder, name)
         return self._garments[name]
-
-    def _used_in_shots(self, name: str) -> GarmentUse | None:
-        """Return what the records of a garment's shots tell, where its asset is of an older bake.
-
-        Raises:
-            SsilkError: it is in shots, and none of their records tells.
-        """
-        if not _place(self.folder, name).with_name("asset.usda").is_file():
-            return None
-        path = None
-        for path in self._records("*", name):
-            if use := _use(read_record(path.parent)):
-                return use
-        if path:
-            fail(
-                str(path),
-                f"it does not tell what the garment '{name}' was baked from",
-                "a name stays with its input",
-                "name this garment with --garment-name, or use the name all the same with --replace",
-            )
-        return None
 
     def _records(self, shot: str, garment: str) -> Iterator[Path]:
         return self.folder.glob(f"shots/{shot}/{garment}/{RECORD}")
@@ -175,8 +173,3 @@ class UsedNames:
             "a name stays with its input",
             f"name this {kind} with --{kind}-name, or use the name all the same with --replace",
         )
-
-
-def _use(record: TaskRecord | None) -> GarmentUse | None:
-    """Return what a record tells of its garment; None where it does not name a model."""
-    return GarmentUse(record.inputs["model"], record.root) if record and "model" in record.inputs else None

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ... import __version__, work_record
@@ -45,13 +45,13 @@ class TaskRecord:
     key: str
     files: Mapping[str, str]
     result: BakeResult
-    inputs: Mapping[str, RecordedInput] = field(default_factory=dict)
-    root: str | None = None
+    inputs: Mapping[str, RecordedInput]
+    root: str | None
 
     @property
-    def wearer(self) -> tuple[str | None, str | None]:
+    def wearer(self) -> tuple[str, str | None]:
         """The character that wears the garment in its shot: its motion and its SkelRoot."""
-        return (self.inputs["motion"].path if "motion" in self.inputs else None), self.root
+        return self.inputs["motion"].path, self.root
 
 
 def task_key(task: BakeTask, contents: InputHashes) -> str:
@@ -106,17 +106,14 @@ def _portable(result: BakeResult) -> dict[str, object]:
 
 
 def read_record(folder: Path) -> TaskRecord | None:
-    """Return the record of a folder; None where none can be read, so that its task is done again.
-
-    Records of older bakes name neither inputs nor SkelRoot.
-    """
+    """Return the record of a folder; None where none can be read, so that its task is done again."""
     try:
         found = work_record.read_record(folder / RECORD)
         if found is None:
             return None
         detail = {**found.detail, "path": folder / found.detail["path"]}
-        inputs = {str(name): from_plain(RecordedInput, each) for name, each in detail.pop("inputs", {}).items()}
-        root = detail.pop("root", None)
+        told, root = detail.pop("inputs"), detail.pop("root")
+        inputs = {name: from_plain(RecordedInput, told[name]) for name in INPUTS}
         result = from_plain(BakeResult, detail)
         return TaskRecord(key=found.key, files=found.files, result=result, inputs=inputs, root=root)
     except (SsilkError, ValueError, TypeError, KeyError, AttributeError):

@@ -72,18 +72,11 @@ def write_shot_stage(
 def _wearers(found: Mapping[str, TaskRecord | None]) -> dict[str, Hashable]:
     """Return who wears each garment of a shot.
 
-    A record that is damaged or older names no motion. All garments of a shot share one, unless somebody replaced it,
-    so such a garment is taken to be of the first character that is known.
+    A record that is damaged names no motion. All garments of a shot share one, unless somebody replaced it, so such a
+    garment is taken to be of the first character that is known.
     """
-    known = [record.wearer for record in found.values() if record and record.wearer[0]]
-
-    def wearer(record: TaskRecord | None) -> Hashable:
-        if record and record.wearer[0]:
-            return record.wearer
-        same = [one for one in known if record is None or one[1] == record.root]
-        return same[0] if same else (None, record.root if record else None)
-
-    return {name: wearer(record) for name, record in found.items()}
+    first = next((record.wearer for record in found.values() if record), None)
+    return {name: record.wearer if record else first for name, record in found.items()}
 
 
 def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -> list[str]:
@@ -94,9 +87,8 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
         return any(
             other.wearer != one.wearer
             and other.root == one.root
-            and other.inputs.get("stage") == one.inputs.get("stage")
+            and other.inputs["stage"] == one.inputs["stage"]
             for one in ours
-            if "motion" in other.inputs
         )
 
     return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]

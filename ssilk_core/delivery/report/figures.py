@@ -11,6 +11,7 @@ from typing import Any
 from ...errors import SsilkError, fail
 from ...physics.skin.figures import ShownSkin
 from ...quality.charts import ChartPanel, svg_chart
+from ...quality.evaluation.results import GO_ON, UNFINISHED
 from ...quality.stress.outcome import HEADER, CaseOutcome
 from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
@@ -87,9 +88,12 @@ def trade(document: Mapping[str, Any]) -> Section:
 
 
 def evaluation(document: Mapping[str, Any]) -> Section:
-    """Return the table of 'ssilk evaluate'."""
-    rest = facts({name: value for name, value in document.items() if name != "figures"})
-    return Section("Evaluation", records(document["figures"]) + rest)
+    """Return the table of 'ssilk evaluate'; of an unfinished file, its title and its first words say so."""
+    rest = facts({name: value for name, value in document.items() if name not in ("figures", "inputs", UNFINISHED)})
+    found = records(document["figures"]) + rest
+    if UNFINISHED in document:
+        return Section("Evaluation, unfinished", f'<p class="note">Unfinished: {GO_ON}.</p>{found}')
+    return Section("Evaluation", found)
 
 
 def records(found: Sequence[Mapping[str, Any]]) -> str:

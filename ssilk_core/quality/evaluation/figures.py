@@ -200,3 +200,13 @@ class Figures:
     minimum: MinimumErrors | None = None
     loop_drift: LoopDrift | None = None
     closed_loop: ClosedLoop | None = None
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """Figures of one method on one split."""
+
+    garment: str
+    method: str
+    split: str
+    figures: Figures

@@ -137,12 +137,17 @@ def build_take_set(takes: Sequence[Take], dressed: EvaluationScene, joints: np.n
     Raises:
         SsilkError: there is no take.
     """
-    if not takes:
-        fail("clips", "none of four frames or more", "one at least is needed", "name longer ones")
+    need_takes(takes)
     skeleton = dressed.scene.character.skeleton
     bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
     assert len(bank.starts) == len(takes)
     return TakeSet(tuple(takes), bank)
+
+
+def need_takes(takes: Sequence[Take]) -> None:
+    """Raise `SsilkError` where there is no take."""
+    if not takes:
+        fail("clips", "none of four frames or more", "one at least is needed", "name longer ones")
 
 
 class LatentStates:

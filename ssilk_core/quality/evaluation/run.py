@@ -3,120 +3,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
-
-import numpy as np
-import torch
-from torch import Tensor
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
 from ...network.model.network import GarmentModel
-from ...scene.assets import Motion
-from ...training.motion_bank import MotionBank, build_bank
+from .asked import EvaluationClips, EvaluationOptions
 from .closed_loop import closed_loop
-from .figures import ClosedLoop, Figures, LoopDrift, MinimumErrors, Settling, SolverErrors
+from .figures import ClosedLoop, Figures, ResultRow, SolverErrors
+from .measured import MeasuredMethod, Probes
 from .methods import (
     CachedPoints,
     EvaluatedMethod,
     EvaluationScene,
     LinearBlendSkinning,
-    Method,
     Network,
-    Reader,
     Simulated,
-    TakeSet,
-    build_take_set,
+    need_takes,
 )
-from .metrics import pose_distance
-from .minimum import minima, minimum_errors
-from .probes import (
-    joined_loop_drift,
-    joined_minimum_errors,
-    joined_settling,
-    last_frames,
-    loop_drift,
-    looped_takes,
-    settling,
-    stopped_takes,
-)
-from .record import recorded
+from .probes import joined_loop_drift, joined_minimum_errors, joined_settling
 from .solver_errors import solver_errors, windows_of
-from .takes import takes_of
-from .tally import Tally, figures, pose_novelty, reference_errors, takes_in
+from .takes import Take, takes_of
+from .tally import Tally, figures, pose_novelty, reference_errors
 
-SIMULATOR = "simulator"
-Stop = tuple[str, Settling, MinimumErrors | None]
-"""The clip of a stop, and what was measured after it."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class EvaluationOptions:
-    """What is measured besides the energies.
-
-    Attributes:
-        sequence: frames after which a clip restarts, as in the paper (512); None for whole clips.
-        stops: stops in each clip after which poses are held; none for zero.
-        hold: how long they are held [s].
-        minimum: whether the simulator minimises the energy of held poses.
-        simulate: whether it plays the stops as well, to see how it settles.
-        solver: whether it simulates from the methods' own states. These three take long on a CPU.
-        loop: frames that the first seconds of each clip loop for, at least; none for zero.
-        linearised: states of each split about which a network's steps are linearised, at most; none for zero.
-    """
-
-    sequence: int | None = None
-    stops: int = 2
-    hold: float = 3.0
-    minimum: bool = False
-    simulate: bool = False
-    solver: bool = False
-    loop: int = 2000
-    linearised: int = 16
-
-    def __post_init__(self) -> None:
-        if not (self.sequence is None or self.sequence >= 4):
-            fail("evaluation", f"sequences of {self.sequence} frames", "four at least are needed")
-        if not 0 <= self.stops <= 100:
-            fail("evaluation", f"{self.stops} stops in each clip", "0 to 100 are allowed")
-        if not 0 < self.hold <= 600:
-            fail("evaluation", f"a hold of {self.hold:g} s", "it lies between 0 and 600 s")
-        if not 0 <= self.loop <= 1_000_000:
-            fail("evaluation", f"loops of {self.loop} frames", "0 to 1,000,000 are allowed")
-        if not 0 <= self.linearised <= 10_000:
-            fail("evaluation", f"{self.linearised} states to linearise about", "0 to 10,000 are allowed")
-
-
-@dataclass(frozen=True, eq=False)
-class EvaluationClips:
-    """What is played.
-
-    Attributes:
-        clips: motions by name.
-        splits: names of clips by split; a clip may be in several.
-        simulated: clips that there are shots of the reference simulator of; `read` returns its points at the
-            methods' rate.
-        seen: training motions; none where they are not known.
-    """
-
-    clips: Mapping[str, Motion]
-    splits: Mapping[str, Sequence[str]]
-    simulated: frozenset[str] = frozenset()
-    read: Reader | None = None
-    seen: Sequence[Motion] = ()
-
-
-@dataclass(frozen=True)
-class ResultRow:
-    """Figures of one method on one split."""
-
-    garment: str
-    method: str
-    split: str
-    figures: Figures
+LBS, SIMULATOR = "LBS", "simulator"
 
 
 def evaluate(
@@ -125,21 +39,26 @@ def evaluate(
     playlist: EvaluationClips,
     options: EvaluationOptions | None = None,
     report: Reporter = silent,
+    known: Sequence[ResultRow] = (),
 ) -> Iterator[ResultRow]:
-    """Yield the figures of linear blend skinning, of the simulator where it has played, and of each method, by split.
+    """Yield the figures of linear blend skinning and of the simulator, where it has played, and of each method.
+
+    Args:
+        known: the first rows, as an evaluation of the same yielded them; they are not measured again.
 
     Raises:
-        SsilkError: no clip has four frames, or a point cache is not of its clip.
+        SsilkError: no clip has four frames, a point cache is not of its clip, or two methods have one name.
     """
-    run = _Run(dressed, methods, playlist, options or EvaluationOptions(), report)
-    yield from run.rows(run.lbs, "LBS")
-    yield from run.simulator_rows()
-    for method in methods:
-        yield from run.method_rows(method)
+    yield from _Run(dressed, methods, playlist, options or EvaluationOptions(), report, known).rows()
 
 
 class _Run:
-    """Takes of all clips, with the records of linear blend skinning and of the simulator."""
+    """The rows of an evaluation, and the methods that those are measured of which are not known.
+
+    Attributes:
+        planned: method and split of each row, in order.
+        figures: those of the rows so far.
+    """
 
     def __init__(
         self,
@@ -148,123 +67,136 @@ class _Run:
         playlist: EvaluationClips,
         options: EvaluationOptions,
         report: Reporter,
+        known: Sequence[ResultRow],
     ) -> None:
         self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
         cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
         self.takes = [take for takes in cut for take in takes]
-        self.clips = {number: take.clip for number, take in enumerate(self.takes)}
-        self.simulated = takes_in(self.clips, playlist.simulated)
-        self.told = Countdown(len(self.takes) * (len(methods) + 1) + len(self.simulated), report)
-        self.joints = methods[0].joints
-        take_set = build_take_set(self.takes, dressed, self.joints)
-        read = playlist.read
-        self.cache = CachedPoints(read, dressed, take_set) if read else None
-        self.simulator = self._tally(take_set, self.cache, self.simulated) if self.cache else Tally({}, self.clips)
-        self.lbs = self._tally(take_set, LinearBlendSkinning(dressed, take_set), list(self.clips))
+        need_takes(self.takes)
+        joints, names = methods[0].joints, [LBS, SIMULATOR, *(method.name for method in methods)]
+        if twice := [name for name, count in Counter(names).items() if count > 1]:
+            fail("evaluation", f"several methods are called {twice[0]}", "names tell rows apart", "name each once")
+        self.methods = {
+            LBS: EvaluatedMethod(LBS, joints, partial(LinearBlendSkinning, dressed)),
+            **({SIMULATOR: EvaluatedMethod(SIMULATOR, joints, partial(CachedPoints, playlist.read, dressed))}
+               if playlist.read else {}),
+            **{method.name: method for method in methods},
+        }  # fmt: skip
+        self.planned = [*self._planned([name for name in (LBS, SIMULATOR) if name in self.methods], by_split=True),
+                        *self._planned(names[2:])]  # fmt: skip
+        self.figures: dict[tuple[str, str], Figures] = {}
+        for place, row in zip(self.planned, known):
+            if place != (row.method, row.split):
+                break
+            self.figures[place] = row.figures
+        left = sum(len(self._missing(name)) for name in self.methods)
+        total = sum(len(self._takes(name, playlist.splits)) for name in self.methods)
+        self.told = Countdown(total, report, done=total - left)
+        self._measured: dict[str, MeasuredMethod] = {}
+        self._probes: dict[str, Probes] = {}
 
-    def _tally(self, take_set: TakeSet, method: Method, takes: Sequence[int]) -> Tally:
-        """Measure a method over takes, with its errors where the simulator has played."""
-        records = {}
-        for take in takes:
-            reference = self.cache if take in self.simulated and method is not self.cache else None
-            records[take] = recorded(self.dressed, take_set, method, take, reference)
-            self.told()
-        return Tally(records, self.clips)
+    def _planned(self, methods: Sequence[str], *, by_split: bool = False) -> list[tuple[str, str]]:
+        """Return method and split of the rows of some methods: those for which there are takes."""
+        pairs = [(method, split) for method in methods for split in self.playlist.splits]
+        if by_split:  # LBS is compared with the simulator, whose row is to be kept as soon as that is measured
+            pairs = [(method, split) for split in self.playlist.splits for method in methods]
+        return [(method, split) for method, split in pairs if self._takes(method, [split])]
 
-    def rows(self, tally: Tally, method: str) -> Iterator[ResultRow]:
-        """Yield the figures of a method that has no state of its own."""
-        for split, names in self.playlist.splits.items():
-            own = tally.only(takes_in(self.clips, names))
-            if own.records:
-                yield ResultRow(self.dressed.name, method, split, self._figures(own))
+    def _takes(self, method: str, splits: Iterable[str]) -> list[Take]:
+        """Return the takes of a method in some splits."""
+        names = {name for split in splits for name in self.playlist.splits[split]}
+        names &= self.playlist.simulated if method == SIMULATOR else names
+        return [take for take in self.takes if take.clip in names]
 
-    def _figures(self, tally: Tally) -> Figures:
-        takes, weight = list(tally.records), self.dressed.weight
-        found = figures(tally, self.lbs.only(takes), weight, self.dressed.covered)
-        return replace(found, reference=reference_errors(tally, self.simulator.only(takes), weight))
+    def _missing(self, method: str) -> list[Take]:
+        """Return the takes of a method that rows are missing of."""
+        missing = (split for name, split in self.planned if name == method and (name, split) not in self.figures)
+        return self._takes(method, missing)
 
-    def simulator_rows(self) -> Iterator[ResultRow]:
-        """Yield the figures of the simulator."""
-        wanted = self.options.simulate and self.options.stops and self.simulator.records
-        stopped = self._stopped(self.joints, partial(Simulated, self.dressed)) if wanted else []
-        for row in self.rows(self.simulator, SIMULATOR):
-            yield replace(row, figures=replace(row.figures, **self._rested(stopped, row.split)))
+    def rows(self) -> Iterator[ResultRow]:
+        """Yield the rows, and let go of each method after its last."""
+        for number, (method, split) in enumerate(self.planned):
+            if (method, split) not in self.figures:
+                self.figures[method, split] = self._row(method, split)
+            yield ResultRow(self.dressed.name, method, split, self.figures[method, split])
+            if method not in (name for name, _ in self.planned[number + 1 :]):
+                self._measured.pop(method, None)
+                self._probes.pop(method, None)
 
-    def method_rows(self, method: EvaluatedMethod) -> Iterator[ResultRow]:
-        """Yield the figures of a method."""
-        take_set = build_take_set(self.takes, self.dressed, method.joints)
-        played = method.on(take_set)
-        tally = self._tally(take_set, played, list(self.clips))
-        distances, loops = self._distances(take_set, method.joints), self._loops(method)
-        stopped = self._stopped(method.joints, method.on)
-        for row in self.rows(tally, method.name):
-            names = self.playlist.splits[row.split]
-            found = replace(
-                row.figures,
-                **self._rested(stopped, row.split),
-                pose_novelty=pose_novelty(tally.only(takes_in(self.clips, names)), distances) if distances else None,
-                loop_drift=joined_loop_drift([loop for clip, loop in loops if clip in names]),
-                solver=self._solver_errors(take_set, played, takes_in(self.clips, names)),
-                closed_loop=self._closed_loop(played, takes_in(self.clips, names)),
-            )
-            yield replace(row, figures=found)
+    def _row(self, method: str, split: str) -> Figures:
+        """Measure a method on a split."""
+        found, names = self._base(method, split), self.playlist.splits[split]
+        if method == SIMULATOR:
+            return replace(found, **self._rested(method, split)) if self.options.simulate else found
+        measured = self._method(method)
+        tally = measured.tally(names)
+        found = replace(found, reference=reference_errors(tally, self._simulator(split), self.dressed.weight))
+        if method == LBS:
+            return found
+        return replace(
+            found,
+            **self._rested(method, split),
+            pose_novelty=pose_novelty(tally, measured.distances) if measured.distances else None,
+            loop_drift=joined_loop_drift(self._probed(method).loops.of(names)),
+            solver=self._solver_errors(measured, tally),
+            closed_loop=self._closed_loop(measured, tally),
+        )
 
-    def _solver_errors(self, take_set: TakeSet, method: Method, takes: Sequence[int]) -> SolverErrors | None:
+    def _base(self, method: str, split: str) -> Figures:
+        """Return the figures that every method has."""
+        return figures(self._tally(method, split), self._lbs_jerk(split), self.dressed.weight, self.dressed.covered)
+
+    def _lbs_jerk(self, split: str) -> float:
+        """Return the RMS jerk of linear blend skinning on a split [m/s3]."""
+        known = self.figures.get((LBS, split))
+        return known.jerk if known else self._tally(LBS, split).root("jerk")
+
+    def _simulator(self, split: str) -> Figures | None:
+        """Return the figures of the simulator on a split; None where it has not played."""
+        if (SIMULATOR, split) not in self.planned:
+            return None
+        return self.figures.get((SIMULATOR, split)) or self._base(SIMULATOR, split)
+
+    def _tally(self, method: str, split: str) -> Tally:
+        return self._method(method).tally(self.playlist.splits[split])
+
+    def _method(self, name: str) -> MeasuredMethod:
+        """Return a method over all takes that its missing rows need."""
+        if name not in self._measured:
+            playlist = replace(self.playlist, read=None) if name == SIMULATOR else self.playlist
+            takes = self._missing(name)
+            self._measured[name] = MeasuredMethod(self.dressed, self.methods[name], takes, playlist, self.told)
+        return self._measured[name]
+
+    def _probed(self, name: str) -> Probes:
+        """Return the probes of a method; the simulator plays stops itself, since no file has them."""
+        if name not in self._probes:
+            method = self.methods[name]
+            if name == SIMULATOR:
+                method = replace(method, on=partial(Simulated, self.dressed))
+            self._probes[name] = Probes(self.dressed, method, self.takes, self.options)
+        return self._probes[name]
+
+    def _rested(self, method: str, split: str) -> dict[str, Any]:
+        """Return the figures of a method's stops in a split."""
+        stops = self._probed(method).stops.of(self.playlist.splits[split])
+        return {
+            "settling": joined_settling([after for after, _ in stops]),
+            "minimum": joined_minimum_errors([errors for _, errors in stops if errors]),
+        }
+
+    def _solver_errors(self, measured: MeasuredMethod, tally: Tally) -> SolverErrors | None:
         """Return how far a method is from the solver on some takes; None unless asked for, or for short takes."""
+        takes, take_set = list(tally.records), measured.take_set
         windows = windows_of(self.dressed, take_set, takes) if self.options.solver else []
         if not windows:
             return None
         self.report(Message(f"the solver plays {len(windows)} windows and single steps from the method's own states"))
-        return solver_errors(self.dressed, take_set, method, windows, self.report)
+        return solver_errors(self.dressed, take_set, measured.played, windows, self.report)
 
-    def _closed_loop(self, method: Method, takes: Sequence[int]) -> ClosedLoop | None:
+    def _closed_loop(self, measured: MeasuredMethod, tally: Tally) -> ClosedLoop | None:
         """Return the closed loop of single steps on some takes; None but for networks with states of two frames."""
+        method = measured.played
         if not (isinstance(method, Network) and isinstance(method.model, GarmentModel)):
             return None
-        return closed_loop(method, takes, self.options.linearised)
-
-    def _distances(self, take_set: TakeSet, joints: np.ndarray) -> dict[int, Tensor]:
-        """Return the distances of each take's poses from the training's [rad], (N,); empty if those are not known."""
-        if not self.playlist.seen:
-            return {}
-        skeleton, device = self.dressed.scene.character.skeleton, self.dressed.device
-        seen = build_bank(self.playlist.seen, skeleton, joints, self.dressed.fps, device)
-        far = pose_distance(_upright(take_set.bank), _upright(seen), len(joints))
-        return dict(enumerate(far.split((take_set.bank.stops - take_set.bank.starts).tolist())))
-
-    def _stopped(self, joints: np.ndarray, method_on: Callable[[TakeSet], Method]) -> list[Stop]:
-        """Return what was measured after each stop."""
-        options, dressed = self.options, self.dressed
-        takes, first = stopped_takes(self.takes, dressed.fps, options.stops, options.hold)
-        if not takes:
-            return []
-        take_set = build_take_set(takes, dressed, joints)
-        method = method_on(take_set)
-        settled = settling(dressed, take_set, method, first)
-        rested: Sequence[MinimumErrors | None] = [None] * len(takes)
-        if options.minimum:
-            rested = minimum_errors(minima(dressed.simulator, takes, last_frames(method, takes)), dressed.weight)
-        return [(take.clip, after, errors) for take, after, errors in zip(takes, settled, rested)]
-
-    def _rested(self, stopped: Sequence[Stop], split: str) -> dict[str, Any]:
-        """Return the figures of the stops of a split."""
-        own = [stop for stop in stopped if stop[0] in self.playlist.splits[split]]
-        return {
-            "settling": joined_settling([after for _, after, _ in own]),
-            "minimum": joined_minimum_errors([errors for _, _, errors in own if errors]),
-        }
-
-    def _loops(self, method: EvaluatedMethod) -> list[tuple[str, LoopDrift]]:
-        """Return how looped takes drift, with the clip of each."""
-        if not self.options.loop:
-            return []
-        takes, lengths = looped_takes(self.takes, self.dressed.fps, self.options.loop)
-        take_set = build_take_set(takes, self.dressed, method.joints)
-        found = loop_drift(self.dressed, take_set, method.on(take_set), lengths)
-        return [(take.clip, loop) for take, loop in zip(takes, found)]
-
-
-def _upright(bank: MotionBank) -> Tensor:
-    """Return the static descriptors of all frames of a bank, gravity being where it was."""
-    frames = torch.arange(bank.frame_count, device=bank.root.device)
-    return bank.static_descriptor(frames, bank.root.new_tensor([0.0, -1.0, 0.0]).expand(len(frames), 3))
+        return closed_loop(method, list(tally.records), self.options.linearised)

@@ -16,10 +16,10 @@ from .figures import (
     MinimumErrors,
     PoseNovelty,
     ReferenceErrors,
+    ResultRow,
     Settling,
     SolverErrors,
 )
-from .run import ResultRow
 from .solver_errors import AFTER
 
 

@@ -63,11 +63,11 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
     return [take for take, clip in clips.items() if clip in names]
 
 
-def figures(tally: Tally, lbs: Tally, weight: float, covered: CoveredSkin) -> Figures:
+def figures(tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin) -> Figures:
     """Return the figures of a method.
 
     Args:
-        lbs: linear blend skinning on the same takes.
+        lbs_jerk: RMS jerk of linear blend skinning on the same takes [m/s3].
         weight: m g L of the garment [J].
         covered: the skin that it covers.
     """
@@ -86,28 +86,31 @@ def figures(tally: Tally, lbs: Tally, weight: float, covered: CoveredSkin) -> Fi
         kinetic_energy=tally.mean("kinetic energy"),
         static_distance=tally.root("static distance") if has_static_state else None,
         jerk=jerk,
-        jerk_ratio=ratio(jerk, lbs.root("jerk")),
+        jerk_ratio=ratio(jerk, lbs_jerk),
         stretch_quantiles=(*histogram_quantiles(stretches, SHARES), float(tally.each("largest stretch").max())),
     )
 
 
-def reference_errors(tally: Tally, reference: Tally, weight: float) -> ReferenceErrors | None:
-    """Compare a method with the simulator on the takes that both have; None where there are none."""
-    ours = tally.only(list(reference.records))
-    if not ours.records or ERRORS[0] not in next(iter(ours.records.values())).values:
+def reference_errors(tally: Tally, simulator: Figures | None, weight: float) -> ReferenceErrors | None:
+    """Compare a method with the simulator on the takes that both have; None where there are none.
+
+    Args:
+        simulator: its figures on these takes; None where it has not played.
+        weight: m g L of the garment [J].
+    """
+    ours = tally.only([take for take, record in tally.records.items() if ERRORS[0] in record.values])
+    if not (ours.records and simulator):
         return None
-    theirs = reference.only(list(ours.records))
-    total = float(theirs.totals().mean())
     position, velocity, acceleration = (ours.root(name) for name in ERRORS)
     return ReferenceErrors(
         frames=len(ours.totals()),
-        reference_total=total,
-        total_excess=float(ours.totals().mean()) - total,
-        gravity_excess=ratio(ours.mean("gravity") - theirs.mean("gravity"), weight),
+        reference_total=simulator.total,
+        total_excess=float(ours.totals().mean()) - simulator.total,
+        gravity_excess=ratio(ours.mean("gravity") - simulator.terms["gravity"], weight),
         position_error=position,
         velocity_error=velocity,
         acceleration_error=acceleration,
-        jerk_ratio=ratio(ours.root("jerk"), theirs.root("jerk")),
+        jerk_ratio=ratio(ours.root("jerk"), simulator.jerk),
     )
 
 

@@ -18,7 +18,16 @@ from pxr import Tf
 from ssilk_core.delivery.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
 from ssilk_core.delivery.bake.inputs import InputHashes
 from ssilk_core.delivery.bake.naming import file_name, pattern_name, prim_name
-from ssilk_core.delivery.bake.record import RECORD, TaskRecord, current_record, read_record, task_key, write_record
+from ssilk_core.delivery.bake.record import (
+    RECORD,
+    RecordedInput,
+    TaskRecord,
+    current_record,
+    read_record,
+    task_key,
+    write_record,
+)
+from ssilk_core.delivery.bake.request import INPUTS
 from ssilk_core.delivery.farm.job import FarmJob, numbers, read_job, write_job
 from ssilk_core.delivery.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.errors import SsilkError
@@ -127,10 +136,15 @@ def result(path: Path) -> BakeResult:
     )  # fmt: skip
 
 
+def record(path: Path, files: dict[str, str]) -> TaskRecord:
+    inputs = {name: RecordedInput(f"../{name}.usda", name) for name in INPUTS}
+    return TaskRecord(key="k", files=files, result=result(path), inputs=inputs, root=None)
+
+
 def test_a_task_is_current_while_its_files_are_as_written(tmp_path):
     path = tmp_path / "anim.usdc"
     path.write_bytes(b"shot")
-    write_record(tmp_path, TaskRecord(key="k", files={"anim.usdc": sha256(path)}, result=result(path)))
+    write_record(tmp_path, record(path, {"anim.usdc": sha256(path)}))
     assert current_record(tmp_path, "k") and not current_record(tmp_path, "other")
     path.write_bytes(b"shut")
     assert not current_record(tmp_path, "k")
@@ -138,10 +152,10 @@ def test_a_task_is_current_while_its_files_are_as_written(tmp_path):
 
 def test_a_record_tells_the_result_again_wherever_its_folder_goes(tmp_path):
     path = tmp_path / "here" / "anim.usdc"
-    write_record(path.parent, TaskRecord(key="k", files={}, result=result(path)))
+    write_record(path.parent, record(path, {}))
     path.parent.rename(tmp_path / "there")
-    record = read_record(tmp_path / "there")
-    assert record is not None and record.result == result(tmp_path / "there" / "anim.usdc")
+    found = read_record(tmp_path / "there")
+    assert found == record(tmp_path / "there" / "anim.usdc", {})
 
 
 @pytest.mark.parametrize("text", [

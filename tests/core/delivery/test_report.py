@@ -19,6 +19,7 @@ from ssilk_core.delivery.report.verdict import verdict
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.quality.charts import ChartPanel, svg_chart
+from ssilk_core.quality.evaluation.results import UNFINISHED
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
 
@@ -204,6 +205,15 @@ def test_figures_become_sections_by_what_they_hold(tmp_path, title):
     assert section.title == title and word in section.body
     if title == "Extremes":
         assert '<tr class="bad">' in section.body and "nan" in section.body
+
+
+def test_an_unfinished_evaluation_says_so(tmp_path):
+    document, word = FIGURES["Evaluation"]
+    path = tmp_path / "figures.json"
+    path.write_text(json.dumps({UNFINISHED: "<b>", "inputs": {"secret": 1}, **document}))
+    section = section_of(path)
+    assert section.title == "Evaluation, unfinished" and word in section.body and "secret" not in section.body
+    assert section.body.startswith('<p class="note">Unfinished: rows are missing; the same command')
 
 
 @pytest.mark.parametrize(

@@ -73,6 +73,18 @@ def test_skin_points_is_the_weighted_mean_of_rigid_images():
     np.testing.assert_allclose(kinematics.skin_points(points, skin, matrices), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("count", range(1, 17))
+def test_influences_are_sorted_and_sum_to_one_also_where_they_are_equal(count):
+    """The rounding of equal weights goes to one of them, which may then be the lightest: 0.333333313, not ...343."""
+    joints = np.arange(count)
+    alike = np.where(joints % 2, 1.0, 1.0 + 1e-9)  # equal in float32 alone
+    ties = np.stack([np.ones(count), joints < max(1, count - 1), alike])
+    indices, weights = kinematics.sorted_influences(SkinWeights("x", np.tile(joints, (3, 1)), ties))
+    assert (np.diff(weights, axis=1) <= 0).all() and (weights.sum(axis=1, dtype=np.float64) == 1).all()
+    for row in np.where(weights > 0, indices, -1 - np.arange(indices.shape[1])):
+        assert len(set(row)) == len(row)
+
+
 @pytest.mark.parametrize("source, target", [(60, 30), (24, 30), (30, 25), (30, 30)])
 def test_resample_keeps_duration_and_hits_a_steady_turn(source, target):
     frames = 2 * source + 1
