@@ -146,7 +146,8 @@ class TextReporter:
     """Print events as text; progress rewrites one line on a terminal, and adds one every ten seconds elsewhere.
 
     Attributes:
-        since: when lines that begin with a time count from, as `time.monotonic` tells it [s]; None for no times.
+        since: when the times that lines of progress begin with count from, as `time.monotonic` tells it [s]; None for no
+            times.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:
@@ -163,7 +164,8 @@ class TextReporter:
         self._end_line()
         text = describe(event)
         if text:
-            print(self._time() + text, file=self.stream, flush=True)
+            told = "" if isinstance(event, Failed | Result) else self._time()
+            print(told + text, file=self.stream, flush=True)
 
     def _progress(self, event: Progress) -> None:
         now = time.monotonic()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a garment that ships trained beside linear blend skinning, then train a draft of it and film all three.
+"""Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.
 
 The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bake many shots on a farm: write a job bundle of Open Job Description, or run its tasks on a Ray cluster.
+"""Bake many shots on a farm: write a bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
 task is one garment in one shot. Running a job again, anywhere, leaves finished tasks alone. With --device cuda each

@@ -5,60 +5,40 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from importlib import import_module
 from types import ModuleType
 
 from .. import __version__
 from ..errors import EXIT_BAD_INPUT, EXIT_INTERRUPTED, SsilkError
 from ..events import Failed, JsonReporter, Reporter, TextReporter
-from . import (
-    bake,
-    completion,
-    demo,
-    evaluate,
-    export,
-    farm,
-    help,
-    inspect,
-    reduce,
-    remove,
-    report,
-    rig,
-    simulate,
-    skin,
-    stress,
-    task,
-    trade,
-    train,
-    verify,
-    view,
-    wardrobe,
-)
+from .inputs import need_inputs
 from .parsing import Parser
 
-VERBS = (
-    inspect,
-    rig,
-    train,
-    wardrobe,
-    reduce,
-    export,
-    bake,
-    remove,
-    simulate,
-    skin,
-    evaluate,
-    trade,
-    stress,
-    report,
-    verify,
-    view,
-    farm,
-    task,
-    demo,
-    completion,
-    help,
-)
+VERBS = {
+    "inspect": "Check a character, a garment and motions before training (preflight).",
+    "rig": "Give a garment weights, classes and proxy joints, written into a copy of the stage.",
+    "train": "Train a garment on motions and write a model.",
+    "wardrobe": "Train a list of garments as 'ssilk train' does, one at a time on each GPU.",
+    "reduce": "Cut a trained model down to fewer blendshapes, proxy joints and influences, without training again.",
+    "export": "Write a trained model's network as ONNX, for engines that play it themselves.",
+    "bake": "Bake trained garments over motions as UsdSkel, and verify it by re-skinning the files.",
+    "remove": "Take garments out of the shots of a folder of layers, and write the stages of these shots again.",
+    "simulate": "Simulate a garment over motions without a network: slow and accurate, the reference for models.",
+    "skin": "Turn a point cache into joints and blendshapes on the character's skeleton, and verify them.",
+    "evaluate": "Measure trained garments on whole clips: energies, against the simulator, and what energies hide.",
+    "trade": "Measure what speed and size cost in accuracy, for all that can be changed without training again.",
+    "stress": "Test a trained garment under extreme motions, rates, sizes, fabrics, meshes and precisions.",
+    "report": "Write a page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.",
+    "verify": "Check a shot, and compare it, re-skinned by UsdSkel alone, with the decoder's vertices or its cache.",
+    "view": "Film a shot (.mp4), lay out its moments on a sheet (.png), or write a page that plays it (.html).",
+    "farm": "Bake many shots on a farm: write a bundle of Open Job Description, or run its tasks on a Ray cluster.",
+    "task": "Bake tasks of a job that 'ssilk farm' wrote, or check that all are done: what a farm's workers run.",
+    "demo": "Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.",
+    "completion": "Write the script that lets a shell complete verbs, options and names with the tab key.",
+    "help": "Say what all verbs, or one of them, are for.",
+}
+"""What each verb does, the first line of its module's docstring: a list of verbs loads none of them."""
 
 # The extra of the distribution that installs everything a verb needs; "all" for others.
 EXTRAS = {
@@ -85,23 +65,22 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
             "onnxscript")  # fmt: skip
 
 
-def name_of(module: ModuleType) -> str:
-    """Return the verb that a module is about."""
-    return module.__name__.rpartition(".")[2]
+def module_of(verb: str) -> ModuleType:
+    """Return the module of a verb."""
+    return import_module(f".{verb}", __package__)
 
 
-def parser() -> Parser:
-    """Return the parser of all verbs."""
+def parser(loaded: Collection[str] = tuple(VERBS)) -> Parser:
+    """Return the parser of all verbs; only those that are `loaded` have options."""
     top = Parser(prog="ssilk", description="Neural loose garments, trained by physics alone, baked as UsdSkel.")
     top.add_argument("--version", action="version", version=f"ssilk {__version__}")
     verbs = top.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for module in VERBS:
-        verb = verbs.add_parser(
-            name_of(module),
-            help=(module.__doc__ or "").splitlines()[0],
-            description=module.__doc__,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
+    for name, purpose in VERBS.items():
+        verb = verbs.add_parser(name, help=purpose, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if name not in loaded:
+            continue
+        module = module_of(name)
+        verb.description = module.__doc__
         verb.add_argument(
             "--json", action="store_true", help="events as JSON, one object per line, on standard output"
         )
@@ -111,12 +90,20 @@ def parser() -> Parser:
     return top
 
 
+def _asked(words: Sequence[str]) -> Collection[str]:
+    """Return the verbs whose options a command may need."""
+    if words[:1] == ["completion"]:
+        return tuple(VERBS)
+    return words[:2] if words[:1] == ["help"] else words[:1]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code: 0, 2 bad input, 3 not verified, 4 tasks failed, 130 interrupted."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     report: Reporter = JsonReporter() if "--json" in words else TextReporter()
     try:
-        options = parser().parse_args(words)
+        options = parser(_asked(words)).parse_args(words)
+        need_inputs(options)
         return int(options.run(options, report))
     except SsilkError as error:
         report(Failed(str(error)))

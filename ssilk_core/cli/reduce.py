@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cut a trained model down to fewer blendshapes, proxy joints and influences, without training it again.
+"""Cut a trained model down to fewer blendshapes, proxy joints and influences, without training again.
 
 What is kept is the best of its size for the given motions (default: those of the training, if their files are still
 there): blendshapes by reduced-rank regression weighted by mass, influences by least squares, proxies by the smallest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write one page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.
+"""Write a page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.
 
 A shot is measured from the points that its file plays, whatever program computed them. The page of a model shows its
 training; with --stage and --motion it is also baked and shown as a shot. --figures adds files that 'ssilk stress',

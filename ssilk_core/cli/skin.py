@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turn a point cache of any simulator into joints and blendshapes on the character's skeleton, and verify them.
+"""Turn a point cache into joints and blendshapes on the character's skeleton, and verify them.
 
 The cache is a USD file with the garment's points at each frame, from Houdini, Marvelous Designer, Blender or 'ssilk
 simulate --points', say: the same mesh, its vertices in the same order, in the character's world. The shot moves the

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bake some tasks of a job that 'ssilk farm' wrote, or check that all are done; this is what a farm's workers run.
+"""Bake tasks of a job that 'ssilk farm' wrote, or check that all are done: what a farm's workers run.
 
 Tasks that are done are left alone. A task with bad input fails alone: the others are baked, and the exit code is 4.
 With --openjd it is 0 then, because a session that runs here begins nothing after a step that failed; the last step of

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure what speed and size cost in accuracy, for everything that can be changed without training again.
+"""Measure what speed and size cost in accuracy, for all that can be changed without training again.
 
 Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time, and
 the simulator goes on by itself from the network's first two states. Networks of several sizes and garments can be

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a shot and compare it, re-skinned by UsdSkel alone, with the decoder's own vertices, or with its cache.
+"""Check a shot, and compare it, re-skinned by UsdSkel alone, with the decoder's vertices or its cache.
 
 The shot says which model, stage and motion it was baked from. Give the present paths of those that have moved. A shot
 that was solved in latents, or refined with feedback, is only checked for being valid and complete.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Film a shot (.mp4), lay out its moments as a contact sheet (.png), or write a page that plays it (.html).
+"""Film a shot (.mp4), lay out its moments on a sheet (.png), or write a page that plays it (.html).
 
 Several shots stand side by side. The page plays in any browser, loads nothing, and can be turned.
 

@@ -40,7 +40,12 @@ def told(capsys, command: str) -> str:
         ("completion bsh", "'bsh'", "'bash'"),
     ],
 )
-def test_what_was_mistyped_is_named_and_what_was_meant_is_suggested(capsys, command, mistyped, meant):
+def test_what_was_mistyped_is_named_and_what_was_meant_is_suggested(
+    tmp_path, monkeypatch, capsys, command, mistyped, meant
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("hero.usdc", "walks"):
+        (tmp_path / name).touch()
     line = told(capsys, command)
     assert mistyped in line
     assert line.endswith(f"did you mean {meant}?")

@@ -108,9 +108,9 @@ def test_lines_begin_with_the_time_where_they_are_asked_to(monkeypatch):
     report = TextReporter(stream)
     report(Message("before"))
     report.since = 100.0
-    for now[0], event in ((102.9, Message("soon")), (3765.0, Progress(1, 2, 65.0))):
+    for now[0], event in ((102.9, Message("soon")), (3765.0, Progress(1, 2, 65.0)), (3766.0, Failed("no"))):
         report(event)
-    assert stream.getvalue() == "before\n0:00:02  soon\n1:01:05  1/2  1 min 05 s left  \n"
+    assert stream.getvalue() == "before\n0:00:02  soon\n1:01:05  1/2  1 min 05 s left  \nerror: no\n"
 
 
 def test_the_time_left_is_told_at_the_pace_since_the_first_step(monkeypatch):

@@ -157,6 +157,8 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_sentence(stage, capsys, words, complaint):
+    (stage / "other").mkdir(exist_ok=True)
+    (stage / "other" / "brief.usda").touch()
     assert main(["simulate", "rigged.usda", *words.split()]) == 2
     assert complaint in capsys.readouterr().err
     assert not (stage / "one.usdc").exists() and not (stage / "caches").exists()

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether what a command names is there, before anything heavy is loaded to read it."""
+
+from __future__ import annotations
+
+import argparse
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import did_you_mean, fail
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What an option names: how it is called where it is missing, what is needed, and whether a folder may be one."""
+
+    name: str
+    needed: str
+    folder: bool = False
+
+
+MODEL = Kind("model file", "a file of 'ssilk train' is needed")
+MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
+KINDS = {
+    "model": MODEL,
+    "models": MODEL,
+    "stepper_of": MODEL,
+    "stage": Kind("file", "a USD stage with a character is needed"),
+    "motion": MOTIONS,
+    "motions": MOTIONS,
+    "valid": MOTIONS,
+    "cache": Kind("file", "a USD file with points is needed"),
+}
+"""By the names under which options are parsed."""
+
+INDEPENDENT = ("bake", "farm")
+"""Verbs with tasks: where one of several inputs is missing, the others are baked."""
+
+
+def need_inputs(options: argparse.Namespace) -> None:
+    """Raise `SsilkError` where an input of a command is not there, or is no file, and suggest one that is."""
+    for name, kind in KINDS.items():
+        value = getattr(options, name, None)
+        values = value if isinstance(value, list) else [value] if value else []
+        if options.verb in INDEPENDENT and len(values) > 1:
+            continue
+        for each in values:
+            need_input(str(each), kind)
+
+
+def need_input(named: str, kind: Kind) -> None:
+    """Raise `SsilkError` where there is no such input. It may be FILE:/PRIM.
+
+    Names that USD resolves in its own way, such as a file in a package, are left to it.
+    """
+    path = Path(named.partition(":/")[0])
+    if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
+        return
+    found, near = f"there is no such {kind.name}", ""
+    if path.is_symlink():
+        found = "a link that leads to no file"
+    elif path.is_dir():
+        found = f"a folder, and no {kind.name}"
+    elif path.exists():
+        found = f"{_special(path)}, and no {kind.name}"
+    elif path.parent.is_dir():
+        near = did_you_mean(path.name, (each.name for each in path.parent.iterdir() if each.suffix == path.suffix))
+    fail(named, found, kind.needed, near)
+
+
+def _special(path: Path) -> str:
+    """Return what a path is that is no file and no folder."""
+    kinds = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device"}
+    return kinds.get(stat.S_IFMT(path.stat().st_mode), "something else")

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs that are not there are told before anything heavy is loaded."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from ssilk_core.cli import main
+from ssilk_core.cli.inputs import MODEL, MOTIONS, need_input
+from ssilk_core.errors import SsilkError
+
+
+def refusal(name: object, kind=MODEL) -> str:
+    with pytest.raises(SsilkError) as caught:
+        need_input(str(name), kind)
+    return str(caught.value)
+
+
+def test_what_is_no_file_is_told_by_what_it_is(tmp_path):
+    os.mkfifo(tmp_path / "pipe.usda")
+    (tmp_path / "loop.usda").symlink_to("loop.usda")
+    (tmp_path / "gone.usda").symlink_to("nowhere.usda")
+    assert "a pipe, and no model file; a file of 'ssilk train' is needed." in refusal(tmp_path / "pipe.usda")
+    for name in ("loop.usda", "gone.usda"):
+        assert f"{name}: a link that leads to no file;" in refusal(tmp_path / name)
+    assert "a folder, and no model file;" in refusal(tmp_path)
+    need_input(str(tmp_path), MOTIONS)
+
+
+def test_a_mistyped_name_is_told_with_the_file_that_it_resembles(tmp_path):
+    (tmp_path / "cape.safetensors").touch()
+    (tmp_path / "cape.txt").touch()
+    said = refusal(tmp_path / "cpe.safetensors")
+    assert said.endswith("no such model file; a file of 'ssilk train' is needed; did you mean 'cape.safetensors'?")
+    need_input(f"{tmp_path}/cape.safetensors:/Hero", MODEL)
+    for elsewhere in ("show.usdz[cape.usda]", "asset://cape"):
+        need_input(elsewhere, MODEL)
+
+
+def test_nothing_heavy_is_loaded_to_say_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = "import sys; from ssilk_core.cli import main; code = main(sys.argv[1:]); print({'torch', 'pxr'} & "
+    code += "sys.modules.keys()); sys.exit(code)"
+    for words in (["bake", "no.safetensors", "--stage", "a.usda", "--motion", "b.usda", "-o", "c.usda"],
+                  ["train", "no.usda", "--motions", "b.usda", "-o", "c.safetensors"]):  # fmt: skip
+        done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
+        assert done.returncode == 2 and f"{words[1]}: there is no such" in done.stderr
+        assert done.stdout.strip() == "set()"
+
+
+def test_one_of_several_motions_of_a_bake_may_be_missing_and_one_of_a_training_may_not(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.usda", "s.usda", "m.safetensors"):
+        (tmp_path / name).touch()
+    assert main(["train", "s.usda", "--motions", "a.usda", "b.usda", "-o", "c.safetensors"]) == 2
+    assert "b.usda: there is no such file or folder; motions are" in capsys.readouterr().err
+    main(["bake", "m.safetensors", "--stage", "s.usda", "--motion", "a.usda", "b.usda", "-o", "layers"])
+    assert "b.usda: there is no such file or folder; motions are" not in capsys.readouterr().err
