@@ -146,8 +146,8 @@ class TextReporter:
     """Print events as text; progress rewrites one line on a terminal, and adds one every ten seconds elsewhere.
 
     Attributes:
-        since: when the times that lines of progress begin with count from, as `time.monotonic` tells it [s]; None for no
-            times.
+        since: when the times at the front of lines of progress count from, as `time.monotonic` tells it [s]; None for
+            no times.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:

@@ -492,7 +492,7 @@ MODELS = [
     Case(
         "model is a folder",
         BAKE.replace("model.", "no."),
-        ("no.safetensors", "no such model"),
+        ("no.safetensors", "a folder, and no model file"),
         folder_at("no.safetensors"),
     ),
     Case("truncated model", BAKE, ("model.safetensors", "truncated"), truncated("model.safetensors")),
