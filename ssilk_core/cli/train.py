@@ -78,7 +78,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..training.parallel import join_process_group
     from ..training.run import train
     from ..training.signals import PATIENCE, stop_on_signals
-    from ..training.verdict import is_worse, lower_by, shortcomings, worse_message
+    from ..training.verdict import is_worse, lower_by, percent, shortcomings, worse_message
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
@@ -102,7 +102,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "iterations": trained.iterations,
                 "total [J]": round(trained.score.total, 5),
                 "linear blend skinning [J]": round(trained.lbs.total, 5),
-                ("lower by" if share >= 0 else "higher by"): f"{abs(share):.1%}",
+                ("lower by" if share >= 0 else "higher by"): percent(share),
                 **({WORSE_FIGURE: True} if worse else {}),
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),

@@ -25,6 +25,11 @@ def lower_by(score: Score, lbs: Score) -> float:
     return 1 - score.total / lbs.total if lbs.total else 0.0
 
 
+def percent(share: float) -> str:
+    """Format the size of a share, of which no more than all can be: totals below zero are lower by "over 100%"."""
+    return f"{abs(share):.1%}" if share <= 1 else "over 100%"
+
+
 def is_worse(score: Score, lbs: Score) -> bool:
     """Return whether a model is worse than none: its total is above that of linear blend skinning."""
     return lower_by(score, lbs) < -WORSE
@@ -73,7 +78,7 @@ def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) ->
     terms = ", ".join(f"{name} {value:.4g}" for name, value in score.terms.items())
     text = (
         f"validation at {iteration}: total {score.total:.4g} J, "
-        f"{abs(share):.1%} {'under' if share >= 0 else 'above'} linear blend skinning's {lbs.total:.4g} J "
+        f"{percent(share)} {'under' if share >= 0 else 'above'} linear blend skinning's {lbs.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
         + "".join(f", {part}" for part in (score.shown_skin, score.step_errors) if part)
     )

@@ -52,7 +52,7 @@ from ssilk_core.training.state import (
 )
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
-from ssilk_core.training.verdict import is_worse, shortcomings, worse_message
+from ssilk_core.training.verdict import is_worse, percent, shortcomings, worse_message
 from ssilk_core.training.windows import WindowSampler
 
 pytestmark = pytest.mark.usefixtures("few_contacts")
@@ -853,3 +853,8 @@ def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job
     said = [event.text for event in heard if isinstance(event, Message)]
     assert said[-1] == "stopped inside a step; --resume continues from iteration 2."
     assert train(replace(asked, resume=True), silent).iterations == 6
+
+
+@pytest.mark.parametrize(("share", "text"), [(0.0345, "3.5%"), (-0.2, "20.0%"), (1.0, "100.0%"), (1.007, "over 100%")])
+def test_a_total_below_zero_is_lower_by_no_more_than_all(share, text):
+    assert percent(share) == text
