@@ -855,6 +855,6 @@ def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job
     assert train(replace(asked, resume=True), silent).iterations == 6
 
 
-@pytest.mark.parametrize(("share", "text"), [(0.0345, "3.5%"), (-0.2, "20.0%"), (1.0, "100.0%"), (1.007, "over 100%")])
+@pytest.mark.parametrize(("share", "text"), [(0.0345, "3.5%"), (-0.2, "20.0%"), (1.0, "100.0%"), (1.01, "over 100%")])
 def test_a_total_below_zero_is_lower_by_no_more_than_all(share, text):
     assert percent(share) == text
