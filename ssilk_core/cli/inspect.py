@@ -134,7 +134,8 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
         write_with_units(file, half_done, units)
         inputs = _read_inputs(_moved(options, half_done), silent)
         repair = plan_repair(inputs.character, inputs.garment, inputs.rig, topology=not inputs.locked)
-        write_repaired(half_done, half_done, repair, garment=prim, root=options.root)
+        skeleton = inputs.character.skeleton
+        write_repaired(half_done, half_done, repair, garment=prim, root=options.root, skeleton=skeleton)
     return [*stated, *repair.done]
 
 

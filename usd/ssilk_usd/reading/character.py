@@ -60,7 +60,7 @@ def read_character(
     Raises:
         SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
     """
-    skel = find_skeleton(open_stage(source), root=root)
+    skel = find_skeleton(open_stage(source), root=root, garment=garment)
     skeleton = character_skeleton(skel)
     order = skeleton.joint_names
     return Character(

@@ -27,7 +27,7 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
-from .skeleton import skeletons
+from .skeleton import of_bodies, skeletons
 from .skin import match_joints
 from .spaces import joints_to_core, need_similarity, similarity_scale
 
@@ -128,14 +128,19 @@ def read_motion(
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
     """Return the SkelAnimation and the Skeleton that it animates (None for an unbound animation)."""
     where = stage.GetRootLayer().identifier
-    bound, own = {}, {}
-    for top, skeleton in skeletons(stage):
+    bound: dict[Usd.Prim, Usd.Prim] = {}
+    own: dict[Usd.Prim, Usd.Prim] = {}
+    pairs = skeletons(stage)
+    bodies = of_bodies(stage, pairs)
+    # Garments may have skeletons of their own, which share the character's animation, or have copies of it.
+    for top, skeleton in (*bodies, *(pair for pair in pairs if pair not in bodies)):
         animation = inherited_target(skeleton, "skel:animationSource")
         if animation:
-            bound[animation] = skeleton
+            bound.setdefault(animation, skeleton)
         if animation and root and named([top, skeleton], root):
             own[animation] = skeleton
-    bound = own or bound
+    moved = {skeleton for _, skeleton in bodies}
+    bound = own or {animation: skeleton for animation, skeleton in bound.items() if skeleton in moved} or bound
     every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
     found = named(every, prim) if prim else list(bound) or every
     if not found:

@@ -11,11 +11,12 @@ from pxr import Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Skeleton
 
-from ..names import PROXIES
+from ..names import PROXIES, SKEL
 from ..opening.stage import (
     PRIMS,
     column_matrix,
     has_value,
+    inherited,
     inherited_target,
     location,
     named,
@@ -24,14 +25,18 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
+from .mesh import is_garment
 from .skin import match_joints
 from .spaces import SkelSource, joints_to_core, need_similarity
 
 _CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
 
 
-def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
+def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | None = None) -> SkelSource:
     """Find the only skeleton of a stage, or the one named by `root` (path or name of its SkelRoot or Skeleton).
+
+    Of several, the character's is the one that other meshes than garments are bound to: `garment` names one, by path
+    or name, that is not marked.
 
     Raises:
         SsilkError: there is no skeleton or no unique one, or the skeleton is malformed.
@@ -45,6 +50,7 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
             "export the character with its armature",
         )
     chosen = found if root is None else _pairs_named(found, root)
+    chosen = of_bodies(stage, chosen, garment) if len(chosen) > 1 else chosen
     there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
     if not chosen:
         fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, _CHOOSE)
@@ -55,13 +61,24 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
             there_are,
             f"{_CHOOSE}, by the path of its Skeleton if need be",
         )
-    return _source(*chosen[0])
+    return skeleton_at(*chosen[0])
 
 
 def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
     """Return the pairs whose SkelRoot has this path or name, or if there are none, whose Skeleton has it."""
     roots, skeletons_named = (named([pair[side] for pair in pairs], name) for side in (0, 1))
     return [pair for pair in pairs if pair[0] in roots] or [pair for pair in pairs if pair[1] in skeletons_named]
+
+
+def of_bodies(
+    stage: Usd.Stage, pairs: list[tuple[Usd.Prim, Usd.Prim]], garment: str | None = None
+) -> list[tuple[Usd.Prim, Usd.Prim]]:
+    """Return the pairs whose Skeleton moves a mesh that is no garment; all pairs where none does."""
+    meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    garments = named(meshes, garment) if garment else []
+    bodies = [mesh for mesh in meshes if not is_garment(mesh) and mesh not in garments]
+    moved = {bound_skeleton(mesh) for mesh in bodies if inherited(mesh, SKEL[0]) is not None}
+    return [pair for pair in pairs if pair[1] in moved] or pairs
 
 
 def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
@@ -98,7 +115,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest)
 
 
-def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
+def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
+    """Read the Skeleton `prim` of a SkelRoot; raise `SsilkError` where it is malformed."""
     where, joints = location(prim), tuple(str(name) for name in value(prim, "joints") or ())
     if not joints:
         fail(where, "the skeleton has no joints", "at least one is needed", "export the armature again")
