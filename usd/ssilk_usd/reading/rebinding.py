@@ -42,9 +42,6 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
     if location(own.prim) == skeleton.path:
         return None
     match = np.array(match_joints(own.joints, skeleton.joint_names))
-    for joint, above in enumerate(own.parents):
-        if match[joint] < 0 and above >= 0:
-            match[joint] = match[above]
     theirs, binds = own.binds_to_core(own.bind), skeleton.bind_transforms
     character = character_source(own.stage, skeleton)
     if character is None:
@@ -54,7 +51,9 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
         kept = character.character_joints
         shown = _shown(character, animated)[kept] @ np.linalg.inv(binds)
         to_character = np.linalg.inv(shown)[match] @ _shown(own, animated) @ np.linalg.inv(theirs)
-    to_character[match < 0] = np.eye(4)
+    for joint in np.flatnonzero(match < 0):
+        above = own.parents[joint]
+        to_character[joint] = to_character[above] if above >= 0 else np.eye(4)
     return to_character if np.abs(to_character - np.eye(4)).max() > SAME else None
 
 
