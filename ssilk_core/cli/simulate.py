@@ -176,7 +176,7 @@ def _written(
 
     simulator = Simulator(scene, fabric, settings, device=device, report=report)
     motions = [shot.motion for shot in shots]
-    played = shots_of(motions, settings)
+    played = shots_of(motions, scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
     figures, start = _Figures(settings.solver.tolerance), time.monotonic()

@@ -783,3 +783,54 @@ def test_missing_layers_are_named(arc, tmp_path, capfd):
 def test_an_empty_folder_of_motions_gives_one_sentence(tmp_path):
     with pytest.raises(SsilkError, match="holds no USD files"):
         read_motions([tmp_path], SKELETON)
+
+
+# Which joint carries the body
+
+
+def game_skeleton(case: str) -> Usd.Stage:
+    """The character of `TRUTH` beneath joints that stand still, in the world as it was."""
+    stage = author(Usd.Stage.CreateInMemory())
+    above = {
+        "a root": ["root"],
+        "two": ["world", "world/root"],
+        "stray weights": ["root"],
+        "targets of inverse kinematics": ["root", "root/ik", "root/ik/hand"],
+        "another root first": ["helper"],
+    }[case]
+    under = {"two": "world/root/", "another root first": ""}.get(case, "root/")
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    for attribute in (skeleton.GetBindTransformsAttr(), skeleton.GetRestTransformsAttr()):
+        attribute.Set([*[Gf.Matrix4d(1)] * len(above), *attribute.Get()])
+    skeleton.GetJointsAttr().Set([*above, *(under + name for name in JOINTS)])
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    animation.GetJointsAttr().Set([under + name for name in JOINTS])
+    animation.GetScalesAttr().Set([Gf.Vec3h(1)] * len(JOINTS))
+    binding = UsdSkel.BindingAPI(stage.GetPrimAtPath("/Hero/Body"))
+    indices = np.array(binding.GetJointIndicesPrimvar().Get()) + len(above)
+    if case == "stray weights":
+        weights = np.array(binding.GetJointWeightsPrimvar().Get())
+        weights[0], indices[0] = 0.05, 0
+        binding.GetJointWeightsPrimvar().Set(weights.tolist())
+    binding.GetJointIndicesPrimvar().Set(indices.tolist())
+    return stage
+
+
+@pytest.mark.parametrize(
+    "case", ["a root", "two", "stray weights", "targets of inverse kinematics", "another root first"]
+)
+def test_the_joint_that_carries_the_body_is_found_beneath_still_ones(case):
+    stage = game_skeleton(case)
+    skeleton = read_character(stage).skeleton
+    assert skeleton.joint_names[skeleton.hub].endswith("Hips")
+    motion = read_motion(stage, skeleton)
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(stage.GetPrimAtPath("/Hero")), Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")))
+    expected = [query.ComputeJointSkelTransforms(code)[skeleton.hub].ExtractTranslation() for code in range(1, 7)]
+    found = kinematics.hub_places(skeleton, motion.rotations, motion.translations)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_the_first_joint_carries_the_body_that_hangs_from_it():
+    assert read_character(author(Usd.Stage.CreateInMemory())).skeleton.hub == 0

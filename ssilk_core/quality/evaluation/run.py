@@ -150,7 +150,8 @@ class _Run:
         report: Reporter,
     ) -> None:
         self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
-        cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
+        skeleton, clips = dressed.scene.character.skeleton, playlist.clips.items()
+        cut = [takes_of(name, motion, skeleton, dressed.fps, options.sequence) for name, motion in clips]
         self.takes = [take for takes in cut for take in takes]
         self.clips = {number: take.clip for number, take in enumerate(self.takes)}
         self.simulated = takes_in(self.clips, playlist.simulated)

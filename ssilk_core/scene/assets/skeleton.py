@@ -21,6 +21,8 @@ class Skeleton:
         parents: index of each joint's parent, -1 for roots, shape (J,).
         bind_transforms: joint to world at the bind pose, rigid, shape (J, 4, 4).
         rest_transforms: joint to parent at rest (world for roots), rigid, shape (J, 4, 4).
+        hub: the joint that carries the body as a whole, whichever stand above it: air moves along with it, cuts are
+            its jumps, and what is relative to the character is relative to it.
     """
 
     path: str
@@ -28,6 +30,7 @@ class Skeleton:
     parents: Ints
     bind_transforms: Floats
     rest_transforms: Floats
+    hub: int = 0
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -52,12 +55,22 @@ class Skeleton:
                 "parents must come first, and a joint must not be its own ancestor",
                 "reorder the joints",
             )
+        if not 0 <= self.hub < count:
+            fail(self.path, f"joint {self.hub} carries the body", f"joints are 0 to {count - 1}")
         check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
         check_rigid(self.rest_transforms, self.path, "rest transform", self.joint_names)
 
     @property
     def joint_count(self) -> int:
         return len(self.joint_names)
+
+    @property
+    def hub_path(self) -> tuple[int, ...]:
+        """The joints above the hub, from the top, and the hub."""
+        path = [self.hub]
+        while (above := int(self.parents[path[0]])) >= 0:
+            path.insert(0, above)
+        return tuple(path)
 
 
 def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:

@@ -25,10 +25,11 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
-from .mesh import is_garment
-from .skin import match_joints
+from .mesh import is_drawn, is_garment
+from .skin import match_joints, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
+_STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
 _CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
 
 
@@ -112,7 +113,37 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     parents = position[source.parents[kept]]
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
-    return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest)
+    hub = _carries_body(_moved_weights(source)[kept], parents)
+    return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest, hub)
+
+
+def _moved_weights(source: SkelSource) -> Floats:
+    """Return how much of the bodies each joint of a skeleton moves, as the sum of its weights, shape (N,)."""
+    total = np.zeros(len(source.joints) + 1)
+    for prim in Usd.PrimRange(source.root, PRIMS):
+        if prim.IsA(UsdGeom.Mesh) and is_drawn(prim) and not is_garment(prim) and bound_skeleton(prim) == source.prim:
+            influences = read_influences(prim, source.joints)
+            if influences is not None:
+                at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
+                np.add.at(total, at, np.abs(influences.weights) / max(len(at), 1))
+    return total[:-1]
+
+
+def _carries_body(moved: Floats, parents: Ints) -> int:
+    """Return the joint that carries the body: the lowest one that all of it hangs from, but for `_STRAY` of it.
+
+    Game skeletons have joints above the hips, which may stand still while the character runs.
+
+    Args:
+        moved: how much of the body each joint moves itself, shape (J,).
+    """
+    below = np.array(moved)
+    for joint in range(len(parents) - 1, -1, -1):
+        if parents[joint] >= 0:
+            below[parents[joint]] += below[joint]
+    whole = (1 - _STRAY) * moved.sum()
+    held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
+    return int(held[-1]) if len(held) else 0
 
 
 def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
