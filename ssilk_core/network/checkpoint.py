@@ -114,6 +114,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
+        **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
 
 
@@ -249,6 +250,7 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.skeleton.bind_transforms"],
         tensors["scene.skeleton.rest_transforms"],
         document.get("hub", 0),
+        np.array(document["placement"], np.float64) if "placement" in document else None,
     )
     mesh = Mesh(
         paths["garment"],

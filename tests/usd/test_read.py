@@ -834,3 +834,46 @@ def test_the_joint_that_carries_the_body_is_found_beneath_still_ones(case):
 
 def test_the_first_joint_carries_the_body_that_hangs_from_it():
     assert read_character(author(Usd.Stage.CreateInMemory())).skeleton.hub == 0
+
+
+# Clips that stand alone, of characters whose axis or scale stands in an Xform
+
+
+def alone(stage: Usd.Stage, *, meters: float, up: str) -> Usd.Stage:
+    """The animation of a character in a file of its own."""
+    clip = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(clip, meters)
+    UsdGeom.SetStageUpAxis(clip, up)
+    clip.SetTimeCodesPerSecond(30)
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Rig/Walk", clip.GetRootLayer(), "/Walk")
+    return clip
+
+
+TILTED = {
+    "a quarter turn": Recipe(placements=[UPRIGHT_Z]),
+    "a quarter turn and centimetres": Recipe(placements=[turned("x", -90, 0.01)]),
+    "centimetres": Recipe(placements=[turned("x", 0, 0.01)]),
+    "y up in a z-up stage": Recipe(up="Z", placements=[np.linalg.inv(UPRIGHT_Z)]),
+    "centimetres, y up, in a z-up stage of metres": Recipe(up="Z", placements=[turned("x", 90, 0.01)]),
+    "turned, moved and scaled": Recipe(placements=[turned("y", 30, at=(2, 0, 1)) @ turned("x", -90, 0.01)]),
+}
+
+
+@pytest.mark.parametrize("recipe", TILTED.values(), ids=TILTED)
+def test_a_clip_alone_moves_its_character_as_usdskel_shows_it_bound(recipe):
+    stage = author(Usd.Stage.CreateInMemory(), recipe)
+    character = read_character(stage)
+    motion = read_motion(alone(stage, meters=recipe.meters, up=recipe.up), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+
+
+def test_a_clip_whose_file_states_its_axis_and_units_is_read_by_them():
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("x", -90, 0.01)]))
+    character = read_character(stage)
+    motion = read_motion(alone(stage, meters=0.01, up="Z"), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+    plain = author(Usd.Stage.CreateInMemory())  # converted when it was exported: metres, y up
+    motion = read_motion(alone(plain, meters=1, up="Y"), character.skeleton)
+    assert np.abs(our_points(character, motion) - usdskel_points(plain, "/Hero/Body", range(1, 7))).max() < 1e-5

@@ -113,6 +113,8 @@ def _on_motions(inputs: PreflightInput) -> Findings:
     for clip in inputs.motions:
         yield from motion.root_jumps(clip, skeleton)
     for clip in inputs.motions:
+        yield from motion.lying(clip, skeleton)
+    for clip in inputs.motions:
         yield from motion.joint_jumps(clip, skeleton)
     for clip in inputs.motions:
         yield from motion.joint_snaps(clip, skeleton)

@@ -18,6 +18,7 @@ from ...scene.kinematics import (
     motion_transforms,
     skinning_matrices,
     split_at_cuts,
+    world_transforms,
 )
 from .finding import Finding, Findings, format_joints, index_tuple
 
@@ -26,6 +27,7 @@ USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
 CHECKED_RATE, MOST_CHECKED = 5.0, 500  # poses a second, and in all, in which limbs are looked for inside the body
 MANY_BURIED = 0.02  # share of the frames
 NAMED_LIMBS = 3
+LYING, MOSTLY = 0.5, 0.9  # cosine between the hub's up axis and that at rest, and share of the frames
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
 
 
@@ -71,6 +73,25 @@ def root_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
             fix="cut the clip there, or repair the root's curve",
             elements="frames",
             indices=index_tuple(starts),
+        )
+
+
+def lying(motion: Motion, skeleton: Skeleton) -> Findings:
+    """Yield a warning if the character lies, or stands on its head, in nearly all frames of a motion."""
+    hub = motion_transforms(motion, skeleton.parents)[:, skeleton.hub, :3, :3]
+    rest = world_transforms(skeleton.rest_transforms, skeleton.parents)[skeleton.hub, :3, :3]
+    down = np.flatnonzero((hub @ rest.T)[:, 1, 1] < LYING)
+    if len(down) > MOSTLY * motion.frame_count:
+        yield Finding(
+            severity="warning",
+            code="lying",
+            prim=motion.path,
+            count=len(down),
+            found=f"the character lies or stands on its head in {len(down)} of {motion.frame_count} frames",
+            why="gravity pulls the cloth along the world's y axis, not towards the character's feet",
+            fix="if it should stand, correct upAxis of the motion's file, or export it together with its character",
+            elements="frames",
+            indices=index_tuple(down),
         )
 
 

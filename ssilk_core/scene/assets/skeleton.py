@@ -23,6 +23,8 @@ class Skeleton:
         rest_transforms: joint to parent at rest (world for roots), rigid, shape (J, 4, 4).
         hub: the joint that carries the body as a whole, whichever stand above it: air moves along with it, cuts are
             its jumps, and what is relative to the character is relative to it.
+        placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
+            above the skeleton tilt or scale it; None elsewhere.
     """
 
     path: str
@@ -31,6 +33,7 @@ class Skeleton:
     bind_transforms: Floats
     rest_transforms: Floats
     hub: int = 0
+    placement: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -45,6 +48,11 @@ class Skeleton:
             bind_transforms=frozen(self.bind_transforms, np.float64),
             rest_transforms=frozen(self.rest_transforms, np.float64),
         )
+        if self.placement is not None:
+            assign(self, placement=frozen(self.placement, np.float64))
+            if self.placement.shape != (4, 4):
+                fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
+            need_finite(self.placement, self.path, "placement")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))

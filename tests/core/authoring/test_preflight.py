@@ -386,6 +386,17 @@ def test_root_jumps():
     assert found.indices == (40,) and "2 m" in found.found
 
 
+def test_a_character_that_lies_throughout_is_told():
+    assert not list(motion.lying(turning(), SKELETON))
+    quarter = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+    rotations = turning().rotations.copy()
+    rotations[:, 0] = multiply_quaternions(quarter, rotations[:, 0])
+    found = only(motion.lying(replace(turning(), rotations=rotations), SKELETON))
+    assert "lies or stands on its head in 60 of 60 frames" in found.found and found.count == 60
+    rotations[:20] = turning().rotations[:20]
+    assert not list(motion.lying(replace(turning(), rotations=rotations), SKELETON))
+
+
 def test_joint_jumps():
     assert not list(motion.joint_jumps(turning(), SKELETON))
     moved = turning().translations.copy()

@@ -114,7 +114,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
     hub = _carries_body(_moved_weights(source)[kept], parents)
-    return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest, hub)
+    binds, placement = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
+    return Skeleton(location(source.prim), names, parents, binds, rest, hub, placement)
 
 
 def _moved_weights(source: SkelSource) -> Floats:
