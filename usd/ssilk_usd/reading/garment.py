@@ -30,6 +30,7 @@ from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import display_colour, is_drawn, is_garment, read_mesh
 from .rebinding import blended_moves, character_source, common_move, joint_moves, used_moves
+from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton, skeletons
 from .skin import match_joints, read_influences, read_skin
 from .spaces import SkelSource
@@ -38,7 +39,12 @@ from .surface import read_surface
 
 @needs_whole_files
 def read_garment(
-    source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    garment: str | None = None,
+    root: str | None = None,
+    shaped: bool = True,
 ) -> Garment:
     """Read a garment at rest, in the core's bind space [m], y up.
 
@@ -52,6 +58,7 @@ def read_garment(
         skeleton: skeleton of the character; weights are remapped to its joints by name.
         garment: the mesh, by path or name, if there are several.
         root: the character that the garment is fitted to, if the stage has several.
+        shaped: with the blendshapes that are on at the earliest time; those of a baked garment move it in its shot.
 
     Raises:
         SsilkError: there is no garment or several, or the data is malformed.
@@ -60,7 +67,7 @@ def read_garment(
     prim = find_garment(stage, garment)
     skel = fitted_skeleton(prim, root)
     place = garment_place(prim, skel, skeleton)
-    mesh = read_mesh(prim, place.to_core)
+    mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
     mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None

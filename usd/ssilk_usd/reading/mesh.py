@@ -39,18 +39,20 @@ def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def read_mesh(prim: Usd.Prim, to_core: Floats) -> Mesh:
+def read_mesh(prim: Usd.Prim, to_core: Floats, offsets: Floats | None = None) -> Mesh:
     """Read a UsdGeom.Mesh; its earliest points are its rest shape.
 
     Args:
         prim: the mesh. Hole faces are omitted, and left-handed faces are reversed.
         to_core: transform from the mesh's local space to the core's bind space [m], column vectors, shape (4, 4).
+        offsets: of the points, in local space, which blendshapes move, shape (V, 3).
 
     Raises:
         SsilkError: counts, indices or texture coordinates do not match, or points are not finite.
     """
     where = location(prim)
     points = np.array(value(prim, "points") or [], dtype=np.float64).reshape(-1, 3)
+    points = points if offsets is None else points + offsets
     counts, indices = _polygons(prim, len(points), where)
     corners, counts = _kept_corners(prim, counts)
     uvs = _texture_coordinates(prim, indices)

@@ -60,7 +60,7 @@ def read_baked(source: StageLike) -> BakedGarment:
     if skel is None:
         fail(location(prim), "its stage has no skeleton", "a baked garment needs joints", "choose a shot with joints")
     skeleton = character_skeleton(skel)
-    garment, rig = read_garment(stage, skeleton), read_proxy_rig(stage, skeleton)
+    garment, rig = read_garment(stage, skeleton, shaped=False), read_proxy_rig(stage, skeleton)
     joints, binds, skin = skeleton.joint_names, skeleton.bind_transforms, garment.skin
     if rig is not None:
         joints, binds, skin = (*joints, *rig.joint_names), np.concatenate([binds, rig.bind_transforms]), rig.skin
