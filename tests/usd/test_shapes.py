@@ -31,7 +31,8 @@ def dressed(folder, weights, *, inbetween=False, sparse=False, order=("Other", "
     skeleton.CreateJointsAttr(["Hips", "Hips/Spine"])
     binds = kinematics.rigid(BIND[:, :3, :3], BIND[:, :3, 3] * 100)
     skeleton.CreateBindTransformsAttr([gf(matrix) for matrix in binds])
-    skeleton.CreateRestTransformsAttr([gf(matrix) for matrix in kinematics.local_transforms(binds, np.array([-1, 0]))])
+    rest = kinematics.local_transforms(binds, np.array([-1, 0]))
+    skeleton.CreateRestTransformsAttr([gf(matrix) for matrix in rest])
     for name in ("Body", "Cape"):
         mesh = UsdGeom.Mesh.Define(stage, f"/Hero/{name}")
         mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((POINTS * 100).astype("f4")))

@@ -215,6 +215,8 @@ class BakeRollout:
 
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""
+        from ssilk_usd.reading.shapes import tell_animated_shapes
+
         from ...authoring.preflight.motion import joint_jumps, root_jumps
 
         skeleton = self.deformer.scene.character.skeleton
@@ -224,6 +226,7 @@ class BakeRollout:
             code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
+        tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
 

@@ -7,11 +7,13 @@ of the character's stage throughout, and `animated_shapes` says which ones a mot
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel, Vt
 
+from ssilk_core.events import Message, Reporter
 from ssilk_core.scene.assets import Floats
 
 from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage, split_location, value
@@ -47,7 +49,7 @@ def _weights(prim: Usd.Prim, skel: SkelSource) -> list[float] | None:
     found, mapper = animation.ComputeBlendShapeWeights(EARLIEST), query.GetBlendShapeMapper()
     if found is None or mapper is None or mapper.IsNull():
         return None
-    remapped = mapper.Remap(found, defaultValue=0.0)
+    remapped = mapper.Remap(found)
     return None if remapped is None else [float(weight) for weight in remapped]
 
 
@@ -73,6 +75,21 @@ class AnimatedShape:
         return f"'{self.name}' of {self.mesh}, {course} where the character's stage has {self.weight:.3g}"
 
 
+def tell_animated_shapes(
+    source: StageLike, motions: Iterable[str], report: Reporter, *, root: str | None = None
+) -> None:
+    """Report which blendshapes of the character's meshes motions change, in which cloth does not meet them.
+
+    Args are those of `animated_shapes`, for each of several motions.
+    """
+    for motion in motions:
+        found = animated_shapes(source, motion, root=root)
+        if found:
+            text = f"{motion}: it weighs blendshapes that are not followed: {found[0]}"
+            more = f", and {len(found) - 1} more" if len(found) > 1 else ""
+            report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
+
+
 @needs_whole_files
 def animated_shapes(source: StageLike, motion: str, *, root: str | None = None) -> list[AnimatedShape]:
     """Return the blendshapes of a character's meshes that a motion weighs otherwise than its stage does.
@@ -85,14 +102,14 @@ def animated_shapes(source: StageLike, motion: str, *, root: str | None = None) 
     Raises:
         SsilkError: as `read_motion` and `read_character`.
     """
-    stage = open_stage(source)
-    skel = find_skeleton(stage, root=root)
     file, prim = split_location(motion)
     of_motion = open_stage(file)
     animation = UsdSkel.Animation(find_animation(of_motion, prim, root)[0])
     names = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
     if not names:
         return []
+    stage = open_stage(source)
+    skel = find_skeleton(stage, root=root)
     attribute = animation.GetBlendShapeWeightsAttr()
     codes = attribute.GetTimeSamples() or [Usd.TimeCode.Default()]
     rows = np.array(
