@@ -877,3 +877,56 @@ def test_a_clip_whose_file_states_its_axis_and_units_is_read_by_them():
     plain = author(Usd.Stage.CreateInMemory())  # converted when it was exported: metres, y up
     motion = read_motion(alone(plain, meters=1, up="Y"), character.skeleton)
     assert np.abs(our_points(character, motion) - usdskel_points(plain, "/Hero/Body", range(1, 7))).max() < 1e-5
+
+
+# Which side is outside, under negative scales
+
+
+def box_in(stage: Usd.Stage, path: str, scale, left_handed: bool) -> UsdGeom.Mesh:
+    """A tetrahedron whose faces are seen from outside: its scales and its orientation turn them round together."""
+    points = np.array([[0, 1, 0], [0.3, 1, 0], [0, 1.3, 0], [0, 1, 0.3]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    UsdGeom.Xformable(mesh.GetPrim().GetParent()).AddScaleOp().Set(Gf.Vec3f(*scale))
+    local = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()).GetInverse())
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((points @ local[:3, :3] + local[3, :3]).astype("f4")))
+    if (np.linalg.det(local[:3, :3]) < 0) != left_handed:
+        faces = faces[:, ::-1]
+    mesh.CreateFaceVertexCountsAttr([3] * 4)
+    mesh.CreateFaceVertexIndicesAttr(faces.reshape(-1).tolist())
+    mesh.CreateOrientationAttr(UsdGeom.Tokens.leftHanded if left_handed else UsdGeom.Tokens.rightHanded)
+    return mesh
+
+
+def volume(mesh: Mesh) -> float:
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    return float(np.einsum("fc,fc->f", a, np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize("left_handed", [False, True])
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 1, 1), (2, -1, 1), (-1, -1, -1), (-1, 1, -1)])
+def test_a_negative_scale_turns_no_face_inside_out(scale, left_handed):
+    """UsdGeom: xforms that mirror turn a mesh's handedness, so that its outside stays outside."""
+    stage = author(Usd.Stage.CreateInMemory())
+    UsdGeom.Xform.Define(stage, "/Set")
+    mesh = box_in(stage, "/Set/Cape", scale, left_handed)
+    assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
+    indices, weights = mesh.GetPrim(), UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    weights.CreateSkeletonRel().SetTargets(["/Hero/Rig"])  # skinned, its xforms still say how it is drawn
+    weights.CreateJointIndicesPrimvar(True, 1).Set([0])
+    weights.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    weights.CreateGeomBindTransformAttr(UsdGeom.XformCache().GetLocalToWorldTransform(indices))
+    assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
+
+
+def test_a_joint_that_is_listed_twice_is_refused_by_name():
+    """UsdSkel takes one of both, and says nothing."""
+    stage = author(Usd.Stage.CreateInMemory())
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    animation.GetJointsAttr().Set([*JOINTS[:4], JOINTS[1]])
+    with pytest.raises(SsilkError, match=r"/Hero/Rig/Walk: joint 'Hips/Spine' is listed twice"):
+        read_motion(stage, SKELETON)
+    body = UsdSkel.BindingAPI(stage.GetPrimAtPath("/Hero/Body"))
+    body.CreateJointsAttr([*JOINTS[:4], JOINTS[3]])
+    with pytest.raises(SsilkError, match=r"/Hero/Body: joint 'Hips/Leg' is listed twice"):
+        read_character(stage)

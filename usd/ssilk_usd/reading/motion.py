@@ -29,7 +29,7 @@ from ..opening.stage import (
 from ..units import StageUnits
 from .clips import LOOKED_AT, clip_placement, spread
 from .skeleton import of_bodies, skeletons
-from .skin import match_joints
+from .skin import match_joints, need_unique
 from .spaces import joints_to_core, need_similarity, similarity_scale
 
 _SCALE_TOLERANCE = 1e-3
@@ -104,6 +104,7 @@ def read_motion(
     animation, placed = find_animation(stage, prim, root)
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    need_unique(joints, where)
     match = _matched(joints, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed, within)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
@@ -26,7 +24,7 @@ from ..opening.stage import (
 )
 from ..units import StageUnits
 from .mesh import is_drawn, is_garment
-from .skin import match_joints, read_influences
+from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
 _STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
@@ -174,9 +172,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
 
 def _parents(joints: tuple[str, ...], where: str) -> Ints:
     """Return parent indices by UsdSkel's rule: the parent is the nearest ancestor path that is a joint."""
-    repeated = next((name for name, count in Counter(joints).items() if count > 1), None)
-    if repeated is not None:
-        fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
+    need_unique(joints, where)
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
     if broken is not None:
         fail(where, f"joint '{broken}' is not a path", "joints are paths like 'Hips/Spine'", "rename it")
