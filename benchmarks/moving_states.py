@@ -110,7 +110,7 @@ class PlayedWindow:
         self.subject, self.best = subject, BestOutputs(subject)
         motion = take_set.takes[take].motion
         self.motion = motion.clip(frames.start, frames.stop)
-        self.origin = torch.as_tensor(motion.translations[0, 0].copy(), device=subject.device)
+        self.origin = torch.as_tensor(take_set.origins[take].copy(), device=subject.device)
         self.character = take_set.character(take, frames).double()
         self.world = played.vertices(take, frames).double() + self.origin[:, None]
         self.outputs = subject.model.output(played.states[take][frames.start : frames.stop]).double()
@@ -165,7 +165,8 @@ class PlayedWindow:
 def measure(subject: Subject, options: Namespace) -> dict[str, float]:
     """Return the figures of one garment over the windows of all clips."""
     fps = subject.file.config.fps
-    takes = [take for name in options.clips for take in takes_of(name, clip_of(options, name, subject), fps)]
+    skeleton, clips = subject.scene.character.skeleton, options.clips
+    takes = [take for name in clips for take in takes_of(name, clip_of(options, name, subject), skeleton, fps)]
     take_set = build_take_set(takes, subject.dressed, subject.model.joints)
     played = Network(subject.model, take_set)
     steps, drifts, begun = [], [], time.perf_counter()

@@ -89,7 +89,8 @@ def playlist(options: argparse.Namespace, subject: Subject) -> Playlist:
     windows: dict[str, list[Window]] = {split: [] for split in splits}
     for split, clips in splits.items():
         for clip in clips:
-            own = takes_of(clip, clip_of(options, clip, subject), subject.file.config.fps)
+            skeleton, fps = subject.scene.character.skeleton, subject.file.config.fps
+            own = takes_of(clip, clip_of(options, clip, subject), skeleton, fps)
             own = within(own, options.within)
             numbered = dict(enumerate(own, start=len(takes)))
             takes += own

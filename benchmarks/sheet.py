@@ -41,7 +41,7 @@ def opened_take(options: argparse.Namespace, subject: Subject) -> Take:
     """
     skeleton, name = subject.scene.character.skeleton, options.motion
     motion = build_motion(name, skeleton) if name in MOTIONS else read_motion(Path(name), skeleton)
-    takes = takes_of(Path(name).stem, motion, subject.file.config.fps)
+    takes = takes_of(Path(name).stem, motion, skeleton, subject.file.config.fps)
     if len(takes) != 1:
         fail(str(name), f"{len(takes)} parts between cuts", "a motion of four frames or more without a cut is drawn")
     outside = [frame for frame in options.frames if not 0 <= frame < takes[0].frame_count]

@@ -148,7 +148,8 @@ def table3(options: argparse.Namespace) -> tuple[str, Any]:
     for path in options.models:
         file, model = load_network(path)
         dressed = dressed_in(file, options.stage, options.device)
-        takes = takes_of(options.clip, clip_of(options, file), dressed.fps)
+        skeleton = dressed.scene.character.skeleton
+        takes = takes_of(options.clip, clip_of(options, file), skeleton, dressed.fps)
         times = frame_times(model.to(dressed.device), build_take_set(takes[:1], dressed, file.joints), options.frames)
         found[path.stem] = vars(times)
         spans = [f"{1000 * value:.2f} ± {1000 * spread:.2f}" for value, spread in (times.full, times.model)]

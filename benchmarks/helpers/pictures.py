@@ -45,7 +45,7 @@ class PlayedShot:
         x = method.vertices(0, range(motion.frame_count)).double().permute(2, 0, 1).cpu().numpy()
         if not np.isfinite(x).all():
             fail(name, "it is not finite", "a picture needs positions")
-        self.garment, self.body, self.fps = x + motion.translations[0, 0], body, motion.fps
+        self.garment, self.body, self.fps = x + take_set.origins[0], body, motion.fps
         self.frame_times = [float(frame) for frame in range(motion.frame_count)]
         faces = dressed.scene.character.merged_body().mesh.faces
         self.meshes = [PlayedMesh("body", faces, False), PlayedMesh(dressed.name, mesh.faces, True)]

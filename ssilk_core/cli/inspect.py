@@ -67,6 +67,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
     from ssilk_usd.reading.facts import animated
+    from ssilk_usd.reading.shapes import tell_animated_shapes
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
@@ -75,6 +76,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
+    tell_animated_shapes(options.stage, [motion.path for motion in motions], report, root=options.root)
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
@@ -134,7 +136,8 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
         write_with_units(file, half_done, units)
         inputs = _read_inputs(_moved(options, half_done), silent)
         repair = plan_repair(inputs.character, inputs.garment, inputs.rig, topology=not inputs.locked)
-        write_repaired(half_done, half_done, repair, garment=prim, root=options.root)
+        skeleton = inputs.character.skeleton
+        write_repaired(half_done, half_done, repair, garment=prim, root=options.root, skeleton=skeleton)
     return [*stated, *repair.done]
 
 

@@ -81,6 +81,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
     from ssilk_usd.reading.frame_range import read_in_range
     from ssilk_usd.reading.motion import motion_files
+    from ssilk_usd.reading.shapes import tell_animated_shapes
 
     from ..devices import select_device
     from ..physics.simulate import SimulationOptions
@@ -102,6 +103,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
+    tell_animated_shapes(options.stage, [motion.path for motion in motions], report, root=options.root)
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric))
         for output, motion, path in zip(outputs, motions, options.motion)
@@ -176,7 +178,7 @@ def _written(
 
     simulator = Simulator(scene, fabric, settings, device=device, report=report)
     motions = [shot.motion for shot in shots]
-    played = shots_of(motions, settings)
+    played = shots_of(motions, scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
     figures, start = _Figures(settings.solver.tolerance), time.monotonic()

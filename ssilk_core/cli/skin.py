@@ -67,9 +67,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     deformer = cap_influences(_deformer(options, report), target)
     mesh = deformer.scene.garment.mesh
     points = MeshTrajectories(options.cache, mesh.vertex_count, mesh.faces)
-    motion = motion_at(
-        read_motion(where, deformer.scene.character.skeleton, root=options.root), points, options.cache
-    )
+    skeleton = deformer.scene.character.skeleton
+    motion = motion_at(read_motion(where, skeleton, root=options.root), skeleton, points, options.cache)
     report(Started("skin", motion.frame_count, {"output": str(options.output)}))
     own = StageUnits.of(open_stage(options.stage))
     result = skin_trajectories(

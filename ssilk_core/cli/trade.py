@@ -133,7 +133,9 @@ class Bench:
             self._check(path, file, first)
         self.paths, self.others = self._motions(first)
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
-        cut = [within(takes_of(name, clip, first.config.fps), options.frames) for name, clip in self.clips.items()]
+        skeleton = first.scene.character.skeleton
+        fps = first.config.fps
+        cut = [within(takes_of(name, clip, skeleton, fps), options.frames) for name, clip in self.clips.items()]
         self.takes = [take for own in cut for take in own]
         self.frames = {name: sum(take.frame_count for take in own) for name, own in zip(self.clips, cut)}
         self.asked: dict[str, Any] = {

@@ -34,7 +34,7 @@ FORMAT = 6  # of the models that ship; files of another are refused
 HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
-    "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {},
+    "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
@@ -113,6 +113,8 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
+        **({"hub": skeleton.hub} if skeleton.hub else {}),
+        **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
 
 
@@ -247,6 +249,8 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.skeleton.parents"],
         tensors["scene.skeleton.bind_transforms"],
         tensors["scene.skeleton.rest_transforms"],
+        document.get("hub", 0),
+        np.array(document["placement"], np.float64) if "placement" in document else None,
     )
     mesh = Mesh(
         paths["garment"],

@@ -2,10 +2,10 @@
 """Descriptors: the features of a motion that the network receives (paper, Sections 3.1 and 3.2).
 
 The state of a garment does not depend on the position, heading or constant velocity of its character. Rotating
-character and gravity together only rotates the result. The descriptors have these symmetries by construction.
-Gravity enters as its direction in the frame of each joint. The root enters through its angular motion and through
-accelerations, not through a position, a heading or a velocity. Augmentation by a rotation of the character is
-therefore equivalent to the inverse rotation of gravity, which costs nothing.
+character and gravity together only rotates the result. The descriptors have these symmetries by construction. Gravity
+enters as its direction in the frame of each joint. The root, which is the skeleton's hub, enters through its angular
+motion and through accelerations, not through a position, a heading or a velocity. Augmentation by a rotation of the
+character is therefore equivalent to the inverse rotation of gravity, which costs nothing.
 
 Those of the paper are "absolute": beside the static descriptor S sees those of the two poses before, and the root's
 rotations and positions in the world. A garment then behaves differently where its character stands or faces
@@ -35,7 +35,8 @@ class PoseFeatures:
     """Descriptors of a motion's frames without gravity, which depends on the augmentation.
 
     Attributes:
-        static: 6D local rotations of the descriptor joints except the root, shape (F, S).
+        static: 6D local rotations of the descriptor joints except the hub, shape (F, S); of joints above the hub,
+            rotations relative to it.
         dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D); absolute
             ones are those of the two frames before (2 S), and `VECTORS` in the world.
         down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
@@ -49,12 +50,29 @@ class PoseFeatures:
 
 
 def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
-    """Return the joints flagged in `used` (J,) and all their ancestors, sorted, shape (J',)."""
+    """Return the joints flagged in `used` (J,) and their ancestors up to the hub, sorted, shape (J',).
+
+    The garment's state does not depend on what stands above the hub, unless something hangs there.
+    """
     keep = np.array(used, dtype=bool)
+    keep[skeleton.hub] |= skeleton.parents[skeleton.hub] >= 0
     for joint in range(skeleton.joint_count - 1, -1, -1):
-        if keep[joint] and skeleton.parents[joint] >= 0:
+        if keep[joint] and skeleton.parents[joint] >= 0 and joint != skeleton.hub:
             keep[skeleton.parents[joint]] = True
     return np.flatnonzero(keep)
+
+
+def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
+    """Return the places in `joints` (J',) of those whose rotations are features: all but the hub, and other roots."""
+    above = skeleton.hub_path[:-1]
+    return np.array(
+        [
+            i
+            for i, joint in enumerate(joints)
+            if joint in above or (joint != skeleton.hub and skeleton.parents[joint] >= 0)
+        ],
+        dtype=np.int64,
+    )
 
 
 def pose_features(
@@ -68,11 +86,13 @@ def pose_features(
     """
     world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
     local = matrix_from_quaternion(motion.rotations[:, joints])
-    inner = [i for i, joint in enumerate(joints) if skeleton.parents[joint] >= 0]
-    static = six_d(local[:, inner]).reshape(len(local), -1)
-    root, down = world[:, 0, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
+    centre = place_of_hub(skeleton, joints)
+    root, down = world[:, centre, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
+    above = np.flatnonzero(np.isin(joints, skeleton.hub_path[:-1]))
+    local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
+    static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
     if kind == "absolute":
-        axes, places = six_d(root), world[:, 0, :3, 3]
+        axes, places = six_d(root), world[:, centre, :3, 3]
         past = [_past(static, steps) for steps in (1, 2)]
         seen = [_past(values, steps) for values in (axes, places) for steps in (0, 1, 2)]
         earlier = np.concatenate([_past(down, steps) for steps in (1, 2)], axis=1)
@@ -85,6 +105,12 @@ def pose_features(
     acceleration = np.einsum("fba,fjb->fja", root, acceleration).reshape(len(local), -1)
     dynamic = np.concatenate([rate, change, *turn, acceleration], axis=1)
     return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0])
+
+
+def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:
+    """Return the place of the hub in `joints` (J',); the first one where nothing of the garment hangs below it."""
+    found = np.flatnonzero(joints == skeleton.hub)
+    return int(found[0]) if len(found) else 0
 
 
 def six_d(rotations: Floats) -> Floats:

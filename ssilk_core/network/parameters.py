@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..scene.assets import PINNED, Ints, Scene
-from .descriptors import VECTORS
+from .descriptors import VECTORS, inner_joints
 from .feedback import feedback_size
 from .schemes import SCHEMES
 from .settings import ModelConfig
@@ -41,7 +41,7 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
 
 def descriptor_sizes(scene: Scene, joints: Ints, kind: str = "relative") -> tuple[int, int]:
     """Return the number of static features, including gravity, and that of dynamic features of a kind."""
-    inner = int((scene.character.skeleton.parents[joints] >= 0).sum())
+    inner = len(inner_joints(scene.character.skeleton, joints))
     if kind == "absolute":
         return 6 * inner + 3 * len(joints), 2 * (6 * inner + 3 * len(joints)) + 3 * VECTORS
     return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)

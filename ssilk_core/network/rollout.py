@@ -179,7 +179,7 @@ def garment_poses(
     """
     rolled = roller or (lambda span: roll(model, span, chunk, pre_roll=pre_roll))
     first = source_frame = 0
-    for span in split_at_cuts(motion):
+    for span in split_at_cuts(motion, model.scene.character.skeleton):
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
         steps = rolled(resample(span, model.config.fps, cover=True))

@@ -133,6 +133,20 @@ def bind_pose(skeleton: Skeleton) -> tuple[Floats, Floats]:
     return quaternion_from_matrix(local[:, :3, :3]), local[:, :3, 3]
 
 
+def hub_places(skeleton: Skeleton, rotations: Floats, translations: Floats) -> Floats:
+    """Return the hub's positions [m], shape (F, 3), of local rotations (F, J, 4) and translations (F, J, 3)."""
+    *above, hub = skeleton.hub_path
+    places = translations[:, hub]
+    for joint in reversed(above):
+        places = (matrix_from_quaternion(rotations[:, joint]) @ places[..., None])[..., 0] + translations[:, joint]
+    return places
+
+
+def first_place(motion: Motion, skeleton: Skeleton) -> Floats:
+    """Return the hub's position in the first frame of a motion [m], shape (3,)."""
+    return hub_places(skeleton, motion.rotations[:1], motion.translations[:1])[0].copy()
+
+
 def motion_transforms(motion: Motion, parents: Ints) -> Floats:
     """Return joint-to-world transforms for every frame of a motion [m], shape (F, J, 4, 4)."""
     return world_transforms(rigid(matrix_from_quaternion(motion.rotations), motion.translations), parents)
@@ -183,7 +197,7 @@ def run_up(motion: Motion, seconds: float) -> Motion:
     return Motion(motion.path, motion.fps, rotations, translations)
 
 
-CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the root was teleported, not animated
+CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the hub was teleported, not animated
 CUT_WINDOW = 5  # frames on either side for that median, so that a fast vehicle is not a jump
 
 # Flips of captured joints are faster than this [rad/s], human motion is slower; the garment must not learn from
@@ -191,22 +205,25 @@ CUT_WINDOW = 5  # frames on either side for that median, so that a fast vehicle 
 MAX_JOINT_SPEED = 40.0
 
 
-def split_at_cuts(motion: Motion, *, max_joint_speed: float = np.inf) -> list[Motion]:
-    """Split a motion at jumps of its root (teleports, edits) and return the spans in order.
+def split_at_cuts(motion: Motion, skeleton: Skeleton, *, max_joint_speed: float = np.inf) -> list[Motion]:
+    """Split a motion at jumps of the hub (teleports, edits) and return the spans in order.
 
     A jump is a step that deviates from the median of the steps around it by more than `CUT_SPEED`. With
     `max_joint_speed` [rad/s] the motion is also split where a joint rotates faster, such as a flip in captured data.
     """
-    step = _deviation_from_median(np.diff(motion.translations[:, 0], axis=0)) * motion.fps
+    step = (
+        _deviation_from_median(np.diff(hub_places(skeleton, motion.rotations, motion.translations), axis=0))
+        * motion.fps
+    )
     cosine = np.abs((motion.rotations[1:] * motion.rotations[:-1]).sum(-1)).clip(max=1.0)
     turn = 2 * np.arccos(cosine).max(axis=1) * motion.fps
     ends = [*(np.flatnonzero((step > CUT_SPEED) | (turn > max_joint_speed)) + 1), motion.frame_count]
     return [motion.clip(start, stop) for start, stop in zip([0, *ends[:-1]], ends)]
 
 
-def held_at_cuts(motion: Motion, position: Floats) -> Floats:
+def held_at_cuts(motion: Motion, skeleton: Skeleton, position: Floats) -> Floats:
     """Return fractional frames, shape (N,), without those between a cut's two frames: the first of them is held."""
-    firsts = np.cumsum([span.frame_count for span in split_at_cuts(motion)])[:-1]
+    firsts = np.cumsum([span.frame_count for span in split_at_cuts(motion, skeleton)])[:-1]
     low = np.floor(position)
     return np.where(np.isin(low + 1, firsts), low, position)
 
@@ -338,8 +355,8 @@ def lbs_poses(frame_count: int) -> Iterator[GarmentPose]:
 
 
 def centred_matrices(motion: Motion, skeleton: Skeleton) -> tuple[Floats, Floats]:
-    """Return skinning matrices (F, J, 4, 4) with the first root at the origin, and that root's position (3,) [m]."""
+    """Return skinning matrices (F, J, 4, 4) with the first frame's hub at the origin, and its position (3,) [m]."""
     world = motion_transforms(motion, skeleton.parents)
-    origin = world[0, 0, :3, 3].copy()
+    origin = world[0, skeleton.hub, :3, 3].copy()
     world[..., :3, 3] -= origin
     return skinning_matrices(world, skeleton.bind_transforms), origin

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..files import replacing
 from ..network.tensors import pack_tensors
-from ..scene.assets import Motion
+from ..scene.assets import Motion, Skeleton
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .motion_bank import MotionBank, usable_spans
 from .skipped_steps import SkippedSteps
@@ -91,7 +91,11 @@ def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: s
     still = int(skipped.iteration) < stepper.config.static_iterations
     window = {name: value.cpu() for name, value in skipped.window.items() if (name in STATIC_INPUTS) == still}
     frames = window.get("frames" if still else "first")
-    places = [] if frames is None else locate_frames(frames, bank, motions, stepper.model.config.fps)
+    places = (
+        []
+        if frames is None
+        else locate_frames(frames, bank, motions, stepper.model.scene.character.skeleton, stepper.model.config.fps)
+    )
     document = {"found": found, "iteration": int(skipped.iteration) + 1, "places": places}
     tensors = learned_tensors(stepper) | {f"window.{name}": value.contiguous() for name, value in window.items()}
     arrays = {name: value.numpy() for name, value in tensors.items()}
@@ -99,9 +103,11 @@ def save_fault(path: Path, stepper: Stepper, motions: Sequence[Motion], found: s
         temporary.write_bytes(pack_tensors(arrays, {"ssilk_fault": json.dumps(document)}))
 
 
-def locate_frames(frames: Tensor, bank: MotionBank, motions: Sequence[Motion], fps: float) -> list[dict[str, Any]]:
+def locate_frames(
+    frames: Tensor, bank: MotionBank, motions: Sequence[Motion], skeleton: Skeleton, fps: float
+) -> list[dict[str, Any]]:
     """Return motion path and frame for each frame index (N,) of a bank of `motions` at `fps`."""
-    spans, starts = usable_spans(motions, fps, MAX_JOINT_SPEED), bank.starts.tolist()
+    spans, starts = usable_spans(motions, skeleton, fps, MAX_JOINT_SPEED), bank.starts.tolist()
     index = frames.tolist()
     clips = np.searchsorted(bank.stops.cpu().numpy(), index, side="right").tolist()
     return [

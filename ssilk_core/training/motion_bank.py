@@ -26,7 +26,7 @@ class MotionBank:
     Attributes:
         matrices: skinning matrices of every frame, shape (F, J * 12), translated so that each clip's root starts at
             the origin, where single precision is finest.
-        root: position of the first joint in the same coordinates [m], shape (F, 3).
+        root: position of the skeleton's hub in the same coordinates [m], shape (F, 3).
         static, dynamic, down, earlier: see `descriptors.PoseFeatures`.
         starts, stops: first frame and end of each clip, shape (clips,).
     """
@@ -103,7 +103,7 @@ def build_bank(
     """
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
-    spans = usable_spans(motions, fps, max_joint_speed)
+    spans = usable_spans(motions, skeleton, fps, max_joint_speed)
     if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
     # In single precision clip by clip: a large bank in double precision does not fit a host.
@@ -124,7 +124,8 @@ def build_bank(
 def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
     """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
     features, matrices = pose_features(clip, skeleton, joints, kind=kind), centred_matrices(clip, skeleton)[0]
-    root = matrices[:, 0, :3, :3] @ skeleton.bind_transforms[0, :3, 3] + matrices[:, 0, :3, 3]
+    hub = matrices[:, skeleton.hub]
+    root = hub[:, :3, :3] @ skeleton.bind_transforms[skeleton.hub, :3, 3] + hub[:, :3, 3]
     values = {
         "matrices": matrices[:, :, :3].reshape(len(matrices), -1),
         "root": root,
@@ -136,12 +137,14 @@ def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> 
     return {name: value.astype(np.float32) for name, value in values.items()}
 
 
-def usable_spans(motions: Sequence[Motion], fps: float, max_joint_speed: float = np.inf) -> list[Motion]:
+def usable_spans(
+    motions: Sequence[Motion], skeleton: Skeleton, fps: float, max_joint_speed: float = np.inf
+) -> list[Motion]:
     """Return the clips of a bank: spans between cuts with at least four frames at `fps`.
 
-    Motions are cut where the root jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
+    Motions are cut where the hub jumps, and where a joint turns faster than `max_joint_speed` [rad/s].
     """
-    spans = [span for motion in motions for span in split_at_cuts(motion, max_joint_speed=max_joint_speed)]
+    spans = [span for motion in motions for span in split_at_cuts(motion, skeleton, max_joint_speed=max_joint_speed)]
     return [span for span in spans if (span.frame_count - 1) * fps >= 3 * span.fps]
 
 

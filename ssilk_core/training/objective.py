@@ -68,7 +68,7 @@ class Objective:
             self.skin = Skinning(rows).to(device)
             rest = model.scene.garment.mesh.points[tethered]
             self.tethered_rest = torch.tensor(rest, dtype=torch.float32, device=device)
-        self.dt = 1 / model.config.fps
+        self.dt, self.hub = 1 / model.config.fps, model.scene.character.skeleton.hub
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
@@ -80,7 +80,7 @@ class Objective:
         Args:
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
         """
-        energy, root = self.energy, character[0, :, 3]  # heights over the root keep the value of gravity small
+        energy, root = self.energy, character[self.hub, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
         planes = self._planes(sampled.detach(), character, buried)

@@ -115,7 +115,7 @@ def build_parts(
     # Validation uses the whole body, to detect collisions with parts that training leaves out.
     whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
-    spans = usable_spans(job.held_out, fps)
+    spans = usable_spans(job.held_out, skeleton, fps)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
     smoothing = None if job.base else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing:

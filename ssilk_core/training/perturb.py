@@ -33,21 +33,24 @@ PUSH_SECONDS = 0.2  # [s] in which the ground speeds the body up, and slows it d
 def perturb_motions(
     motions: Sequence[Motion], skeleton: Skeleton, copies: int, seed: int, tumbling: float
 ) -> list[Motion]:
-    """Return `copies` of each motion with slow random turns of every joint but the root, about random axes.
+    """Return `copies` of each motion with slow random turns of the joints within the body, about random axes.
 
     About half of the copies then go to and fro between these poses and the bind pose, each limb its own part of the
     way. A share `tumbling` turns as a whole, about the middle of its joints and random axes, again and again.
     """
     generator = np.random.default_rng(seed)
     bind, limbs = bind_pose(skeleton)[0], limb_joints(skeleton)
-    found = [_perturbed(motion, bind, limbs, generator) for motion in [*motions] * copies]
+    found = [_perturbed(motion, skeleton, bind, limbs, generator) for motion in [*motions] * copies]
     return [_tumbling(motion, skeleton, generator) if generator.random() < tumbling else motion for motion in found]
 
 
-def _perturbed(motion: Motion, bind: Floats, limbs: Sequence[Ints], generator: np.random.Generator) -> Motion:
-    rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, generator)))
+def _perturbed(
+    motion: Motion, skeleton: Skeleton, bind: Floats, limbs: Sequence[Ints], generator: np.random.Generator
+) -> Motion:
+    whole = [0, *skeleton.hub_path]  # what moves the character as a whole
+    rotations = multiply_quaternions(motion.rotations, _quaternions(_turns(motion, whole, generator)))
     if generator.random() < BLEND_PROBABILITY:
-        rotations = _towards(rotations, bind, _bind_weights(motion, limbs, generator))
+        rotations = _towards(rotations, bind, _bind_weights(motion, whole, limbs, generator))
     return replace(motion, path=f"{motion.path} perturbed", rotations=rotations)
 
 
@@ -80,14 +83,14 @@ def _hop(time: Floats, flight: float) -> Floats:
     return (0.5 * GRAVITY * since * (flight - since)).clip(min=0).mean(axis=1)
 
 
-def _turns(motion: Motion, generator: np.random.Generator) -> Floats:
-    """Return rotation vectors (F, J, 3) [rad] that change slowly; those of the root are zero."""
+def _turns(motion: Motion, whole: list[int], generator: np.random.Generator) -> Floats:
+    """Return rotation vectors (F, J, 3) [rad] that change slowly; those of joints `whole` are zero."""
     count = motion.rotations.shape[1]
     far = generator.random((count, 1)) < LARGE_PROBABILITY
     size = np.where(far, LARGE_TURN, USUAL_TURN)
     still, swing = (size * generator.normal(size=(count, 3)) / np.sqrt(2) for _ in range(2))
     turns = still + np.sqrt(2) * swing * _waves(motion, generator, count)[..., None]
-    turns[:, 0] = 0
+    turns[:, whole] = 0
     return turns
 
 
@@ -98,12 +101,12 @@ def _towards(rotations: Floats, bind: Floats, weights: Floats) -> Floats:
     return slerp(rotations, bind, weights * fading.clip(0, 1))
 
 
-def _bind_weights(motion: Motion, limbs: Sequence[Ints], generator: np.random.Generator) -> Floats:
-    """Return how far joints are on their way to the bind pose, from 0 to 1, shape (F, J); the root never is."""
+def _bind_weights(motion: Motion, whole: list[int], limbs: Sequence[Ints], generator: np.random.Generator) -> Floats:
+    """Return how far joints but `whole` are on their way to the bind pose, from 0 to 1, shape (F, J)."""
     parts = np.ones(motion.rotations.shape[1])
     for joints in limbs:  # outer limbs come last
         parts[joints] = 1 if generator.random() < WHOLE_PROBABILITY else generator.random()
-    parts[0] = 0
+    parts[whole] = 0
     return (0.5 + 0.5 * _waves(motion, generator, 1)) * parts
 
 

@@ -31,10 +31,14 @@ def recombine_motions(motions: Sequence[Motion], skeleton: Skeleton, copies: int
 
 
 def limb_joints(skeleton: Skeleton) -> list[Ints]:
-    """Return the joints of every limb: each joint that has siblings, with its descendants."""
+    """Return the joints of every limb: each joint that has siblings, with its descendants; the body is none."""
     parents = np.asarray(skeleton.parents)
     children = np.bincount(parents[parents >= 0], minlength=len(parents))
-    heads = [joint for joint, parent in enumerate(parents) if parent >= 0 and children[parent] > 1]
+    heads = [
+        joint
+        for joint, parent in enumerate(parents)
+        if parent >= 0 and children[parent] > 1 and joint not in skeleton.hub_path
+    ]
     return [np.flatnonzero(_below(parents, head)) for head in heads]
 
 

@@ -251,9 +251,10 @@ class TrainingRun:
             self._rebuild_stepper(learned_tensors(self.stepper))
 
     def _announce(self) -> None:
+        skeleton = self.job.scene.character.skeleton
         for motions, max_joint_speed in ((self.job.motions, MAX_JOINT_SPEED), (self.job.held_out, inf)):
             for motion in motions:
-                if cuts := len(split_at_cuts(motion, max_joint_speed=max_joint_speed)) - 1:
+                if cuts := len(split_at_cuts(motion, skeleton, max_joint_speed=max_joint_speed)) - 1:
                     found = "root or a joint jumps" if max_joint_speed < inf else "root jumps"
                     text = f"{motion.path}: the {found} {cuts} times; the spans between are used separately."
                     self.report(Message(text))

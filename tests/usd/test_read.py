@@ -783,3 +783,150 @@ def test_missing_layers_are_named(arc, tmp_path, capfd):
 def test_an_empty_folder_of_motions_gives_one_sentence(tmp_path):
     with pytest.raises(SsilkError, match="holds no USD files"):
         read_motions([tmp_path], SKELETON)
+
+
+# Which joint carries the body
+
+
+def game_skeleton(case: str) -> Usd.Stage:
+    """The character of `TRUTH` beneath joints that stand still, in the world as it was."""
+    stage = author(Usd.Stage.CreateInMemory())
+    above = {
+        "a root": ["root"],
+        "two": ["world", "world/root"],
+        "stray weights": ["root"],
+        "targets of inverse kinematics": ["root", "root/ik", "root/ik/hand"],
+        "another root first": ["helper"],
+    }[case]
+    under = {"two": "world/root/", "another root first": ""}.get(case, "root/")
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    for attribute in (skeleton.GetBindTransformsAttr(), skeleton.GetRestTransformsAttr()):
+        attribute.Set([*[Gf.Matrix4d(1)] * len(above), *attribute.Get()])
+    skeleton.GetJointsAttr().Set([*above, *(under + name for name in JOINTS)])
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    animation.GetJointsAttr().Set([under + name for name in JOINTS])
+    animation.GetScalesAttr().Set([Gf.Vec3h(1)] * len(JOINTS))
+    binding = UsdSkel.BindingAPI(stage.GetPrimAtPath("/Hero/Body"))
+    indices = np.array(binding.GetJointIndicesPrimvar().Get()) + len(above)
+    if case == "stray weights":
+        weights = np.array(binding.GetJointWeightsPrimvar().Get())
+        weights[0], indices[0] = 0.05, 0
+        binding.GetJointWeightsPrimvar().Set(weights.tolist())
+    binding.GetJointIndicesPrimvar().Set(indices.tolist())
+    return stage
+
+
+@pytest.mark.parametrize(
+    "case", ["a root", "two", "stray weights", "targets of inverse kinematics", "another root first"]
+)
+def test_the_joint_that_carries_the_body_is_found_beneath_still_ones(case):
+    stage = game_skeleton(case)
+    skeleton = read_character(stage).skeleton
+    assert skeleton.joint_names[skeleton.hub].endswith("Hips")
+    motion = read_motion(stage, skeleton)
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(stage.GetPrimAtPath("/Hero")), Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")))
+    expected = [query.ComputeJointSkelTransforms(code)[skeleton.hub].ExtractTranslation() for code in range(1, 7)]
+    found = kinematics.hub_places(skeleton, motion.rotations, motion.translations)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_the_first_joint_carries_the_body_that_hangs_from_it():
+    assert read_character(author(Usd.Stage.CreateInMemory())).skeleton.hub == 0
+
+
+# Clips that stand alone, of characters whose axis or scale stands in an Xform
+
+
+def alone(stage: Usd.Stage, *, meters: float, up: str) -> Usd.Stage:
+    """The animation of a character in a file of its own."""
+    clip = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageMetersPerUnit(clip, meters)
+    UsdGeom.SetStageUpAxis(clip, up)
+    clip.SetTimeCodesPerSecond(30)
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Rig/Walk", clip.GetRootLayer(), "/Walk")
+    return clip
+
+
+TILTED = {
+    "a quarter turn": Recipe(placements=[UPRIGHT_Z]),
+    "a quarter turn and centimetres": Recipe(placements=[turned("x", -90, 0.01)]),
+    "centimetres": Recipe(placements=[turned("x", 0, 0.01)]),
+    "y up in a z-up stage": Recipe(up="Z", placements=[np.linalg.inv(UPRIGHT_Z)]),
+    "centimetres, y up, in a z-up stage of metres": Recipe(up="Z", placements=[turned("x", 90, 0.01)]),
+    "turned, moved and scaled": Recipe(placements=[turned("y", 30, at=(2, 0, 1)) @ turned("x", -90, 0.01)]),
+}
+
+
+@pytest.mark.parametrize("recipe", TILTED.values(), ids=TILTED)
+def test_a_clip_alone_moves_its_character_as_usdskel_shows_it_bound(recipe):
+    stage = author(Usd.Stage.CreateInMemory(), recipe)
+    character = read_character(stage)
+    motion = read_motion(alone(stage, meters=recipe.meters, up=recipe.up), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+
+
+def test_a_clip_whose_file_states_its_axis_and_units_is_read_by_them():
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("x", -90, 0.01)]))
+    character = read_character(stage)
+    motion = read_motion(alone(stage, meters=0.01, up="Z"), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+    plain = author(Usd.Stage.CreateInMemory())  # converted when it was exported: metres, y up
+    motion = read_motion(alone(plain, meters=1, up="Y"), character.skeleton)
+    assert np.abs(our_points(character, motion) - usdskel_points(plain, "/Hero/Body", range(1, 7))).max() < 1e-5
+
+
+# Which side is outside, under negative scales
+
+
+def box_in(stage: Usd.Stage, path: str, scale, left_handed: bool) -> UsdGeom.Mesh:
+    """A tetrahedron whose faces are seen from outside: its scales and its orientation turn them round together."""
+    points = np.array([[0, 1, 0], [0.3, 1, 0], [0, 1.3, 0], [0, 1, 0.3]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    UsdGeom.Xformable(mesh.GetPrim().GetParent()).AddScaleOp().Set(Gf.Vec3f(*scale))
+    local = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()).GetInverse())
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((points @ local[:3, :3] + local[3, :3]).astype("f4")))
+    if (np.linalg.det(local[:3, :3]) < 0) != left_handed:
+        faces = faces[:, ::-1]
+    mesh.CreateFaceVertexCountsAttr([3] * 4)
+    mesh.CreateFaceVertexIndicesAttr(faces.reshape(-1).tolist())
+    mesh.CreateOrientationAttr(UsdGeom.Tokens.leftHanded if left_handed else UsdGeom.Tokens.rightHanded)
+    return mesh
+
+
+def volume(mesh: Mesh) -> float:
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    return float(np.einsum("fc,fc->f", a, np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize("left_handed", [False, True])
+@pytest.mark.parametrize("scale", [(1, 1, 1), (-1, 1, 1), (2, -1, 1), (-1, -1, -1), (-1, 1, -1)])
+def test_a_negative_scale_turns_no_face_inside_out(scale, left_handed):
+    """UsdGeom: xforms that mirror turn a mesh's handedness, so that its outside stays outside."""
+    stage = author(Usd.Stage.CreateInMemory())
+    UsdGeom.Xform.Define(stage, "/Set")
+    mesh = box_in(stage, "/Set/Cape", scale, left_handed)
+    assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
+    indices, weights = mesh.GetPrim(), UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    weights.CreateSkeletonRel().SetTargets(["/Hero/Rig"])  # skinned, its xforms still say how it is drawn
+    weights.CreateJointIndicesPrimvar(True, 1).Set([0])
+    weights.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    weights.CreateGeomBindTransformAttr(UsdGeom.XformCache().GetLocalToWorldTransform(indices))
+    assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
+
+
+def test_a_joint_that_is_listed_twice_is_refused_by_name():
+    """UsdSkel takes one of both, and says nothing."""
+    stage = author(Usd.Stage.CreateInMemory())
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    animation.GetJointsAttr().Set([*JOINTS[:4], JOINTS[1]])
+    with pytest.raises(SsilkError, match=r"/Hero/Rig/Walk: joint 'Hips/Spine' is listed twice"):
+        read_motion(stage, SKELETON)
+    body = UsdSkel.BindingAPI(stage.GetPrimAtPath("/Hero/Body"))
+    body.CreateJointsAttr([*JOINTS[:4], JOINTS[3]])
+    with pytest.raises(SsilkError, match=r"/Hero/Body: joint 'Hips/Leg' is listed twice"):
+        read_character(stage)

@@ -393,3 +393,15 @@ def test_an_output_that_cannot_be_gives_one_sentence(name, message, tmp_path):
     with pytest.raises(SsilkError, match=message):
         write_rigged_stage(source, scene, tmp_path / name)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_garment_that_leaves_a_mirrored_xform_keeps_its_outside(tmp_path):
+    source, garment = hero(tmp_path, "beside")
+    stage = Usd.Stage.Open(str(source))
+    UsdGeom.Xformable(stage.GetPrimAtPath("/Set")).AddScaleOp().Set(Gf.Vec3f(-1, 1, 1))
+    stage.Save()
+    scene, out = dress(source, garment), tmp_path / "rigged.usda"
+    write_rigged_stage(source, scene, out)
+    found = read_scene(out, garment="Cape")[1].mesh
+    np.testing.assert_allclose(found.points, scene.garment.mesh.points, atol=1e-6)
+    np.testing.assert_array_equal(found.polygon_indices, scene.garment.mesh.polygon_indices)

@@ -111,13 +111,15 @@ def _on_motions(inputs: PreflightInput) -> Findings:
     for path, reason in inputs.unread.items():
         yield motion.unread_motion(path, reason)
     for clip in inputs.motions:
-        yield from motion.root_jumps(clip)
+        yield from motion.root_jumps(clip, skeleton)
+    for clip in inputs.motions:
+        yield from motion.lying(clip, skeleton)
     for clip in inputs.motions:
         yield from motion.joint_jumps(clip, skeleton)
     for clip in inputs.motions:
         yield from motion.joint_snaps(clip, skeleton)
     for clip in inputs.motions:
-        yield from motion.short_motion(clip, preset.model.fps, preset.train.window)
+        yield from motion.short_motion(clip, skeleton, preset.model.fps, preset.train.window)
     for clip in inputs.motions:
         yield from motion.unusual_rate(clip)
     for file in inputs.files:

@@ -7,10 +7,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...events import format_count
 from ...scene.assets import Floats, Ints, Motion, Scene, Skeleton
-from ...scene.kinematics import CUT_SPEED, MAX_JOINT_SPEED, motion_transforms, skinning_matrices, split_at_cuts
+from ...scene.kinematics import (
+    CUT_SPEED,
+    MAX_JOINT_SPEED,
+    hub_places,
+    motion_transforms,
+    skinning_matrices,
+    split_at_cuts,
+    world_transforms,
+)
 from .finding import Finding, Findings, format_joints, index_tuple
 
 STILL_ANGLE = 0.5  # [degrees]
@@ -18,6 +27,7 @@ USUAL_RATES = (15.0, 240.0)  # [1/s] lowest and highest
 CHECKED_RATE, MOST_CHECKED = 5.0, 500  # poses a second, and in all, in which limbs are looked for inside the body
 MANY_BURIED = 0.02  # share of the frames
 NAMED_LIMBS = 3
+LYING, MOSTLY = 0.5, 0.9  # cosine between the hub's up axis and that at rest, and share of the frames
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
 
 
@@ -47,11 +57,11 @@ def unread_motion(path: str, reason: str) -> Finding:
     )
 
 
-def root_jumps(motion: Motion) -> Findings:
+def root_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
     """Yield the frames at which the root is teleported rather than animated."""
-    starts = np.cumsum([span.frame_count for span in split_at_cuts(motion)])[:-1]
+    starts = np.cumsum([span.frame_count for span in split_at_cuts(motion, skeleton)])[:-1]
     if len(starts):
-        root = motion.translations[:, 0]
+        root = hub_places(skeleton, motion.rotations, motion.translations)
         far = np.linalg.norm(root[starts] - root[starts - 1], axis=1).max()
         yield Finding(
             severity="warning",
@@ -66,9 +76,28 @@ def root_jumps(motion: Motion) -> Findings:
         )
 
 
+def lying(motion: Motion, skeleton: Skeleton) -> Findings:
+    """Yield a warning if the character lies, or stands on its head, in nearly all frames of a motion."""
+    hub = motion_transforms(motion, skeleton.parents)[:, skeleton.hub, :3, :3]
+    rest = world_transforms(skeleton.rest_transforms, skeleton.parents)[skeleton.hub, :3, :3]
+    down = np.flatnonzero((hub @ rest.T)[:, 1, 1] < LYING)
+    if len(down) > MOSTLY * motion.frame_count:
+        yield Finding(
+            severity="warning",
+            code="lying",
+            prim=motion.path,
+            count=len(down),
+            found=f"the character lies or stands on its head in {len(down)} of {motion.frame_count} frames",
+            why="gravity pulls the cloth along the world's y axis, not towards the character's feet",
+            fix="if it should stand, correct upAxis of the motion's file, or export it together with its character",
+            elements="frames",
+            indices=index_tuple(down),
+        )
+
+
 def joint_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
     """Yield the frames at which a joint leaps away from its parent."""
-    steps = np.linalg.norm(np.diff(motion.translations, axis=0), axis=-1) * (np.asarray(skeleton.parents) >= 0)
+    steps = np.linalg.norm(np.diff(motion.translations, axis=0), axis=-1) * _within(skeleton)
     frames = np.flatnonzero((steps * motion.fps > CUT_SPEED).any(axis=1))
     if len(frames):
         joint = int(steps.max(axis=0).argmax())
@@ -84,6 +113,13 @@ def joint_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
             elements="frames",
             indices=index_tuple(frames + 1),
         )
+
+
+def _within(skeleton: Skeleton) -> NDArray[np.bool_]:
+    """Flag the joints that move within the body: not roots, nor those above the hub or it, shape (J,)."""
+    within = np.asarray(skeleton.parents) >= 0
+    within[list(skeleton.hub_path)] = False
+    return within
 
 
 def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
@@ -107,9 +143,9 @@ def joint_snaps(motion: Motion, skeleton: Skeleton) -> Findings:
         )
 
 
-def short_motion(motion: Motion, fps: float, window: int) -> Findings:
+def short_motion(motion: Motion, skeleton: Skeleton, fps: float, window: int) -> Findings:
     """Yield a warning if no span of a motion is as long as a training window of `window` poses at `fps`."""
-    spans = split_at_cuts(motion, max_joint_speed=MAX_JOINT_SPEED)
+    spans = split_at_cuts(motion, skeleton, max_joint_speed=MAX_JOINT_SPEED)
     longest = max(int((span.frame_count - 1) * fps / motion.fps + 1e-6) + 1 for span in spans)
     if longest < window:
         yield Finding(

@@ -91,15 +91,17 @@ def sample_poses(skeleton: Skeleton, count: int) -> Floats:
     """Return transforms from joint to world of random poses, the same at every call, shape (count, J, 4, 4).
 
     Each joint is turned from its bind pose, about a random axis, by up to `LARGEST_TURN`. Whole bodies come out
-    contorted, but the skin around a joint depends on few of them.
+    contorted, but the skin around a joint depends on few of them. Joints above the hub stay.
     """
+    inner = np.setdiff1d(np.arange(skeleton.joint_count), skeleton.hub_path[:-1])
     random = np.random.default_rng(0)
-    axis = random.normal(size=(count, skeleton.joint_count, 3))
+    axis = random.normal(size=(count, len(inner), 3))
     axis /= np.linalg.norm(axis, axis=-1, keepdims=True)
-    half = random.uniform(0, LARGEST_TURN / 2, size=(count, skeleton.joint_count, 1))
-    turns = matrix_from_quaternion(np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1))
+    half = random.uniform(0, LARGEST_TURN / 2, size=(count, len(inner), 1))
+    turns = np.tile(np.eye(3), (count, skeleton.joint_count, 1, 1))
+    turns[:, inner] = matrix_from_quaternion(np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1))
     bind = local_transforms(skeleton.bind_transforms, skeleton.parents)
-    return world_transforms(bind @ rigid(turns, np.zeros(axis.shape)), skeleton.parents)
+    return world_transforms(bind @ rigid(turns, np.zeros(turns.shape[:-1])), skeleton.parents)
 
 
 def to_simplex(values: Floats) -> Floats:

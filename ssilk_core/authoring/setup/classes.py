@@ -28,6 +28,7 @@ from .surface import closest_on_surface
 Mask = NDArray[np.bool_]
 HANG_RADIUS = 0.06  # [m] neighbourhood of a border vertex; it must reach past a collar that curls towards the neck
 HANG_DROP = 0.005  # [m] least height of a border that carries the cloth, above the mean of that neighbourhood
+FOLD = 0.5  # cosine between the normals of two faces below which closed cloth has its border between them
 USUAL = 0.5  # tightness at which the thresholds below hold as they are
 LADDER = np.arange(1, 20) / 20  # of tightness, on which vertices become tight one after another
 RANGE = 4.0  # the factor of the distances from the usual tightness to the ends
@@ -233,10 +234,15 @@ def _tops(mesh: Mesh, held: Mask, rim: Mask, island: Ints, options: ClassOptions
 def _hanging_border(mesh: Mesh, near: Mask, island: Ints, shortest: float) -> Mask:
     """Return the highest stretch of `near` border of each island that lies above the cloth around it, shape (V,).
 
-    Stretches shorter than `shortest` [m], such as the lower half of an armhole, carry nothing.
+    Stretches shorter than `shortest` [m], such as the lower half of an armhole, carry nothing. Cloth whose layers
+    close around its thickness has its border where it folds.
     """
     pairs, uses = edge_use(mesh.faces)
-    rims = pairs[(uses == 1) & near[pairs].all(axis=1)]
+    border = pairs[uses == 1]
+    folds = _folds(mesh)
+    closed = ~np.isin(island[folds[:, 0]], island[border[:, 0]])
+    rims = np.concatenate([border, folds[closed]])
+    rims = rims[near[rims].all(axis=1)]
     border, index = np.unique(rims, return_inverse=True)
     rims = rims[(_drops(mesh, border) > HANG_DROP)[index.reshape(-1, 2)].all(axis=1)]
     stretch = components(rims, mesh.vertex_count)
@@ -248,6 +254,20 @@ def _hanging_border(mesh: Mesh, near: Mask, island: Ints, shortest: float) -> Ma
         here = stretch[long & (island == number)]
         result |= stretch == here[height[here].argmax()]
     return result
+
+
+def _folds(mesh: Mesh) -> Ints:
+    """Return the edges at which two faces meet at more than `FOLD`, shape (N, 2)."""
+    sides = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(mesh.faces)), 3)
+    a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    order = np.lexsort(sides.T)
+    sides, owner = sides[order], owner[order]
+    same = (sides[1:] == sides[:-1]).all(axis=1)
+    cosine = np.einsum("nc,nc->n", normals[owner[1:]], normals[owner[:-1]])
+    return sides[1:][same & (cosine < FOLD)]
 
 
 def _drops(mesh: Mesh, vertices: Ints) -> Floats:

@@ -46,7 +46,8 @@ def in_order_of(trained: Skeleton, character: Character) -> Character:
         replace(body, skin=SkinWeights(body.skin.path, joints[body.skin.indices], body.skin.weights))
         for body in character.bodies
     )
-    return replace(character, skeleton=trained, bodies=tuple(bodies))
+    skeleton = replace(trained, placement=character.skeleton.placement)
+    return replace(character, skeleton=skeleton, bodies=tuple(bodies))
 
 
 def _places(found: Skeleton, trained: Skeleton) -> Ints:

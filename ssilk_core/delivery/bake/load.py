@@ -108,7 +108,7 @@ class LoadedGarment:
         from ssilk_usd.reading.motion import read_motion
         from ssilk_usd.reading.visibility import read_hidden
 
-        character, root, samples = self.file.scene.character, request.root, request.samples_per_frame
+        character, root, samples = self.deformer.scene.character, request.root, request.samples_per_frame
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
         if frames is None:
             source = read_motion(request.motion, character.skeleton, root=root)

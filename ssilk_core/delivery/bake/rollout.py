@@ -11,7 +11,7 @@ import numpy as np
 
 from ...events import Countdown, Message, Reporter, silent
 from ...quality.levels import SizeReduction
-from ...scene.assets import Deformer, Floats, GarmentPose, Motion
+from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import deform, lbs_poses, slerp, split_at_cuts
 from .inputs import InputHashes
@@ -151,11 +151,12 @@ class BakeRollout:
         from ...network.latent_solver import frames_to_solve
 
         assert self.model is not None
-        return frames_to_solve(self._driver(), self.model.config.fps, self.request.pre_roll)
+        skeleton = self.deformer.scene.character.skeleton
+        return frames_to_solve(self._driver(), skeleton, self.model.config.fps, self.request.pre_roll)
 
     def _driver(self) -> Motion:
         """Return the motion that is rolled over, from the first sample of the lead on, at its own rate."""
-        return _from_fraction(self.source, self._source_frame(-self.lead))
+        return _from_fraction(self.source, self.deformer.scene.character.skeleton, self._source_frame(-self.lead))
 
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
@@ -215,20 +216,23 @@ class BakeRollout:
 
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""
+        from ssilk_usd.reading.shapes import tell_animated_shapes
+
         from ...authoring.preflight.motion import joint_jumps, root_jumps
 
         skeleton = self.deformer.scene.character.skeleton
         first, last = self._source_frame(0), self._source_frame(self.motion.frame_count - 1)
         shown = self.source.clip(int(first), int(np.ceil(last)) + 1)
-        for found in (*root_jumps(shown), *joint_jumps(shown, skeleton)):
+        for found in (*root_jumps(shown, skeleton), *joint_jumps(shown, skeleton)):
             code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
+        tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
 
 
-def _from_fraction(motion: Motion, first: float) -> Motion:
+def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:
     """Return a motion with as many frames from a fractional one on, at its own rate.
 
     Nothing is interpolated across a cut: the frame before it becomes one of those after it, and their first step is
@@ -239,7 +243,7 @@ def _from_fraction(motion: Motion, first: float) -> Motion:
     if first == whole:
         return motion
     frames = np.arange(motion.frame_count)
-    ends = np.cumsum([span.frame_count for span in split_at_cuts(motion)])
+    ends = np.cumsum([span.frame_count for span in split_at_cuts(motion, skeleton)])
     own = np.searchsorted(ends, np.minimum(frames + 1, frames[-1]), side="right")
     begin, end = np.array([0, *ends[:-1]])[own], ends[own] - 1
     low = np.clip(frames, begin, np.maximum(end - 1, begin))

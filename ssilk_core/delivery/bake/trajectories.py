@@ -14,7 +14,7 @@ import numpy as np
 from ...errors import fail
 from ...events import Message, Reporter, silent
 from ...files import relative_path, replacing, sha256
-from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.assets import Deformer, Floats, Motion, Scene, Skeleton
 from ...scene.kinematics import held_at_cuts, sample_motion
 from ..targets import GLB
 from .character import on_character
@@ -52,7 +52,7 @@ def trained_deformer(model: str | os.PathLike[str], stage: str | os.PathLike[str
     return replace(deformer, shapes=deformer.shapes[:0])
 
 
-def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
+def motion_at(motion: Motion, skeleton: Skeleton, cache: MeshTrajectories, where: str) -> Motion:
     """Return the character's motion at the frames of a cache; nothing is interpolated across a cut.
 
     Raises:
@@ -70,7 +70,7 @@ def motion_at(motion: Motion, cache: MeshTrajectories, where: str) -> Motion:
         )
     near = np.round(position)
     position = np.where(np.abs(position - near) < SLACK, near, position).clip(0, motion.frame_count - 1)
-    position = held_at_cuts(motion, position)
+    position = held_at_cuts(motion, skeleton, position)
     return Motion(motion.path, cache.fps, *sample_motion(motion, position), start=float(seconds[0]) * cache.fps)
 
 

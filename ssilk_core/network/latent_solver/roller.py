@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 import torch
 
-from ...scene.assets import Motion
+from ...scene.assets import Motion, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import resample, run_up, split_at_cuts
 from ..model.network import GarmentModel
@@ -51,9 +51,9 @@ class LatentTally:
         return float(np.mean(self.figures[name])) if self.figures[name] else 0.0
 
 
-def frames_to_solve(motion: Motion, fps: float, pre_roll: float) -> int:
+def frames_to_solve(motion: Motion, skeleton: Skeleton, fps: float, pre_roll: float) -> int:
     """Return how many frames a `LatentRoller` solves over a motion of any rate, for a model's rate."""
-    spans = [resample(span, fps, cover=True) for span in split_at_cuts(motion)]
+    spans = [resample(span, fps, cover=True) for span in split_at_cuts(motion, skeleton)]
     before = [run_up(span, pre_roll).frame_count if pre_roll else 0 for span in spans]
     return sum(span.frame_count for span in spans) + sum(before)
 

@@ -52,7 +52,8 @@ def motion_inputs(model: GarmentModel, motions: Sequence[Motion]) -> MotionInput
     for motion in motions:
         if not abs(motion.fps - fps) < 1e-6:
             fail(motion.path, f"{motion.fps:g} frames per second", f"the model steps at {fps:g}")
-    shots = [[_span_inputs(model, span) for span in split_at_cuts(motion)] for motion in motions]
+    skeleton = model.scene.character.skeleton
+    shots = [[_span_inputs(model, span) for span in split_at_cuts(motion, skeleton)] for motion in motions]
     parts = [map(torch.cat, zip(*spans)) for spans in shots]
     return MotionInputs(*(
         torch.stack([part[[*range(len(part)), *[-1] * (frames - len(part))]] for part in group], dim=axis)
@@ -68,7 +69,7 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     body = BodyFrames.of(world, skeleton, parameter)
     static, pose = upright_descriptors(features, parameter)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
-    origins = torch.as_tensor(world[:, 0, :3, 3].copy()).to(parameter.device)
+    origins = torch.as_tensor(world[:, skeleton.hub, :3, 3].copy()).to(parameter.device)
     return model.initial(static), pose, body.matrices[..., 0], body.bend[..., 0], origins, begins
 
 

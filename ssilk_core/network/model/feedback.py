@@ -34,7 +34,7 @@ class BodyFrames:
 
         Differences of roots are taken in double precision, so that single precision serves anywhere in the world.
         """
-        origins, world = world[:, 0, :3, 3].copy(), world.copy()
+        origins, world = world[:, skeleton.hub, :3, 3].copy(), world.copy()
         world[..., :3, 3] -= origins[:, None]
         matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
         return cls(torch.as_tensor(matrices).to(like)[..., None], torch.as_tensor(bends(origins)).to(like)[..., None])
@@ -66,6 +66,7 @@ class Feedback(nn.Module):
 
     def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
         super().__init__()
+        self.hub = scene.character.skeleton.hub
         self.size, rows = feedback_size(scene, config), torch.as_tensor(feedback_vertices(scene, config))
         self.register_buffer("rows", rows, persistent=False)
         # Of each chosen vertex among those that are not pinned, which alone have blendshapes.
@@ -102,7 +103,7 @@ class Feedback(nn.Module):
         before, now = past
         carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0])
         away = 2 * now.points - before.points - carried.points - body.bend[0]
-        turn = body.matrices[0, 0, :, :3]  # of the root, but for a constant
+        turn = body.matrices[0, self.hub, :, :3]  # of the root, but for a constant
         own = torch.einsum("ban,mbn->man", turn, away)
         return LIMIT * torch.tanh(own.flatten(0, 1).T / (UNIT * LIMIT))
 

@@ -79,7 +79,7 @@ def _about_root(world: Floats, skeleton: Skeleton) -> tuple[NDArray, Floats]:
 
     Relative to the root, float32 is precise anywhere in the world.
     """
-    origins = world[:, 0, :3, 3].copy()
+    origins = world[:, skeleton.hub, :3, 3].copy()
     world = world.copy()
     world[..., :3, 3] -= origins[:, None]
     matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]

@@ -49,6 +49,7 @@ class ClothPoints:
         self.decoder, self.kinematics = decoder, kinematics
         rows = feedback_vertices(file.scene, file.config)
         self.count, self.joints = len(rows), file.scene.character.skeleton.joint_count
+        self.hub = file.scene.character.skeleton.hub
         self.size = feedback_size(file.scene, file.config)
         whole = tiles(file.scene, file.parameters)
         shapes = np.concatenate([tile.shapes.reshape(len(tile.shapes), 3, -1) for tile in whole], axis=2)
@@ -116,7 +117,7 @@ class SeenCloth:
         away -= self.before
         away -= carried
         away -= self.course.bend[self.frame]
-        away = away @ self.course.matrices[self.frame + 2, 0, :, :3]
+        away = away @ self.course.matrices[self.frame + 2, self.points.hub, :, :3]
         np.divide(away.reshape(-1), SATURATION, into)
         np.tanh(into, into)
         np.multiply(into, np.float32(LIMIT), into)

@@ -54,7 +54,7 @@ class Playback:
     def __init__(self, player: NumpyGarment, motion: Motion, block: int, pre_roll: float) -> None:
         self.player, self.motion, self.block, self.pre_roll = player, motion, block, pre_roll
         self.rate = player.file.config.fps / motion.fps
-        self.spans = split_at_cuts(motion)
+        self.spans = split_at_cuts(motion, player.skeleton)
         self.firsts = [int(first) for first in np.cumsum([0, *(span.frame_count for span in self.spans[:-1])])]
         fps = motion.fps if self._steps_with_frames else player.file.config.fps
         self.rolled_spans = [

@@ -163,7 +163,7 @@ class Refiner:
         fps = self.simulator.options.fps
         if not abs(motion.fps - fps) < 1e-6:
             fail(motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
-        for span in split_at_cuts(motion):
+        for span in split_at_cuts(motion, self.simulator.poser.skeleton):
             yield from self._span(span, network, refined_points)
 
     def _span(

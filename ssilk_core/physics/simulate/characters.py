@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import Floats, Ints, Motion, Scene
+from ...scene.assets import Floats, Ints, Motion, Scene, Skeleton
 from ...scene.kinematics import (
     frames_at,
     matrix_from_quaternion,
@@ -48,11 +48,11 @@ class MotionSpan:
 
 
 def split_into_spans(
-    motion: Motion, shot: int, fps: float, substeps: int, longest: int | None = None
+    motion: Motion, skeleton: Skeleton, shot: int, fps: float, substeps: int, longest: int | None = None
 ) -> list[MotionSpan]:
     """Return the spans of a motion between its cuts, each at most `longest` frames of a shot at `fps`."""
     spans, first, source = [], 0, 0
-    for part in split_at_cuts(motion):
+    for part in split_at_cuts(motion, skeleton):
         stop = frames_at(source + part.frame_count, motion.fps, fps)
         most = longest or max(1, stop - first)
         for start in range(first, stop, most):
@@ -78,7 +78,7 @@ class PosedCharacters:
     """Posed characters, each relative to its own root.
 
     Attributes:
-        root: position of the first joint [m], float64, shape (3, N).
+        root: position of the skeleton's hub [m], float64, shape (3, N).
         body: relative to the root.
         lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
         matrices: skinning matrices of the character's joints, relative to the root, shape (J, 3, 4, N).
@@ -120,7 +120,7 @@ class CharacterPoser:
     def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
         """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
-        root = world[:, 0, :3, 3].copy()
+        root = world[:, self.skeleton.hub, :3, 3].copy()
         world[:, :, :3, 3] -= root[:, None]
         matrices = skinning_matrices(world, self.skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         character = torch.as_tensor(matrices.copy(), dtype=self.dtype, device=self.rest.device)

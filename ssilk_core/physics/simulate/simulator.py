@@ -18,7 +18,7 @@ from torch import Tensor
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, Motion, Scene
+from ...scene.assets import Floats, Motion, Scene, Skeleton
 from ...scene.fabrics import Fabric
 from ..constants import GRAVITY
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
@@ -153,7 +153,10 @@ class Simulator:
         """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel."""
         options = self.options
         cut = (options.fps, options.substeps, options.sequence)
-        spans = [span for shot, motion in enumerate(motions) for span in split_into_spans(motion, shot, *cut)]
+        skeleton = self.poser.skeleton
+        spans = [
+            span for shot, motion in enumerate(motions) for span in split_into_spans(motion, skeleton, shot, *cut)
+        ]
         spans.sort(key=lambda span: -span.motion.frame_count)
         for start in range(0, len(spans), options.batch):
             yield from self._simulate_spans(spans[start : start + options.batch])
@@ -263,7 +266,7 @@ def simulate(
     if not motions:
         fail("simulation", "no motion given", "at least one is needed")
     simulator = Simulator(scene, fabric, options, device=device, report=report)
-    counts = [shot.frame_count for shot in shots_of(motions, simulator.options)]
+    counts = [shot.frame_count for shot in shots_of(motions, scene.character.skeleton, simulator.options)]
     points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]
     told = Countdown(sum(counts), report)
     for frame in simulator.frames(motions):
@@ -272,9 +275,9 @@ def simulate(
     return points
 
 
-def shots_of(motions: Sequence[Motion], options: SimulationOptions) -> list[Motion]:
+def shots_of(motions: Sequence[Motion], skeleton: Skeleton, options: SimulationOptions) -> list[Motion]:
     """Return the motions sampled at the frames of their simulated shots."""
-    spans = [split_into_spans(motion, 0, options.fps, options.substeps) for motion in motions]
+    spans = [split_into_spans(motion, skeleton, 0, options.fps, options.substeps) for motion in motions]
     return [join_spans(motion, parts) for motion, parts in zip(motions, spans)]
 
 

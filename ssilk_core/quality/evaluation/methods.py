@@ -25,6 +25,7 @@ from ...physics.skin.covered_skin import CoveredSkin
 from ...physics.skinning import Skinning
 from ...scene.assets import PINNED, Floats, Scene
 from ...scene.fabrics import Fabric
+from ...scene.kinematics import first_place
 from ...training.motion_bank import LatentModel, MotionBank, build_bank, roll_states
 from .minimum import minima
 from .takes import Take
@@ -115,6 +116,7 @@ class TakeSet:
 
     takes: tuple[Take, ...]
     bank: MotionBank
+    origins: tuple[Floats, ...]
 
     def frames(self, take: int, frames: range) -> Tensor:
         """Return indices into the bank of frames of a take, shape (N,)."""
@@ -127,7 +129,7 @@ class TakeSet:
 
     def local(self, take: int, points: Floats) -> Tensor:
         """Return points in the world (N, V, 3) about the root of a take's first frame, shape (V, 3, N)."""
-        local = points - self.takes[take].motion.translations[0, 0]
+        local = points - self.origins[take]
         return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.bank.root.device)
 
 
@@ -141,7 +143,7 @@ def build_take_set(takes: Sequence[Take], dressed: EvaluationScene, joints: np.n
     skeleton = dressed.scene.character.skeleton
     bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
     assert len(bank.starts) == len(takes)
-    return TakeSet(tuple(takes), bank)
+    return TakeSet(tuple(takes), bank, tuple(first_place(take.motion, skeleton) for take in takes))
 
 
 def need_takes(takes: Sequence[Take]) -> None:
@@ -285,5 +287,7 @@ class Simulated:
         motion = self.take_set.takes[take].motion
         ends = [Take("", 0, motion.clip(0, frame + 1)) for frame in frames]
         found = minima(self.dressed.simulator, ends, self.vertices(take, frames))
-        origin = torch.as_tensor(motion.translations[0, 0].copy(), device=self.dressed.device)
+        origin = torch.as_tensor(
+            first_place(motion, self.dressed.scene.character.skeleton), device=self.dressed.device
+        )
         return (found.x + found.poses.root - origin[:, None]).float()

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ...physics.simulate import Simulator
 from ...physics.simulate.characters import PosedCharacters
+from ...scene.kinematics import first_place
 from .figures import MinimumErrors
 from .metrics import mean_square
 from .takes import Take
@@ -68,7 +69,8 @@ def minima(simulator: Simulator, takes: Sequence[Take], x: Tensor) -> Minima:
         np.stack([getattr(motion, name)[-1] for motion in motions]) for name in ("rotations", "translations")
     )
     poses = simulator.poser.pose(rotations, translations)
-    origins = torch.as_tensor(np.stack([m.translations[0, 0] for m in motions], axis=1), device=x.device)
+    skeleton = simulator.poser.skeleton
+    origins = torch.as_tensor(np.stack([first_place(m, skeleton) for m in motions], axis=1), device=x.device)
     start = simulator.apply_pins(x.double() + origins - poses.root, poses)
     found = simulator.quasi_static(poses, start)
     return Minima(simulator, poses, start, found.x, found.residual)

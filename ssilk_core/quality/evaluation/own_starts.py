@@ -18,6 +18,7 @@ from ...physics.simulate import Simulator
 from ...physics.simulate.characters import PosedCharacters
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
+from ...scene.kinematics import first_place
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import mean_square
 
@@ -39,7 +40,7 @@ class MethodWindow:
         take, frames = window
         motion: Motion = take_set.takes[take].motion
         self.motion = motion.clip(frames.start, frames.stop)
-        origin = torch.as_tensor(np.array(motion.translations[0, 0]), device=dressed.device)
+        origin = torch.as_tensor(first_place(motion, dressed.scene.character.skeleton), device=dressed.device)
         self.x = method.vertices(take, frames).double().permute(2, 0, 1) + origin
 
     @property

@@ -70,7 +70,8 @@ class _Run:
         known: Sequence[ResultRow],
     ) -> None:
         self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
-        cut = [takes_of(name, motion, dressed.fps, options.sequence) for name, motion in playlist.clips.items()]
+        skeleton, clips = dressed.scene.character.skeleton, playlist.clips.items()
+        cut = [takes_of(name, motion, skeleton, dressed.fps, options.sequence) for name, motion in clips]
         self.takes = [take for takes in cut for take in takes]
         need_takes(self.takes)
         joints, names = methods[0].joints, [LBS, SIMULATOR, *(method.name for method in methods)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...physics.simulate.characters import split_into_spans
-from ...scene.assets import Floats, Motion
+from ...scene.assets import Floats, Motion, Skeleton
 from ...scene.kinematics import sample_motion
 
 EASE = 0.25  # [s] to start or to stop
@@ -44,12 +44,12 @@ class Take:
         return self.start + (self.first + np.arange(self.frame_count)) * self.step
 
 
-def takes_of(clip: str, motion: Motion, fps: float, longest: int | None = None) -> list[Take]:
+def takes_of(clip: str, motion: Motion, skeleton: Skeleton, fps: float, longest: int | None = None) -> list[Take]:
     """Return a clip at `fps` as takes of at most `longest` frames; those of under four frames are left out.
 
     Frames are those of `ssilk simulate` at the same rate, so that a point cache of the clip lines up.
     """
-    spans = split_into_spans(motion, 0, fps, 1, longest)
+    spans = split_into_spans(motion, skeleton, 0, fps, 1, longest)
     clock = motion.start, motion.fps / fps
     return [Take(clip, span.first, span.motion, *clock) for span in spans if span.motion.frame_count >= SHORTEST]
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...scene.assets import Floats, Motion, Skeleton
-from ...scene.kinematics import bind_pose, multiply_quaternions, sample_motion, slerp
+from ...scene.kinematics import bind_pose, hub_places, multiply_quaternions, sample_motion, slerp
 
 BLOCK = 256  # frames
 SWAY = 4.0  # [s] period of the procedural motion
@@ -74,7 +74,7 @@ def sway(skeleton: Skeleton, fps: float) -> ProceduralMotion:
         half = size * np.sin(times[:, None, None] * turns + phase)
         turn = np.concatenate([np.ones((*half.shape[:2], 1)), half], axis=-1)
         moved = np.tile(places, (len(times), 1, 1))
-        moved[:, 0, 0] += 0.3 * np.sin(times * 2 * np.pi / loop)
+        moved[:, skeleton.hub_path[0], 0] += 0.3 * np.sin(times * 2 * np.pi / loop)
         return multiply_quaternions(rest, turn / np.linalg.norm(turn, axis=-1, keepdims=True)), moved
 
     return ProceduralMotion(fps, 1, at, loop)
@@ -92,12 +92,12 @@ def loop_clip(motion: Motion, fps: float) -> ProceduralMotion:
 
 
 def rotate_character(drive: ProceduralMotion, skeleton: Skeleton, turn: Turn) -> ProceduralMotion:
-    """Rotate the character about its first joint by a function of time."""
+    """Rotate the character about its hub by a function of time."""
     roots = np.flatnonzero(skeleton.parents < 0)
 
     def change(times: Floats, rotations: Floats, translations: Floats) -> Sampled:
         rotations, translations = rotations.copy(), translations.copy()
-        q, centre = turn(times)[:, None], translations[:, :1]
+        q, centre = turn(times)[:, None], hub_places(skeleton, rotations, translations)[:, None]
         rotations[:, roots] = multiply_quaternions(q, rotations[:, roots])
         translations[:, roots] = centre + rotate_vectors(q, translations[:, roots] - centre)
         return rotations, translations
@@ -142,8 +142,9 @@ def freeze_after(drive: ProceduralMotion, time: float) -> ProceduralMotion:
 
 
 def randomize_rotations(drive: ProceduralMotion, skeleton: Skeleton, every: float) -> ProceduralMotion:
-    """Replace the rotations of all joints except roots by random ones, uniform on SO(3), every `every` seconds."""
-    random, inner = np.random.default_rng(1), skeleton.parents >= 0
+    """Replace the rotations of all joints but roots and the hub by random ones on SO(3) every `every` seconds."""
+    random, inner = np.random.default_rng(1), np.asarray(skeleton.parents) >= 0
+    inner[list(skeleton.hub_path)] = False
     keys = random.normal(size=(64, skeleton.joint_count, 4))
     keys /= np.linalg.norm(keys, axis=-1, keepdims=True)
 

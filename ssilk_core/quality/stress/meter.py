@@ -126,7 +126,7 @@ def matrices_about_root(motion: Motion, scene: Scene) -> tuple[Tensor, Floats]:
     """Return the character's skinning matrices about its root (J, 3, 4, F), float64, and the root (F, 1, 3) [m]."""
     skeleton = scene.character.skeleton
     world = motion_transforms(motion, skeleton.parents)
-    origin = world[:, :1, :3, 3].copy()
+    origin = world[:, skeleton.hub : skeleton.hub + 1, :3, 3].copy()
     world[..., :3, 3] -= origin
     matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3]
     return torch.as_tensor(np.ascontiguousarray(matrices.transpose(1, 2, 3, 0))), origin

@@ -22,7 +22,7 @@ from ...physics.simulate import Simulator
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Floats, GarmentPose, Motion
 from ...scene.decomposition import Decomposition, decompose
-from ...scene.kinematics import deform, resample, sample_motion
+from ...scene.kinematics import deform, first_place, resample, sample_motion
 from ..evaluation.methods import EvaluationScene, TakeSet
 
 GIVEN = 2  # frames of the network that the simulator goes on from, as two steps back make a velocity
@@ -84,7 +84,7 @@ class ShotMethod:
         elif self.simulator:
             rest = self._solved(self._carried_on(self.simulator, motion, points[:GIVEN]))
             points = self._stored(take, np.concatenate([points[:GIVEN], rest]))
-        return points - motion.translations[0, 0]
+        return points - first_place(motion, self.dressed.scene.character.skeleton)
 
     def _solved(self, frames: Iterator[Floats]) -> Floats:
         """Return frames (N, V, 3) that a solver computes as they are asked for; note the time of all but the first.

@@ -21,6 +21,10 @@ class Skeleton:
         parents: index of each joint's parent, -1 for roots, shape (J,).
         bind_transforms: joint to world at the bind pose, rigid, shape (J, 4, 4).
         rest_transforms: joint to parent at rest (world for roots), rigid, shape (J, 4, 4).
+        hub: the joint that carries the body as a whole, whichever stand above it: air moves along with it, cuts are
+            its jumps, and what is relative to the character is relative to it.
+        placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
+            above the skeleton tilt or scale it; None elsewhere.
     """
 
     path: str
@@ -28,6 +32,8 @@ class Skeleton:
     parents: Ints
     bind_transforms: Floats
     rest_transforms: Floats
+    hub: int = 0
+    placement: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -42,6 +48,11 @@ class Skeleton:
             bind_transforms=frozen(self.bind_transforms, np.float64),
             rest_transforms=frozen(self.rest_transforms, np.float64),
         )
+        if self.placement is not None:
+            assign(self, placement=frozen(self.placement, np.float64))
+            if self.placement.shape != (4, 4):
+                fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
+            need_finite(self.placement, self.path, "placement")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
@@ -52,12 +63,22 @@ class Skeleton:
                 "parents must come first, and a joint must not be its own ancestor",
                 "reorder the joints",
             )
+        if not 0 <= self.hub < count:
+            fail(self.path, f"joint {self.hub} carries the body", f"joints are 0 to {count - 1}")
         check_rigid(self.bind_transforms, self.path, "bind transform", self.joint_names)
         check_rigid(self.rest_transforms, self.path, "rest transform", self.joint_names)
 
     @property
     def joint_count(self) -> int:
         return len(self.joint_names)
+
+    @property
+    def hub_path(self) -> tuple[int, ...]:
+        """The joints above the hub, from the top, and the hub."""
+        path = [self.hub]
+        while (above := int(self.parents[path[0]])) >= 0:
+            path.insert(0, above)
+        return tuple(path)
 
 
 def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:

@@ -21,6 +21,7 @@ from ...errors import fail
 from ..assets import PINNED, Deformer, Floats, GarmentPose, Ints, Motion
 from ..kinematics import (
     combined_transforms,
+    hub_places,
     local_transforms,
     matrix_from_quaternion,
     quaternion_from_matrix,
@@ -113,9 +114,13 @@ class PoseFitter:
         where = f"frames {pose.start} to {pose.start + pose.frame_count - 1}"
         if not np.isfinite(vertices).all():
             fail(where, "NaN or infinity among the vertices", "all must be finite")
-        root = motion.translations[pose.start : pose.start + pose.frame_count, :1]
-        about = replace(motion, translations=motion.translations - _of_root(motion))
-        search = _Search(self, about, pose, self._tensor((vertices - root)[:, self.free]))
+        skeleton = self.deformer.scene.character.skeleton
+        places = hub_places(skeleton, motion.rotations, motion.translations)[:, None]
+        about = motion.translations.copy()
+        about[:, skeleton.parents < 0] -= places
+        root = places[pose.start : pose.start + pose.frame_count]
+        about_hub = replace(motion, translations=about)
+        search = _Search(self, about_hub, pose, self._tensor((vertices - root)[:, self.free]))
         for _ in range(self.steps):
             if not search.advance():
                 break
@@ -126,13 +131,6 @@ def model_bounds(shapes: int) -> tuple[Floats, Floats]:
     """Return the bounds of a trained model's blendshape weights, the last of which is constant, shape (shapes,)."""
     upper = np.ones(shapes)
     return np.where(np.arange(shapes) == shapes - 1, 1.0, 0.0), upper
-
-
-def _of_root(motion: Motion) -> Floats:
-    """Return the position of the first joint in its own row and zero in the others, shape (F, J, 3)."""
-    places = np.zeros_like(motion.translations)
-    places[:, 0] = motion.translations[:, 0]
-    return places
 
 
 def _below(parents: np.ndarray, joints: int) -> Floats:

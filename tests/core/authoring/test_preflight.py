@@ -379,11 +379,22 @@ def test_class_coverage_and_unheld_islands():
 
 def test_root_jumps():
     motion_ = turning()
-    assert not list(motion.root_jumps(motion_))
+    assert not list(motion.root_jumps(motion_, SKELETON))
     jumped = motion_.translations.copy()
     jumped[40:, 0] += [2.0, 0, 0]
-    found = only(motion.root_jumps(replace(motion_, translations=jumped)))
+    found = only(motion.root_jumps(replace(motion_, translations=jumped), SKELETON))
     assert found.indices == (40,) and "2 m" in found.found
+
+
+def test_a_character_that_lies_throughout_is_told():
+    assert not list(motion.lying(turning(), SKELETON))
+    quarter = np.array([np.sqrt(0.5), np.sqrt(0.5), 0, 0])
+    rotations = turning().rotations.copy()
+    rotations[:, 0] = multiply_quaternions(quarter, rotations[:, 0])
+    found = only(motion.lying(replace(turning(), rotations=rotations), SKELETON))
+    assert "lies or stands on its head in 60 of 60 frames" in found.found and found.count == 60
+    rotations[:20] = turning().rotations[:20]
+    assert not list(motion.lying(replace(turning(), rotations=rotations), SKELETON))
 
 
 def test_joint_jumps():
@@ -412,18 +423,18 @@ def test_what_training_cuts_at_is_told_before_it():
     rotations[:] = rotations[:1]
     rotations[30:, 2] = multiply_quaternions(rotations[30:, 2], np.array([np.cos(half), 0, 0, np.sin(half)]))
     clip = replace(clip, rotations=rotations, fps=30.0)
-    spans = split_at_cuts(clip, max_joint_speed=MAX_JOINT_SPEED)
+    spans = split_at_cuts(clip, SKELETON, max_joint_speed=MAX_JOINT_SPEED)
     found = only(motion.joint_snaps(clip, SKELETON))
     assert found.count == len(spans) - 1 == 1 and found.indices == (30,) and "by 80 degrees" in found.found
     assert not list(motion.joint_snaps(replace(clip, fps=24.0), SKELETON))
     longest = max(span.frame_count for span in spans)
-    assert longest < clip.frame_count and list(motion.short_motion(clip, 30, longest + 1))
+    assert longest < clip.frame_count and list(motion.short_motion(clip, SKELETON, 30, longest + 1))
 
 
 def test_short_motions_count_the_longest_span_at_the_rate_of_the_model():
-    assert not list(motion.short_motion(still(61, 60), 30, 31))
-    assert "31 poses" in only(motion.short_motion(still(61, 60), 30, 32)).found
-    assert "1 poses" in only(motion.short_motion(still(1), 30, 16)).found
+    assert not list(motion.short_motion(still(61, 60), SKELETON, 30, 31))
+    assert "31 poses" in only(motion.short_motion(still(61, 60), SKELETON, 30, 32)).found
+    assert "1 poses" in only(motion.short_motion(still(1), SKELETON, 30, 16)).found
 
 
 @pytest.mark.parametrize(("fps", "count"), [(5, 1), (24, 0), (60, 0), (240, 0), (4800, 1)])

@@ -98,6 +98,25 @@ def test_close_tube_is_held_and_hangs_from_its_top(trunk):
     assert (classes[top] == PINNED).all() and (classes[~top] == TIGHT).all()
 
 
+def test_a_closed_double_layer_hangs_as_a_single_one_does(trunk):
+    """Cloth with a thickness, as some programs make it: two layers that close around it, without any border."""
+    heights, columns, rows = [1.3, 0.7], 61, 41
+    outer, inner = (tube([radius, radius + 0.2], heights, columns=columns, rows=rows) for radius in (0.164, 0.16))
+    count, around = outer.vertex_count, np.arange(columns)
+    after = (around + 1) % columns
+    caps = []
+    for row, turn in ((0, 1), ((rows - 1) * columns, -1)):
+        a, b, c, d = row + around, row + after, count + row + after, count + row + around
+        caps += [np.stack([a, b, c], 1)[:, ::turn], np.stack([a, c, d], 1)[:, ::turn]]
+    faces = np.concatenate([outer.faces, inner.faces[:, ::-1] + count, *caps])
+    double = Mesh("/Double", np.concatenate([outer.points, inner.points]), faces)
+    assert trimesh.Trimesh(double.points, double.faces, process=False).is_watertight
+    single, both = found(trunk, inner), found(trunk, double)
+    np.testing.assert_array_equal(both[count:], single)
+    assert (both[:count] == both[count:]).mean() > 0.95
+    assert set(both[:count]) == {PINNED, TIGHT, LOOSE}
+
+
 def test_back_panel_is_close_but_not_held(trunk):
     mesh = tube([0.16, 0.16], [1.3, 0.7], turn=140)
     classes = found(trunk, mesh)

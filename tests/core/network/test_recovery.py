@@ -12,7 +12,7 @@ import torch
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import RECOVERY_FRAMES, garment_poses, roll, roll_blocks
 from ssilk_core.network.settings import ModelConfig
-from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.assets import Motion, Skeleton
 from ssilk_core.scene.kinematics import split_at_cuts
 
 
@@ -101,6 +101,9 @@ def test_the_frames_that_are_told_are_those_that_differ(model, scene, toy_motion
     assert frames[-1] == int(np.ceil((21 + RECOVERY_FRAMES) / 30 * target - 1e-6)) - 1
 
 
+ONE_JOINT = Skeleton("/Rig", ("Hips",), [-1], *[np.eye(4)[None]] * 2)
+
+
 def flight(speeds: np.ndarray) -> Motion:
     """A single joint that flies along x at a speed [m/s] in each frame."""
     places = np.zeros((len(speeds) + 1, 1, 3))
@@ -110,17 +113,17 @@ def flight(speeds: np.ndarray) -> Motion:
 
 def test_a_fast_ride_is_no_cut_and_a_jump_on_it_is():
     steady = np.full(60, 50.0)
-    assert len(split_at_cuts(flight(steady))) == 1
-    assert len(split_at_cuts(flight(np.linspace(0, 90, 60)))) == 1
+    assert len(split_at_cuts(flight(steady), ONE_JOINT)) == 1
+    assert len(split_at_cuts(flight(np.linspace(0, 90, 60)), ONE_JOINT)) == 1
     steady[30] = 400
-    assert [span.frame_count for span in split_at_cuts(flight(steady))] == [31, 30]
+    assert [span.frame_count for span in split_at_cuts(flight(steady), ONE_JOINT)] == [31, 30]
 
 
 @pytest.mark.parametrize("at", [0, 7, 58])
 def test_a_jump_anywhere_is_a_cut(at):
     speeds = np.zeros(59)
     speeds[at] = 300
-    assert [span.frame_count for span in split_at_cuts(flight(speeds))] == [at + 1, 59 - at]
+    assert [span.frame_count for span in split_at_cuts(flight(speeds), ONE_JOINT)] == [at + 1, 59 - at]
 
 
 def test_a_calm_garment_sleeps_while_its_character_holds_still_and_wakes(scene, toy_motion):

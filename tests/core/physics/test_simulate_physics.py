@@ -214,7 +214,7 @@ def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
     motion = toy_motion(scene, 3, fps=60.0)
     options = replace(SHORT, substeps=2)
     (points,) = simulate(scene, CLOTH, [motion], options)
-    (shot,) = shots_of([motion], options)
+    (shot,) = shots_of([motion], scene.character.skeleton, options)
     skeleton = scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(shot, skeleton.parents), skeleton.bind_transforms)
     lbs = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)
@@ -227,7 +227,7 @@ def test_a_shot_has_the_frames_of_its_motion(scene, toy_motion) -> None:
     motion = toy_motion(scene, 40, fps=120.0)
     for fps, substeps in ((30.0, 1), (24.0, 3), (120.0, 2)):
         expected = resample(motion, fps)
-        (shot,) = shots_of([motion], SimulationOptions(fps=fps, substeps=substeps))
+        (shot,) = shots_of([motion], scene.character.skeleton, SimulationOptions(fps=fps, substeps=substeps))
         assert shot.fps == fps and shot.frame_count == expected.frame_count
         np.testing.assert_allclose(shot.translations, expected.translations, atol=1e-12)
         np.testing.assert_allclose(np.abs((shot.rotations * expected.rotations).sum(-1)), 1, atol=1e-12)
@@ -238,7 +238,7 @@ def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
     moved = motion.translations.copy()
     moved[3:, 0] += [20.0, 0.0, 0.0]
     cut = replace(motion, translations=moved)
-    first, second = split_into_spans(cut, 0, 30.0, 1)
+    first, second = split_into_spans(cut, scene.character.skeleton, 0, 30.0, 1)
     assert (first.first, first.frame_count, second.first, second.frame_count) == (0, 3, 3, 2)
     (points,) = simulate(scene, CLOTH, [cut], SHORT)
     (alone,) = simulate(scene, CLOTH, [cut.clip(3, 5)], SHORT)

@@ -62,7 +62,8 @@ def dressed(scene) -> EvaluationScene:
 
 @pytest.fixture
 def take_set(scene, dressed, toy_motion) -> TakeSet:
-    takes = [take for frames in (12, 9) for take in takes_of("sway", toy_motion(scene, frames), FPS)]
+    skeleton = scene.character.skeleton
+    takes = [take for frames in (12, 9) for take in takes_of("sway", toy_motion(scene, frames), skeleton, FPS)]
     return build_take_set(takes, dressed, JOINTS)
 
 

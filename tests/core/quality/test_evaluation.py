@@ -78,7 +78,7 @@ def motion(scene, toy_motion) -> Motion:
 
 @pytest.fixture
 def take_set(dressed, motion) -> TakeSet:
-    return build_take_set(takes_of("sway", motion, FPS), dressed, JOINTS)
+    return build_take_set(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), dressed, JOINTS)
 
 
 class Still:
@@ -99,14 +99,15 @@ def test_takes_are_the_frames_of_a_simulated_shot(scene, toy_motion):
     fast = toy_motion(scene, 101, fps=50.0)
     places = fast.translations.copy()
     places[60:, 0] += 3.0
-    takes = takes_of("clip", replace(fast, translations=places), FPS)
+    takes = takes_of("clip", replace(fast, translations=places), scene.character.skeleton, FPS)
     assert [(take.first, take.frame_count) for take in takes] == [(0, 36), (36, 25)]
     np.testing.assert_allclose(takes[1].motion.translations[-1, 0], places[100, 0], atol=1e-9)
-    later = takes_of("clip", replace(fast, translations=places, start=1001.0), FPS)[1]
+    later = takes_of("clip", replace(fast, translations=places, start=1001.0), scene.character.skeleton, FPS)[1]
     np.testing.assert_allclose(later.codes[[0, -1]], [1061, 1101])  # of the motion, whose rate is another
-    parts = takes_of("clip", fast, FPS, longest=25)
+    parts = takes_of("clip", fast, scene.character.skeleton, FPS, longest=25)
     assert [(take.first, take.frame_count) for take in parts] == [(0, 25), (25, 25), (50, 11)]
-    assert [take.frame_count for take in takes_of("clip", fast.clip(0, 101), FPS, longest=58)] == [58]  # 3 are few
+    parts = takes_of("clip", fast.clip(0, 101), scene.character.skeleton, FPS, longest=58)
+    assert [take.frame_count for take in parts] == [58]  # 3 are few
 
 
 def test_a_motion_stops_and_loops_without_a_jolt(motion):
@@ -125,7 +126,7 @@ def test_energies_are_those_of_the_validation(scene, dressed, toy_motion, toy_mo
     """Of models and baselines, also over several blocks."""
     model = toy_model(scene) if kind == "ssilk" else baseline(scene, BaselineConfig(method=kind), JOINTS)
     clip = toy_motion(scene, 23)
-    take_set = build_take_set(takes_of("clip", clip, FPS), dressed, JOINTS)
+    take_set = build_take_set(takes_of("clip", clip, dressed.scene.character.skeleton, FPS), dressed, JOINTS)
     network = method_over(model, take_set)
     validator = Validator(
         network.take_set.bank, dressed.energy, dressed.body, scene, dressed.rest, FPS, clip.frame_count
@@ -183,7 +184,7 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
 
 def test_skin_that_shows_is_counted_where_cloth_sinks_into_the_body(dressed, motion, monkeypatch):
     """In one frame of the second take the cloth is pushed into the ball."""
-    takes = takes_of("sway", replace(motion, start=100.0), FPS, longest=20)
+    takes = takes_of("sway", replace(motion, start=100.0), dressed.scene.character.skeleton, FPS, longest=20)
     take_set = build_take_set(takes, dressed, JOINTS)
     pushed = torch.zeros(20, 3)
     pushed[7, 2] = 0.05
@@ -247,7 +248,7 @@ def test_a_point_cache_is_measured_as_the_cloth_that_was_written(scene, dressed,
 
 def test_a_swing_that_dies_away_settles(dressed, motion):
     """An offset that decays while the pose is held: energy, settling time and distance from rest follow from it."""
-    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 2, 2.0)
+    takes, first = stopped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 2, 2.0)
     assert [take.clip for take in takes] == ["sway"] * 2 and first[1] > first[0]
     take_set, tau, begun = build_take_set(takes, dressed, JOINTS), 0.3, 0.1
     count = max(take.frame_count for take in takes)
@@ -266,7 +267,7 @@ def test_a_swing_that_dies_away_settles(dressed, motion):
 
 def test_cloth_that_is_held_up_is_found_out(dressed, motion):
     """Ten centimetres above its quasi-static state for ever: it settles, and floats."""
-    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 1, 1.0)
+    takes, first = stopped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 1, 1.0)
     take_set = build_take_set(takes, dressed, JOINTS)
     lifted = torch.tensor([0.0, 0.1, 0.0]).expand(takes[0].frame_count, 3)
     found = joined_settling(settling(dressed, take_set, Still(dressed, take_set, lifted), first))
@@ -278,7 +279,7 @@ def test_cloth_that_is_held_up_is_found_out(dressed, motion):
 
 def test_minima_are_where_forces_balance(dressed, motion):
     """Of two poses at once, from linear blend skinning: lower, in balance, and a place to measure heights from."""
-    takes, _ = stopped_takes(takes_of("sway", motion, FPS), FPS, 2, 0.5)
+    takes, _ = stopped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 2, 0.5)
     take_set = build_take_set(takes, dressed, JOINTS)
     found = minima(dressed.simulator, takes, last_frames(LinearBlendSkinning(dressed, take_set), takes))
     np.testing.assert_allclose(found.start, found.poses.lbs, atol=1e-6)
@@ -310,7 +311,7 @@ def _origins(takes: Sequence[Take]) -> Tensor:
 def test_the_simulator_comes_to_rest_at_its_own_minimum(scene, dressed, motion):
     """Played over a stop in thick air like any other method: calm at the end, where forces balance."""
     dressed = EvaluationScene(scene, replace(dressed.fabric, drag=1.2), FPS, CPU)
-    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 1, 1.5)
+    takes, first = stopped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 1, 1.5)
     take_set = build_take_set(takes, dressed, JOINTS)
     found = settling(dressed, take_set, Simulated(dressed, take_set), first)[0]
     assert found.initial_kinetic_energy > 100 * found.final_kinetic_energy and 0 < found.settling_time < 1.5
@@ -318,7 +319,7 @@ def test_the_simulator_comes_to_rest_at_its_own_minimum(scene, dressed, motion):
 
 
 def test_holds_come_together(dressed, motion):
-    takes, first = stopped_takes(takes_of("sway", motion, FPS), FPS, 3, 1.0)
+    takes, first = stopped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 3, 1.0)
     take_set = build_take_set(takes, dressed, JOINTS)
     single = settling(dressed, take_set, Still(dressed, take_set, torch.zeros(100, 3)), first)
     never = replace(
@@ -331,7 +332,7 @@ def test_holds_come_together(dressed, motion):
 
 
 def test_drift_is_what_changes_from_loop_to_loop(dressed, motion):
-    takes, lengths = looped_takes(takes_of("sway", motion, FPS), FPS, 400)
+    takes, lengths = looped_takes(takes_of("sway", motion, dressed.scene.character.skeleton, FPS), FPS, 400)
     take_set = build_take_set(takes, dressed, JOINTS)
     frames, length = takes[0].frame_count, lengths[0]
     same = loop_drift(dressed, take_set, Still(dressed, take_set, torch.zeros(frames, 3)), lengths)[0]
@@ -364,7 +365,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
 
     def read(clip: str, frames: range) -> np.ndarray:
         if not cache:
-            take_set = build_take_set(takes_of("slow", slow, FPS), dressed, JOINTS)
+            take_set = build_take_set(takes_of("slow", slow, dressed.scene.character.skeleton, FPS), dressed, JOINTS)
             cache["slow"] = (
                 LinearBlendSkinning(dressed, take_set).vertices(0, range(6)).permute(2, 0, 1)
                 + slow.translations[0, 0]
@@ -510,7 +511,7 @@ def test_options_out_of_range_are_refused(options, complaint):
 
 
 def test_no_take_is_refused(dressed, motion):
-    nothing: Sequence[Take] = takes_of("short", motion.clip(0, 3), FPS)
+    nothing: Sequence[Take] = takes_of("short", motion.clip(0, 3), dressed.scene.character.skeleton, FPS)
     with pytest.raises(SsilkError, match="none of four frames"):
         build_take_set(nothing, dressed, JOINTS)
 
@@ -521,7 +522,8 @@ def test_tables_are_aligned():
 
 
 def test_a_simulation_is_where_the_solver_goes_from_its_own_states(scene, dressed, toy_motion):
-    take_set = build_take_set(takes_of("sway", toy_motion(scene, 9), FPS), dressed, JOINTS)
+    takes = takes_of("sway", toy_motion(scene, 9), scene.character.skeleton, FPS)
+    take_set = build_take_set(takes, dressed, JOINTS)
     simulated = Simulated(dressed, take_set)
     (window, *_) = windows_of(dressed, take_set, [0])
     events: list[Progress] = []
@@ -551,7 +553,8 @@ def test_windows_begin_with_a_take_and_with_its_most_violent_second(dressed, sce
 
 def test_departures_are_those_of_cloth_that_leaves_the_simulation(scene, dressed, toy_motion):
     """A method that follows its own simulation, then is moved by steps of a millimetre; windows of two lengths."""
-    take_set = build_take_set(takes_of("sway", toy_motion(scene, 12), FPS), dressed, JOINTS)
+    takes = takes_of("sway", toy_motion(scene, 12), scene.character.skeleton, FPS)
+    take_set = build_take_set(takes, dressed, JOINTS)
     simulated = Simulated(dressed, take_set)
     windows = [MethodWindow(dressed, take_set, simulated, (0, frames)) for frames in (range(9), range(3, 8))]
     for window in windows:

@@ -122,9 +122,9 @@ def test_rides_are_no_cuts_and_teleports_are(scene, base):
     ride = drives.translate_character(base, measures.ride, skeleton).motion()
     steps = np.diff(ride.translations[:, 0, 0] - base.motion().translations[:, 0, 0])
     np.testing.assert_allclose(steps * 30, 50.0)
-    assert len(split_at_cuts(ride)) == 1
+    assert len(split_at_cuts(ride, skeleton)) == 1
     assert (
-        len(split_at_cuts(drives.translate_character(base, measures.jumps, skeleton).motion())) == 13
+        len(split_at_cuts(drives.translate_character(base, measures.jumps, skeleton).motion(), skeleton)) == 13
     )  # after each of 12 s
 
 

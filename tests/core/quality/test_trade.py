@@ -52,7 +52,7 @@ def bench(scene, model, toy_motion):
     takes = [
         take
         for name, frames in (("long", 50), ("short", 20))
-        for take in takes_of(name, toy_motion(scene, frames), FPS)
+        for take in takes_of(name, toy_motion(scene, frames), scene.character.skeleton, FPS)
     ]
     return Reducer(file, [toy_motion(scene, 60, speed=1.3)]), dressed, build_take_set(takes, dressed, file.joints)
 

@@ -80,7 +80,7 @@ def test_frames_of_a_bank_are_those_of_the_motions(scene, toy_motion):
     moved[40:, 0] += 5.0
     motions = [late, short, type(fast)(fast.path, fast.fps, fast.rotations, moved)]
     bank = build_bank(motions, scene.character.skeleton, np.arange(3), 30.0, CPU)
-    found = locate_frames(torch.tensor([0, 19, 20, 25, 39, 40, 41]), bank, motions, 30.0)
+    found = locate_frames(torch.tensor([0, 19, 20, 25, 39, 40, 41]), bank, motions, scene.character.skeleton, 30.0)
     assert [(place["motion"], place["frame"]) for place in found] == [
         *(("/late", 10), ("/late", 29)),
         *(("/fast", 0), ("/fast", 10), ("/fast", 38), ("/fast", 40), ("/fast", 42)),

@@ -30,8 +30,8 @@ from . import memory
 from .memory import HOST, allowed_gib, positive_setting
 
 VARIABLE, USUAL = "SSILK_READ_SECONDS", 30.0
-_READERS = ("reading.motion", "reading.scene", "reading.visibility", "reading.frame_range", "shots.read",
-            "writing.repair")  # fmt: skip
+_READERS = ("reading.motion", "reading.scene", "reading.shapes", "reading.visibility", "reading.frame_range",
+            "shots.read", "writing.repair")  # fmt: skip
 _IMPORTS = ", ".join(f"ssilk_usd.{name}" for name in (*_READERS, "opening.trial"))
 _SERVE = f"import {_IMPORTS}; ssilk_usd.opening.trial.serve()"
 _HEADER = struct.Struct("<Qd")  # of a request: its size [bytes], and for how long it may compute [s]

@@ -25,6 +25,7 @@ from ..opening.stage import (
 )
 from .carried import carried_by
 from .mesh import is_drawn, is_garment, read_mesh
+from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin
 from .spaces import SkelSource
@@ -46,9 +47,10 @@ def read_character(
 
     Meshes that a joint carries are bodies where they are named, or where none is bound.
 
-    Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
-    geomBindTransform) in metres, y up. It includes the uniform scale of the character's xforms but not their
-    position; see `SkelSource.bind_to_core`. Rest transforms of root joints are in world space.
+    Blendshapes that are on at the earliest time are part of a body's shape. Points and bind transforms are in the
+    core's bind space: UsdSkel's bind space (points after geomBindTransform) in metres, y up. It includes the uniform
+    scale of the character's xforms but not their position; see `SkelSource.bind_to_core`. Rest transforms of root
+    joints are in world space.
 
     Args:
         source: a file or an open stage.
@@ -60,7 +62,7 @@ def read_character(
     Raises:
         SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
     """
-    skel = find_skeleton(open_stage(source), root=root)
+    skel = find_skeleton(open_stage(source), root=root, garment=garment)
     skeleton = character_skeleton(skel)
     order = skeleton.joint_names
     return Character(
@@ -111,7 +113,7 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
     if carried:
         mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
         return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
-    mesh = read_mesh(prim, geom_to_core(prim, skel))
+    mesh = read_mesh(prim, geom_to_core(prim, skel), shape_offsets(prim, skel))
     skin = read_skin(prim, skel.joints, order)
     assert skin is not None  # is_skinned
     return Body(mesh, skin)

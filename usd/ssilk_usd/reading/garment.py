@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
 from pxr import Usd, UsdGeom
 
@@ -27,7 +29,9 @@ from ..units import StageUnits
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import display_colour, is_drawn, is_garment, read_mesh
-from .skeleton import bound_skeleton, find_skeleton, skeletons
+from .rebinding import blended_moves, character_source, common_move, joint_moves, used_moves
+from .shapes import shape_offsets
+from .skeleton import bound_skeleton, character_skeleton, find_skeleton, skeletons
 from .skin import match_joints, read_influences, read_skin
 from .spaces import SkelSource
 from .surface import read_surface
@@ -35,11 +39,17 @@ from .surface import read_surface
 
 @needs_whole_files
 def read_garment(
-    source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    garment: str | None = None,
+    root: str | None = None,
+    shaped: bool = True,
 ) -> Garment:
     """Read a garment at rest, in the core's bind space [m], y up.
 
-    A mesh with influences is placed by its geomBindTransform, as in UsdSkel. A mesh without influences is placed by
+    A mesh with influences is placed by its geomBindTransform, as in UsdSkel; one that is bound to another Skeleton
+    than the character's is brought into the character's bind pose (`rebinding`). One without influences is placed by
     its world transform: relative to the character in a stage with one, and absolutely in its own file. One without
     influences whose xforms move as a joint does is bound to that joint, at its bind pose.
 
@@ -48,6 +58,7 @@ def read_garment(
         skeleton: skeleton of the character; weights are remapped to its joints by name.
         garment: the mesh, by path or name, if there are several.
         root: the character that the garment is fitted to, if the stage has several.
+        shaped: with the blendshapes that are on at the earliest time; those of a baked garment move it in its shot.
 
     Raises:
         SsilkError: there is no garment or several, or the data is malformed.
@@ -55,7 +66,9 @@ def read_garment(
     stage = open_stage(source)
     prim = find_garment(stage, garment)
     skel = fitted_skeleton(prim, root)
-    mesh = read_mesh(prim, garment_to_core(prim, skel))
+    place = garment_place(prim, skel, skeleton)
+    mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
+    mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
     if carried:
@@ -103,18 +116,64 @@ def fitted_skeleton(prim: Usd.Prim, root: str | None = None) -> SkelSource | Non
         return None
     above = [skeleton for top, skeleton in found if prim.GetPath().HasPrefix(top.GetPath())]
     own = bound or (above[0] if len(above) == 1 else None)
-    return find_skeleton(stage, root=str(own.GetPath()) if own else root)
+    return find_skeleton(stage, root=str(own.GetPath()) if own else root, garment=str(prim.GetPath()))
 
 
-def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
-    """Return the transform from a garment's local space to the core's bind space [m], column vectors, (4, 4)."""
+@dataclass(frozen=True, eq=False)
+class GarmentPlace:
+    """Where a garment is in the character's bind pose.
+
+    Attributes:
+        to_core: from its local space to the core's bind space [m], column vectors, shape (4, 4).
+        moves: what then moves each point, shape (V, 4, 4); None where all of them stay.
+    """
+
+    to_core: Floats
+    moves: Floats | None = None
+
+    def moved(self, points: Floats) -> Floats:
+        """Return points (V, 3) [m], which `to_core` has transformed, where the garment is."""
+        if self.moves is None:
+            return points
+        return (self.moves[:, :3, :3] @ points[:, :, None])[..., 0] + self.moves[:, :3, 3]
+
+    def offsets_to_local(self, offsets: Floats, rows: Ints) -> Floats:
+        """Return offsets (N, 3) [m] of the points in `rows` (N,) in the garment's local space."""
+        if self.moves is not None:
+            offsets = np.linalg.solve(self.moves[rows, :3, :3], offsets[:, :, None])[..., 0]
+        return offsets @ np.linalg.inv(self.to_core[:3, :3]).T
+
+
+def garment_place(prim: Usd.Prim, skel: SkelSource | None, skeleton: Skeleton | None) -> GarmentPlace:
+    """Return where a garment is on the character with `skeleton`, or on that of its own stage without one.
+
+    Args:
+        skel: of `fitted_skeleton`.
+    """
     if skel is None:
-        return StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim)
+        return GarmentPlace(StageUnits.of(prim.GetStage()).matrix @ world_matrix(prim))
+    if skeleton is None:
+        skeleton = character_skeleton(skel)
     if is_skinned(prim, skel):
-        return geom_to_core(prim, skel)
+        return _rebound(prim, skel, skeleton)
     if carried := carried_by(prim, skel):
-        return skel.bind_to_core @ carried.to_bind
-    return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
+        moves, to_core = joint_moves(skel, skeleton), skel.bind_to_core @ carried.to_bind
+        return GarmentPlace(to_core if moves is None else moves[carried.joint] @ to_core)
+    skel = character_source(skel.stage, skeleton) or skel
+    return GarmentPlace(skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim))
+
+
+def _rebound(prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton) -> GarmentPlace:
+    """Return where a skinned garment is, which may be bound to a Skeleton of its own."""
+    to_core, moves = geom_to_core(prim, skel), joint_moves(skel, skeleton)
+    influences = None if moves is None else read_influences(prim, skel.joints)
+    if moves is None or influences is None:
+        return GarmentPlace(to_core)
+    ordered, used = used_moves(moves, influences, skel.joints)
+    common = common_move(used)
+    if common is not None:
+        return GarmentPlace(common @ to_core)
+    return GarmentPlace(to_core, blended_moves(ordered, influences))
 
 
 def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:

@@ -10,7 +10,7 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Mesh
 
 from ..names import CLASS, GARMENT, PROXIES
-from ..opening.stage import EARLIEST, apply, has_value, location, value
+from ..opening.stage import EARLIEST, apply, has_value, location, value, world_matrix
 from .polygons import triangulate
 
 
@@ -39,18 +39,20 @@ def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
     return red, green, blue
 
 
-def read_mesh(prim: Usd.Prim, to_core: Floats) -> Mesh:
+def read_mesh(prim: Usd.Prim, to_core: Floats, offsets: Floats | None = None) -> Mesh:
     """Read a UsdGeom.Mesh; its earliest points are its rest shape.
 
     Args:
-        prim: the mesh. Hole faces are omitted, and left-handed faces are reversed.
+        prim: the mesh. Hole faces are omitted, and faces that run clockwise are reversed.
         to_core: transform from the mesh's local space to the core's bind space [m], column vectors, shape (4, 4).
+        offsets: of the points, in local space, which blendshapes move, shape (V, 3).
 
     Raises:
         SsilkError: counts, indices or texture coordinates do not match, or points are not finite.
     """
     where = location(prim)
     points = np.array(value(prim, "points") or [], dtype=np.float64).reshape(-1, 3)
+    points = points if offsets is None else points + offsets
     counts, indices = _polygons(prim, len(points), where)
     corners, counts = _kept_corners(prim, counts)
     uvs = _texture_coordinates(prim, indices)
@@ -95,9 +97,18 @@ def _kept_corners(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints]:
     holes = np.array(value(prim, "holeIndices") or [], dtype=np.int64)
     keep[holes[(holes >= 0) & (holes < len(counts))]] = False
     starts = np.cumsum(counts) - counts
-    step = -1 if value(prim, "orientation") == UsdGeom.Tokens.leftHanded else 1
+    step = -1 if winds_backwards(prim) else 1
     corners = [np.arange(start, start + count)[::step] for start, count in zip(starts[keep], counts[keep])]
     return np.concatenate(corners) if corners else np.zeros(0, dtype=np.int64), counts[keep]
+
+
+def winds_backwards(prim: Usd.Prim) -> bool:
+    """Return whether a mesh's faces, as they are seen, run clockwise from outside.
+
+    Left-handed ones do, and a negative scale of the xforms turns either kind into the other.
+    """
+    left_handed = value(prim, "orientation") == UsdGeom.Tokens.leftHanded
+    return bool(left_handed != (np.linalg.det(world_matrix(prim)[:3, :3]) < 0))
 
 
 def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:

@@ -27,8 +27,9 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
-from .skeleton import skeletons
-from .skin import match_joints
+from .clips import LOOKED_AT, clip_placement, spread
+from .skeleton import of_bodies, skeletons
+from .skin import match_joints, need_unique
 from .spaces import joints_to_core, need_similarity, similarity_scale
 
 _SCALE_TOLERANCE = 1e-3
@@ -81,8 +82,9 @@ def read_motion(
     """Read a motion at its own rate: framesPerSecond if authored, else timeCodesPerSecond.
 
     Frames run from the first to the last authored sample, whatever range the stage says; USD interpolates between
-    samples. On a character, the root joints include the xforms above the skeleton, animated or not. Joints are
-    matched by path, then by unique leaf name. Joints that the animation lacks stay in the rest pose.
+    samples. On a character, the root joints include the xforms above the skeleton, animated or not; one that stands
+    alone may be in the space of the character's skeleton (`clips`). Joints are matched by path, then by unique leaf
+    name. Joints that the animation lacks stay in the rest pose.
 
     Args:
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
@@ -102,11 +104,17 @@ def read_motion(
     animation, placed = find_animation(stage, prim, root)
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    need_unique(joints, where)
     match = _matched(joints, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed, within)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
         need_similarity(placed, placements)
+    units = StageUnits.of(stage)
+    if placed is None and skeleton.placement is not None:
+        sample = read_samples(animation, spread(codes, LOOKED_AT), len(joints), where)
+        found = clip_placement(rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match], match, units, skeleton)
+        placements, units = (placements, units) if found is None else (found[None], StageUnits())
     scale = similarity_scale(placements)
     rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
     for first in range(0, len(codes), _FRAMES_AT_ONCE):
@@ -114,7 +122,7 @@ def read_motion(
         turned, moved = read_samples(animation, codes[part], len(joints), where)
         authored = rigid(matrix_from_quaternion(turned), moved)[:, match]
         placement = placements[part] if placed else placements
-        local = joints_to_core(authored, skeleton.parents, placement, StageUnits.of(stage), scale)
+        local = joints_to_core(authored, skeleton.parents, placement, units, scale)
         local[:, match < 0] = skeleton.rest_transforms[match < 0]
         if not first:
             kept = match >= 0
@@ -128,14 +136,19 @@ def read_motion(
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
     """Return the SkelAnimation and the Skeleton that it animates (None for an unbound animation)."""
     where = stage.GetRootLayer().identifier
-    bound, own = {}, {}
-    for top, skeleton in skeletons(stage):
+    bound: dict[Usd.Prim, Usd.Prim] = {}
+    own: dict[Usd.Prim, Usd.Prim] = {}
+    pairs = skeletons(stage)
+    bodies = of_bodies(stage, pairs)
+    # Garments may have skeletons of their own, which share the character's animation, or have copies of it.
+    for top, skeleton in (*bodies, *(pair for pair in pairs if pair not in bodies)):
         animation = inherited_target(skeleton, "skel:animationSource")
         if animation:
-            bound[animation] = skeleton
+            bound.setdefault(animation, skeleton)
         if animation and root and named([top, skeleton], root):
             own[animation] = skeleton
-    bound = own or bound
+    moved = {skeleton for _, skeleton in bodies}
+    bound = own or {animation: skeleton for animation, skeleton in bound.items() if skeleton in moved} or bound
     every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
     found = named(every, prim) if prim else list(bound) or every
     if not found:

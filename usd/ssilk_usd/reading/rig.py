@@ -16,6 +16,7 @@ from ssilk_core.scene.assets import Floats, Ints, ProxyRig, Skeleton, SkinWeight
 from ..names import PROXIES
 from ..opening.stage import StageLike, has_value, location, needs_whole_files, open_stage, value
 from .garment import find_garment, fitted_skeleton, lbs_skin
+from .rebinding import joint_moves
 from .skin import match_joints, read_influences
 from .spaces import SkelSource
 
@@ -52,11 +53,12 @@ def read_proxy_rig(
     gone = [name for name, index in zip(value(prim, PROXIES), _find(prim, skel)) if index < 0]
     if gone:
         report(Message(f"{where}: {len(gone)} of its proxy joints are gone ({gone[0]}, ...)", "warning"))
+    binds, moves = skel.binds_to_core(skel.bind[mine]), joint_moves(skel, skeleton)
     return ProxyRig(
         where,
         names,
         _proxy_parents(skel, mine, skeleton, where),
-        skel.binds_to_core(skel.bind[mine]),
+        binds if moves is None else moves[mine] @ binds,
         _rig_skin(prim, skel, skeleton, names, report),
     )
 

@@ -52,18 +52,19 @@ def read_scene(
     """
     stage = open_stage(source)
     file, prim = split_location(garment) if garment else (None, None)
+    names: tuple[str | None, str | None]
     if file and Path(file).suffix in USD_SUFFIXES:
-        wardrobe, where = open_stage(file), {"garment": prim}
+        wardrobe, names = open_stage(file), (prim, None)
         _need_order(stage, wardrobe)
         character = read_character(stage, root=root, bodies=bodies, report=report)
     else:
         character = read_character(stage, root=root, bodies=bodies, garment=garment, report=report)
-        wardrobe, where = stage, {"garment": garment, "root": root}
+        wardrobe, names = stage, (garment, root)
     for opened in dict.fromkeys((stage, wardrobe)):
         _announce_units(opened, report)
     skeleton = character.skeleton
-    rig = read_proxy_rig(wardrobe, skeleton, **where, report=report)
-    return character, read_garment(wardrobe, skeleton, **where), rig
+    rig = read_proxy_rig(wardrobe, skeleton, garment=names[0], root=names[1], report=report)
+    return character, read_garment(wardrobe, skeleton, garment=names[0], root=names[1]), rig
 
 
 @needs_whole_files

@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Skeleton
 
-from ..names import PROXIES
+from ..names import PROXIES, SKEL
 from ..opening.stage import (
     PRIMS,
     column_matrix,
     has_value,
+    inherited,
     inherited_target,
     location,
     named,
@@ -24,14 +23,19 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
-from .skin import match_joints
+from .mesh import is_drawn, is_garment
+from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
+_STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
 _CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
 
 
-def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
+def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | None = None) -> SkelSource:
     """Find the only skeleton of a stage, or the one named by `root` (path or name of its SkelRoot or Skeleton).
+
+    Of several, the character's is the one that other meshes than garments are bound to: `garment` names one, by path
+    or name, that is not marked.
 
     Raises:
         SsilkError: there is no skeleton or no unique one, or the skeleton is malformed.
@@ -45,6 +49,7 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
             "export the character with its armature",
         )
     chosen = found if root is None else _pairs_named(found, root)
+    chosen = of_bodies(stage, chosen, garment) if len(chosen) > 1 else chosen
     there_are = "there are " + ", ".join(f"{top.GetPath()} ({skeleton.GetName()})" for top, skeleton in found)
     if not chosen:
         fail(where, f"no SkelRoot or Skeleton is named '{root}'", there_are, _CHOOSE)
@@ -55,13 +60,24 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None) -> SkelSource:
             there_are,
             f"{_CHOOSE}, by the path of its Skeleton if need be",
         )
-    return _source(*chosen[0])
+    return skeleton_at(*chosen[0])
 
 
 def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
     """Return the pairs whose SkelRoot has this path or name, or if there are none, whose Skeleton has it."""
     roots, skeletons_named = (named([pair[side] for pair in pairs], name) for side in (0, 1))
     return [pair for pair in pairs if pair[0] in roots] or [pair for pair in pairs if pair[1] in skeletons_named]
+
+
+def of_bodies(
+    stage: Usd.Stage, pairs: list[tuple[Usd.Prim, Usd.Prim]], garment: str | None = None
+) -> list[tuple[Usd.Prim, Usd.Prim]]:
+    """Return the pairs whose Skeleton moves a mesh that is no garment; all pairs where none does."""
+    meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    garments = named(meshes, garment) if garment else []
+    bodies = [mesh for mesh in meshes if not is_garment(mesh) and mesh not in garments]
+    moved = {bound_skeleton(mesh) for mesh in bodies if inherited(mesh, SKEL[0]) is not None}
+    return [pair for pair in pairs if pair[1] in moved] or pairs
 
 
 def skeletons(stage: Usd.Stage) -> list[tuple[Usd.Prim, Usd.Prim]]:
@@ -95,10 +111,42 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     parents = position[source.parents[kept]]
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
-    return Skeleton(location(source.prim), names, parents, source.binds_to_core(source.bind[kept]), rest)
+    hub = _carries_body(_moved_weights(source)[kept], parents)
+    binds, placement = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
+    return Skeleton(location(source.prim), names, parents, binds, rest, hub, placement)
 
 
-def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
+def _moved_weights(source: SkelSource) -> Floats:
+    """Return how much of the bodies each joint of a skeleton moves, as the sum of its weights, shape (N,)."""
+    total = np.zeros(len(source.joints) + 1)
+    for prim in Usd.PrimRange(source.root, PRIMS):
+        if prim.IsA(UsdGeom.Mesh) and is_drawn(prim) and not is_garment(prim) and bound_skeleton(prim) == source.prim:
+            influences = read_influences(prim, source.joints)
+            if influences is not None:
+                at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
+                np.add.at(total, at, np.abs(influences.weights) / max(len(at), 1))
+    return total[:-1]
+
+
+def _carries_body(moved: Floats, parents: Ints) -> int:
+    """Return the joint that carries the body: the lowest one that all of it hangs from, but for `_STRAY` of it.
+
+    Game skeletons have joints above the hips, which may stand still while the character runs.
+
+    Args:
+        moved: how much of the body each joint moves itself, shape (J,).
+    """
+    below = np.array(moved)
+    for joint in range(len(parents) - 1, -1, -1):
+        if parents[joint] >= 0:
+            below[parents[joint]] += below[joint]
+    whole = (1 - _STRAY) * moved.sum()
+    held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
+    return int(held[-1]) if len(held) else 0
+
+
+def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
+    """Read the Skeleton `prim` of a SkelRoot; raise `SsilkError` where it is malformed."""
     where, joints = location(prim), tuple(str(name) for name in value(prim, "joints") or ())
     if not joints:
         fail(where, "the skeleton has no joints", "at least one is needed", "export the armature again")
@@ -124,9 +172,7 @@ def _source(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
 
 def _parents(joints: tuple[str, ...], where: str) -> Ints:
     """Return parent indices by UsdSkel's rule: the parent is the nearest ancestor path that is a joint."""
-    repeated = next((name for name, count in Counter(joints).items() if count > 1), None)
-    if repeated is not None:
-        fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
+    need_unique(joints, where)
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
     if broken is not None:
         fail(where, f"joint '{broken}' is not a path", "joints are paths like 'Hips/Spine'", "rename it")

@@ -51,6 +51,13 @@ def match_joints(names: tuple[str, ...], among: tuple[str, ...]) -> list[int]:
     return [find(name) for name in names]
 
 
+def need_unique(joints: tuple[str, ...], where: str) -> None:
+    """Raise `SsilkError` where a list names a joint twice: UsdSkel then takes either of both."""
+    repeated = next((name for name, count in Counter(joints).items() if count > 1), None)
+    if repeated is not None:
+        fail(where, f"joint '{repeated}' is listed twice", "each joint needs its own path", "rename one")
+
+
 def leaf(joint: str) -> str:
     """Return the last part of a joint path."""
     return joint.rpartition("/")[2]
@@ -109,6 +116,7 @@ def read_influences(
         )
     own = inherited(prim, properties[2]) or inherited(prim, JOINTS)
     names = joints if own is None else tuple(own.Get(EARLIEST) or ())
+    need_unique(names, where)
     return AuthoredInfluences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
 
 

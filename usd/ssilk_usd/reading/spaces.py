@@ -72,6 +72,14 @@ class SkelSource:
         return matrix
 
     @property
+    def skeleton_to_world(self) -> Floats | None:
+        """Skeleton space to the core's world [m], (4, 4), where the xforms above tilt or scale it; None elsewhere."""
+        scale, up = similarity_scale(self.placement), self.units.rotation.T @ np.array([0.0, 1.0, 0.0])
+        tilt = up @ self.placement[:3, :3] @ up / scale
+        plain = abs(scale - 1) < _RIGID_TOLERANCE and tilt > 1 - _RIGID_TOLERANCE
+        return None if plain else self.units.matrix @ self.placement
+
+    @property
     def world_to_bind(self) -> Floats:
         """World to bind space for the character's placement at the earliest time, shape (4, 4)."""
         return self._skeleton_to_bind() @ np.linalg.inv(self.placement)

@@ -14,7 +14,7 @@ from ssilk_core.scene.kinematics import local_transforms
 
 from ..opening.garment_api import GarmentRecord, read_garment_record
 from ..opening.stage import StageLike, apply, location, needs_whole_files, open_stage
-from ..reading.garment import find_garment, fitted_skeleton, garment_to_core, read_garment
+from ..reading.garment import find_garment, fitted_skeleton, garment_place, read_garment
 from ..reading.mesh import read_mesh
 from ..reading.motion import find_animation, read_samples
 from ..reading.rig import read_proxy_rig
@@ -60,13 +60,14 @@ def read_baked(source: StageLike) -> BakedGarment:
     if skel is None:
         fail(location(prim), "its stage has no skeleton", "a baked garment needs joints", "choose a shot with joints")
     skeleton = character_skeleton(skel)
-    garment, rig = read_garment(stage, skeleton), read_proxy_rig(stage, skeleton)
+    garment, rig = read_garment(stage, skeleton, shaped=False), read_proxy_rig(stage, skeleton)
     joints, binds, skin = skeleton.joint_names, skeleton.bind_transforms, garment.skin
     if rig is not None:
         joints, binds, skin = (*joints, *rig.joint_names), np.concatenate([binds, rig.bind_transforms]), rig.skin
     if skin is None:
         fail(location(prim), "no joint moves it", "a baked garment needs weights", "bake to joints, not to points")
-    names, shapes = _read_blendshapes(prim, garment_to_core(prim, skel)[:3, :3], garment.mesh.vertex_count)
+    linear = garment_place(prim, skel, skeleton).to_core[:3, :3]
+    names, shapes = _read_blendshapes(prim, linear, garment.mesh.vertex_count)
     times = frame_times(stage)
     proxies = joints[skeleton.joint_count :]
     pose = _read_pose(find_animation(stage, None, None)[0], proxies, names, times, skel.joint_scale)

@@ -6,17 +6,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..opening.stage import explains_damage, open_stage, value
-from ..reading.garment import find_garment, fitted_skeleton, garment_to_core
+from ..reading.garment import find_garment, fitted_skeleton, garment_place
 from ..units import StageUnits
 from .export import export
 from .repair_mesh import rewrite_mesh
 
 if TYPE_CHECKING:
     from ssilk_core.authoring.preflight.repair import MeshRepair
+    from ssilk_core.scene.assets import Skeleton
 
 # What refers to points, edges or faces in ways that a repair would have to guess at.
 _LOCKS = {
@@ -52,7 +52,13 @@ def write_with_units(source: str | Path, out: str | Path, units: StageUnits) -> 
 
 @explains_damage
 def write_repaired(
-    source: str | Path, out: str | Path, repair: MeshRepair, *, garment: str | None = None, root: str | None = None
+    source: str | Path,
+    out: str | Path,
+    repair: MeshRepair,
+    *,
+    garment: str | None = None,
+    root: str | None = None,
+    skeleton: Skeleton | None = None,
 ) -> None:
     """Write a flattened copy of a garment's file with its mesh repaired.
 
@@ -64,21 +70,21 @@ def write_repaired(
         out: the file to write: .usdc, .usd or .usda.
         repair: relative to the mesh as `read_garment` returns it.
         garment, root: as in `read_garment`.
+        skeleton: that the garment was read with; by default the one of its own stage.
 
     Raises:
         SsilkError: the output cannot be written, or a primvar does not match the mesh.
     """
     stage = open_stage(source)
     prim = find_garment(stage, garment)
-    to_core = garment_to_core(prim, fitted_skeleton(prim, root))
+    place = garment_place(prim, fitted_skeleton(prim, root), skeleton)
     stage.SetEditTarget(stage.GetSessionLayer())
     for prefix in prim.GetPath().GetPrefixes():  # what is instanced cannot be edited
         if stage.GetPrimAtPath(prefix).IsInstance():
             stage.GetPrimAtPath(prefix).SetInstanceable(False)
     path, layer = prim.GetPath(), stage.Flatten()
     copy = Usd.Stage.Open(layer)
-    offsets = repair.offsets @ np.linalg.inv(to_core[:3, :3]).T
-    rewrite_mesh(UsdGeom.Mesh(copy.GetPrimAtPath(path)), repair, offsets)
+    rewrite_mesh(UsdGeom.Mesh(copy.GetPrimAtPath(path)), repair, place.offsets_to_local(repair.offsets, repair.kept))
     export(layer, out)
 
 

@@ -14,6 +14,7 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import EARLIEST, location, value
+from ..reading.mesh import winds_backwards
 
 if TYPE_CHECKING:
     from ssilk_core.authoring.preflight.repair import MeshRepair
@@ -69,8 +70,8 @@ def _reshape(mesh: UsdGeom.Mesh, repair: MeshRepair) -> None:
 
 
 def _authored_corners(mesh: UsdGeom.Mesh, repair: MeshRepair) -> Ints:
-    """Return the authored corners of the new faces; `read_mesh` reverses all faces of left-handed meshes."""
-    if mesh.GetOrientationAttr().Get() != UsdGeom.Tokens.leftHanded:
+    """Return the authored corners of the new faces; `read_mesh` reverses those that run clockwise."""
+    if not winds_backwards(mesh.GetPrim()):
         return repair.corners
     counts = np.array(value(mesh.GetPrim(), "faceVertexCounts"), dtype=np.int64)
     return _backwards(counts)[repair.corners][_backwards(repair.counts)]

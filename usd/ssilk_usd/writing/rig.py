@@ -20,13 +20,14 @@ from ..opening.stage import (
     PRIMS,
     apply,
     inherited,
+    location,
     open_stage,
     split_location,
     value,
 )
 from ..reading.carried import carried_by
-from ..reading.garment import garment_to_core
-from ..reading.mesh import is_garment
+from ..reading.garment import fitted_skeleton, garment_place
+from ..reading.mesh import is_garment, winds_backwards
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
@@ -58,7 +59,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
+    mesh, to_bind = _place_garment(stage, skel, source, scene, moved)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
@@ -89,26 +90,35 @@ def _prim_path(where: str) -> str:
 
 
 def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment, moved: Floats | None
+    stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None
 ) -> tuple[UsdGeom.Mesh, Floats]:
     """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
 
     A mesh of the stage keeps its points but for what `moved`, and is moved if it stands elsewhere; one from its own
     file is copied.
     """
+    garment, skeleton = scene.garment, scene.character.skeleton
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
     if not (same and old and old.IsA(UsdGeom.Mesh)):
         return _copy_garment(stage, skel, garment), np.eye(4)
-    to_core = garment_to_core(old, skel)
-    to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
+    own = fitted_skeleton(old, str(skel.prim.GetPath())) or skel
+    place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
+    to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
+    if place.moves is not None:  # to its bind pose, which another skeleton has otherwise
+        moved = garment.mesh.points - apply(place.to_core, np.array(value(old, "points"), dtype=np.float64))
     if moved is not None:
-        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(to_core[:3, :3]).T)
-    if carried_by(old, skel):
+        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(place.to_core[:3, :3]).T)
+    backwards = winds_backwards(old)
+    if carried_by(old, own):
         old = _let_go(stage, skel, old)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
+    if winds_backwards(old) != backwards:  # under other xforms, which mirror it, or no longer
+        tokens = UsdGeom.Tokens
+        turned = tokens.rightHanded if value(old, "orientation") == tokens.leftHanded else tokens.leftHanded
+        UsdGeom.Mesh(old).CreateOrientationAttr(turned)
     return UsdGeom.Mesh(old), to_bind
 
 

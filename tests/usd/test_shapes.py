@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bodies and garments whose shape is a blendshape that is on: read as UsdSkel shows them."""
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from scipy.spatial.transform import Rotation
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.reading.shapes import animated_shapes
+
+from ssilk_core.scene import kinematics
+
+BIND = kinematics.rigid(Rotation.from_euler("z", [[10], [-20]], degrees=True).as_matrix(), [[0, 1, 0], [0, 1.4, 0]])
+POINTS = np.array([[0, 1.0, 0.1], [0.1, 1, 0], [0, 1.5, 0], [0.1, 0.9, 0]])
+OFFSETS = np.array([[0, 0, 0.05], [0.02, 0, 0], [0, 0.01, 0], [0.03, 0, 0.01]])
+GEOM = Gf.Matrix4d().SetScale(2) * Gf.Matrix4d().SetTranslate(Gf.Vec3d(0, 0.1, 0))
+
+
+def gf(matrix: np.ndarray) -> Gf.Matrix4d:
+    return Gf.Matrix4d(np.asarray(matrix).T.tolist())
+
+
+def dressed(folder, weights, *, inbetween=False, sparse=False, order=("Other", "Full")):
+    """Write a body and a garment, each with the blendshape `Full`; `weights` are of `order`, constant or samples."""
+    path = str(folder / "hero.usda")
+    stage = Usd.Stage.CreateNew(path)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdSkel.Root.Define(stage, "/Hero")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/Hero/Rig")
+    skeleton.CreateJointsAttr(["Hips", "Hips/Spine"])
+    binds = kinematics.rigid(BIND[:, :3, :3], BIND[:, :3, 3] * 100)
+    skeleton.CreateBindTransformsAttr([gf(matrix) for matrix in binds])
+    rest = kinematics.local_transforms(binds, np.array([-1, 0]))
+    skeleton.CreateRestTransformsAttr([gf(matrix) for matrix in rest])
+    for name in ("Body", "Cape"):
+        mesh = UsdGeom.Mesh.Define(stage, f"/Hero/{name}")
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy((POINTS * 100).astype("f4")))
+        mesh.CreateFaceVertexCountsAttr([3, 3])
+        mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 0, 3, 1])
+        binding = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+        binding.CreateSkeletonRel().SetTargets(["/Hero/Rig"])
+        binding.CreateJointIndicesPrimvar(False, 1).Set([0, 0, 1, 0])
+        binding.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 4)
+        binding.CreateGeomBindTransformAttr(GEOM)
+        shape = UsdSkel.BlendShape.Define(stage, f"/Hero/{name}/Full")
+        rows = [1, 3] if sparse else [0, 1, 2, 3]
+        shape.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy((OFFSETS[rows] * 100).astype("f4")))
+        if sparse:
+            shape.CreatePointIndicesAttr(rows)
+        if inbetween:
+            half = shape.CreateInbetween("half")
+            half.SetWeight(0.5)
+            half.SetOffsets(Vt.Vec3fArray.FromNumpy((OFFSETS[rows] * 30).astype("f4")))
+        binding.CreateBlendShapesAttr(["Full"])
+        binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath()])
+    animation = UsdSkel.Animation.Define(stage, "/Hero/Rig/Look")
+    animation.CreateJointsAttr(["Hips", "Hips/Spine"])
+    local = kinematics.local_transforms(binds, np.array([-1, 0]))
+    quats = Rotation.from_matrix(local[:, :3, :3]).as_quat()
+    animation.CreateRotationsAttr([Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in quats])
+    animation.CreateTranslationsAttr([Gf.Vec3f(*map(float, place)) for place in local[:, :3, 3]])
+    animation.CreateScalesAttr([Gf.Vec3h(1)] * 2)
+    animation.CreateBlendShapesAttr(order)
+    if isinstance(weights, dict):
+        for code, row in weights.items():
+            animation.CreateBlendShapeWeightsAttr().Set(row, code)
+    else:
+        animation.CreateBlendShapeWeightsAttr(weights)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(["/Hero/Rig/Look"])
+    stage.SetTimeCodesPerSecond(30)
+    stage.Save()
+    return path
+
+
+def seen(path: str, mesh: str, code: float) -> np.ndarray:
+    """World positions [m] that UsdSkel bakes into the points of a mesh."""
+    stage = Usd.Stage.Open(Usd.Stage.Open(path).Flatten())
+    root = UsdSkel.Root(stage.GetPrimAtPath("/Hero"))
+    assert UsdSkel.BakeSkinning(root, Gf.Interval(code, code))
+    return np.array(UsdGeom.Mesh(stage.GetPrimAtPath(mesh)).GetPointsAttr().Get(code)) * 0.01
+
+
+CASES = {
+    "on": ([0.0, 1.0], {}),
+    "half on": ([0.3, 0.5], {}),
+    "an in-between": ([0.0, 0.5], {"inbetween": True}),
+    "over one": ([0.0, 1.5], {}),
+    "sparse": ([0.0, 1.0], {"sparse": True}),
+    "off": ([1.0, 0.0], {}),
+    "animated": ({1: [0.0, 0.25], 5: [0.0, 1.0]}, {}),
+}
+
+
+@pytest.mark.parametrize(("weights", "options"), CASES.values(), ids=CASES)
+def test_a_shape_that_is_on_is_the_one_that_is_read(tmp_path, weights, options):
+    path = dressed(tmp_path, weights, **options)
+    character, garment, _ = read_scene(path, garment="Cape")
+    (body,) = character.bodies
+    for mesh, name in ((body.mesh, "Body"), (garment.mesh, "Cape")):  # the animation holds the bind pose
+        np.testing.assert_allclose(mesh.points, seen(path, f"/Hero/{name}", 1), atol=2e-6)
+
+
+def test_what_a_motion_makes_of_shapes_is_told(tmp_path):
+    path = dressed(tmp_path, [0.0, 1.0])
+    assert animated_shapes(path, path) == []
+    moving = tmp_path / "shot"
+    moving.mkdir()
+    shot = dressed(moving, {1: [0.0, 0.25], 5: [0.0, 1.0]})
+    assert [str(found) for found in animated_shapes(path, shot)] == [
+        "'Full' of Body, from 0.25 to 1 where the character's stage has 1",
+        "'Full' of Cape, from 0.25 to 1 where the character's stage has 1",
+    ]
+    (tmp_path / "without").mkdir()
+    without = dressed(tmp_path / "without", [0.0], order=("Other",))
+    assert animated_shapes(path, without) == []

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which axis and which unit a SkelAnimation is in that stands alone, without the character that it moves.
+
+Exporters write axis and scale of a character into an Xform above its skeleton. Joints then are in skeleton space,
+lying and in centimetres perhaps, and so are clips of them, whatever their own files say of axis and units. UsdSkel
+shows them by the character's Xforms. Other exporters convert clips to what their files say. The bones tell the unit,
+and the character stands upright in one of both.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ssilk_core.scene.assets import Floats, Ints, Skeleton
+from ssilk_core.scene.kinematics import world_transforms
+
+from ..units import StageUnits
+from .spaces import joints_to_core, similarity_scale
+
+LOOKED_AT = 32  # frames of a clip
+SAME = 1e-3  # relative difference of scales, and of rotation matrices, that is rounding
+UPRIGHT = 0.5  # by how much more upright a character is by its clip's axis, where that one counts
+_SHORT = 1e-3  # [m] bones that tell no scale
+
+
+def spread(codes: Floats, count: int) -> Floats:
+    """Return at most `count` of some time codes, spread evenly."""
+    return codes[np.unique(np.linspace(0, len(codes) - 1, min(len(codes), count)).round().astype(int))]
+
+
+def clip_placement(local: Floats, match: Ints, units: StageUnits, skeleton: Skeleton) -> Floats | None:
+    """Return what brings a clip's root joints into the world [m], shape (4, 4); None where its file's units do.
+
+    Args:
+        local: joint to parent in some frames of the clip, as authored, in the skeleton's order, (F, J, 4, 4).
+        match: index of each joint in the clip, or -1 where `local` means nothing, shape (J,).
+        units: those of the clip's file.
+        skeleton: of a character whose Xforms tilt or scale it.
+    """
+    assert skeleton.placement is not None
+    above = skeleton.placement
+    scale = similarity_scale(above)
+    metres = _scale_of_bones(local, match, skeleton, (scale, units.meters_per_unit))
+    turns = above[:3, :3] / scale, units.rotation
+    if np.abs(turns[0] - turns[1]).max() < SAME:
+        turn = turns[1]
+    else:
+        by_character, by_file = (_uprightness(local, match, turn, metres, skeleton) for turn in turns)
+        turn = turns[1] if by_file > by_character + UPRIGHT else turns[0]
+    if turn is turns[1] and metres == units.meters_per_unit:
+        return None
+    placement = np.eye(4)
+    placement[:3, :3] = turn * metres
+    placement[:3, 3] = above[:3, 3]
+    return placement
+
+
+def _scale_of_bones(local: Floats, match: Ints, skeleton: Skeleton, choice: tuple[float, float]) -> float:
+    """Return the scale [m] by which the clip's bones are as long as the skeleton's, the last one where both are."""
+    rest = np.linalg.norm(skeleton.rest_transforms[:, :3, 3], axis=-1)
+    kept = (np.asarray(skeleton.parents) >= 0) & (match >= 0) & (rest > _SHORT)
+    first, last = choice
+    if abs(first / last - 1) < SAME or not kept.any():
+        return last
+    ratio = float(np.median(np.linalg.norm(local[0, kept, :3, 3], axis=-1) / rest[kept]))
+    if not ratio > 0:
+        return last
+    return first if abs(np.log(ratio * first)) < abs(np.log(ratio * last)) else last
+
+
+def _uprightness(local: Floats, match: Ints, turn: Floats, metres: float, skeleton: Skeleton) -> float:
+    """Return how upright the character's hub is on average, from 1 as at rest to -1 upside down."""
+    placement = np.eye(4)
+    placement[:3, :3] = turn * metres
+    posed = joints_to_core(local, skeleton.parents, placement, StageUnits())
+    posed[:, match < 0] = skeleton.rest_transforms[match < 0]
+    hub, rest = (
+        world_transforms(joints, skeleton.parents)[..., skeleton.hub, :3, :3]
+        for joints in (posed, skeleton.rest_transforms)
+    )
+    return float((hub @ rest.T)[:, 1, 1].mean())

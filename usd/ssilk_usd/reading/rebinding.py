@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments that are bound to another Skeleton than the character's, brought into the character's bind pose.
+
+A garment may come with a Skeleton prim of its own, which has joints of the same names, and a bind pose, a rest pose
+and a place of its own. UsdSkel shows it by those. Joint by joint, the garment goes to where it is seen beside the
+character, and from there back into the character's bind pose.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Usd, UsdSkel
+
+from ssilk_core.scene.assets import Floats, Skeleton
+from ssilk_core.scene.kinematics import world_transforms
+
+from ..opening.stage import EARLIEST, PRIMS, column_matrix, inherited_target, location
+from ..units import scaling
+from .skeleton import skeleton_at, skeletons
+from .skin import AuthoredInfluences, match_joints
+from .spaces import SkelSource
+
+SAME = 1e-5  # [m], and of rotation matrices: two bind poses that differ by less are one, rounded
+
+
+def character_source(stage: Usd.Stage, skeleton: Skeleton) -> SkelSource | None:
+    """Return the Skeleton of a stage that a character's skeleton was read from; None where it is not in it."""
+    found = (pair for pair in skeletons(stage) if location(pair[1]) == skeleton.path)
+    pair = next(found, None)
+    return skeleton_at(*pair) if pair else None
+
+
+def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
+    """Return what moves what each joint carries from its bind pose to the character's [m], shape (N, 4, 4).
+
+    In one stage with the character, both are compared as USD shows them: animated where both are, else at rest. A
+    garment in its own file was fitted to its own bind pose. Joints that the character lacks move as those above them.
+
+    Returns:
+        Rigid transforms in the core's bind space, for the joints of `own`; None where nothing moves.
+    """
+    if location(own.prim) == skeleton.path:
+        return None
+    match = np.array(match_joints(own.joints, skeleton.joint_names))
+    theirs, binds = own.binds_to_core(own.bind), skeleton.bind_transforms
+    character = character_source(own.stage, skeleton)
+    if character is None:
+        to_character = binds[match] @ np.linalg.inv(theirs)
+    else:
+        animated = all(inherited_target(source.prim, "skel:animationSource") for source in (own, character))
+        kept = character.character_joints
+        shown = _shown(character, animated)[kept] @ np.linalg.inv(binds)
+        to_character = np.linalg.inv(shown)[match] @ _shown(own, animated) @ np.linalg.inv(theirs)
+    for joint in np.flatnonzero(match < 0):
+        above = own.parents[joint]
+        to_character[joint] = to_character[above] if above >= 0 else np.eye(4)
+    return to_character if np.abs(to_character - np.eye(4)).max() > SAME else None
+
+
+def common_move(moves: Floats) -> Floats | None:
+    """Return the one transform that all of some are (4, 4), up to rounding; None where they differ."""
+    return moves[0] if np.abs(moves - moves[0]).max() <= SAME else None
+
+
+def blended_moves(moves: Floats, influences: AuthoredInfluences) -> Floats:
+    """Return the linear blend of joints' transforms for each point, shape (V, 4, 4)."""
+    total = influences.weights.sum(axis=1, keepdims=True)
+    weights = influences.weights / np.where(total > 0, total, 1)
+    blended = np.einsum("vi,viab->vab", weights, moves[influences.indices])
+    blended[total[:, 0] <= 0] = np.eye(4)
+    return blended
+
+
+def used_moves(moves: Floats, influences: AuthoredInfluences, joints: tuple[str, ...]) -> tuple[Floats, Floats]:
+    """Return joints' transforms in the joint order of influences, shape (M, 4, 4), and of those in use alone."""
+    ordered = np.concatenate([moves, np.eye(4)[None]])[match_joints(influences.joints, joints)]
+    return ordered, ordered[np.unique(influences.indices[influences.weights != 0])]
+
+
+def _shown(source: SkelSource, animated: bool) -> Floats:
+    """Return joint to core world [m] as USD shows a skeleton at its earliest time, rigid, shape (N, 4, 4)."""
+    posed = world_transforms(source.rest, source.parents)
+    if animated:
+        cache = UsdSkel.Cache()
+        cache.Populate(UsdSkel.Root(source.root), PRIMS)
+        found = cache.GetSkelQuery(UsdSkel.Skeleton(source.prim)).ComputeJointSkelTransforms(EARLIEST)
+        posed = column_matrix(found) if found else posed
+    return source.units.matrix @ source.placement @ posed @ scaling(1 / source.joint_scale)

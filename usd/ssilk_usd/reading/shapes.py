@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blendshapes that are on: a mesh is read in the shape that UsdSkel shows at the earliest time of its stage.
+
+Blendshapes make body types, and the shape that a garment was fitted to. Shots may animate them: cloth meets the shape
+of the character's stage throughout, and `animated_shapes` says which ones a motion changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.events import Message, Reporter
+from ssilk_core.scene.assets import Floats
+
+from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage, split_location, value
+from .motion import find_animation
+from .skeleton import bound_skeleton, find_skeleton
+from .spaces import SkelSource
+
+SAME = 1e-3  # difference of weights that nobody sees
+
+
+def shape_offsets(prim: Usd.Prim, skel: SkelSource) -> Floats | None:
+    """Return how far the blendshapes that are on move a mesh's points in its own space, (V, 3); None without any."""
+    weights = _weights(prim, skel)
+    if weights is None or not np.any(weights):
+        return None
+    shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
+    points = Vt.Vec3fArray(len(value(prim, "points") or []))
+    given = shapes.ComputeSubShapeWeights(Vt.FloatArray(weights))
+    indices, offsets = shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets()
+    if not given or not shapes.ComputeDeformedPoints(*given, indices, offsets, points):
+        return None
+    return np.array(points, dtype=np.float64).reshape(-1, 3)
+
+
+def _weights(prim: Usd.Prim, skel: SkelSource) -> list[float] | None:
+    """Return the weight of each blendshape of a mesh at the earliest time; None where nothing weighs them."""
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(skel.root), PRIMS)
+    query = cache.GetSkinningQuery(prim)
+    animation = cache.GetSkelQuery(UsdSkel.Skeleton(skel.prim)).GetAnimQuery()
+    if not (query and query.HasBlendShapes() and animation):
+        return None
+    found, mapper = animation.ComputeBlendShapeWeights(EARLIEST), query.GetBlendShapeMapper()
+    if found is None or mapper is None or mapper.IsNull():
+        return None
+    remapped = mapper.Remap(found)
+    return None if remapped is None else [float(weight) for weight in remapped]
+
+
+@dataclass(frozen=True)
+class AnimatedShape:
+    """A blendshape of a character whose weight in a motion is another one than that it was read with.
+
+    Attributes:
+        mesh: name of its mesh.
+        weight: that the character was read with; lowest, highest: in the motion.
+    """
+
+    name: str
+    mesh: str
+    weight: float
+    lowest: float
+    highest: float
+
+    def __str__(self) -> str:
+        course = (
+            f"from {self.lowest:.3g} to {self.highest:.3g}" if self.lowest != self.highest else f"{self.lowest:.3g}"
+        )
+        return f"'{self.name}' of {self.mesh}, {course} where the character's stage has {self.weight:.3g}"
+
+
+def tell_animated_shapes(
+    source: StageLike, motions: Iterable[str], report: Reporter, *, root: str | None = None
+) -> None:
+    """Report which blendshapes of the character's meshes motions change, in which cloth does not meet them.
+
+    Args are those of `animated_shapes`, for each of several motions.
+    """
+    for motion in motions:
+        found = animated_shapes(source, motion, root=root)
+        if found:
+            text = f"{motion}: it weighs blendshapes that are not followed: {found[0]}"
+            more = f", and {len(found) - 1} more" if len(found) > 1 else ""
+            report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
+
+
+@needs_whole_files
+def animated_shapes(source: StageLike, motion: str, *, root: str | None = None) -> list[AnimatedShape]:
+    """Return the blendshapes of a character's meshes that a motion weighs otherwise than its stage does.
+
+    Args:
+        source: the character's stage.
+        motion: "file[:/Prim/Path]", as for `read_motion`.
+        root: the character, if there are several.
+
+    Raises:
+        SsilkError: as `read_motion` and `read_character`.
+    """
+    file, prim = split_location(motion)
+    of_motion = open_stage(file)
+    animation = UsdSkel.Animation(find_animation(of_motion, prim, root)[0])
+    names = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
+    if not names:
+        return []
+    stage = open_stage(source)
+    skel = find_skeleton(stage, root=root)
+    attribute = animation.GetBlendShapeWeightsAttr()
+    codes = attribute.GetTimeSamples() or [Usd.TimeCode.Default()]
+    rows = np.array(
+        [row for row in (attribute.Get(code) for code in codes) if row is not None and len(row) == len(names)]
+    )
+    found = []
+    for mesh in Usd.PrimRange(skel.root, PRIMS):
+        if not (len(rows) and mesh.IsA(UsdGeom.Mesh) and bound_skeleton(mesh) == skel.prim):
+            continue
+        own = [str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ()]
+        weights = _weights(mesh, skel) or [0.0] * len(own)
+        for name, weight in zip(own, weights):
+            course = rows[:, names.index(name)] if name in names else np.array([weight])
+            if np.abs(course - weight).max() > SAME:
+                low, high = float(course.min()), float(course.max())
+                found.append(AnimatedShape(name, mesh.GetName(), weight, low, high))
+    return found
