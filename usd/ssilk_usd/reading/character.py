@@ -55,7 +55,8 @@ def read_character(
         root: SkelRoot or Skeleton, by path or name, if there are several.
         bodies: body meshes, by path or name; all if empty.
         garment: a garment mesh that is not marked as one, by path or name.
-        report: receives a warning about each body that does not use linear blend skinning.
+        report: receives a warning about each body that does not use linear blend skinning, or whose weights do not
+            sum to one.
 
     Raises:
         SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
@@ -112,6 +113,6 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
         mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
         return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
     mesh = read_mesh(prim, geom_to_core(prim, skel))
-    skin = read_skin(prim, skel.joints, order)
+    skin = read_skin(prim, skel.joints, order, report)
     assert skin is not None  # is_skinned
     return Body(mesh, skin)

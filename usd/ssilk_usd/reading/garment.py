@@ -7,6 +7,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
+from ssilk_core.events import Reporter, silent
 from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
@@ -35,7 +36,12 @@ from .surface import read_surface
 
 @needs_whole_files
 def read_garment(
-    source: StageLike, skeleton: Skeleton, *, garment: str | None = None, root: str | None = None
+    source: StageLike,
+    skeleton: Skeleton,
+    *,
+    garment: str | None = None,
+    root: str | None = None,
+    report: Reporter = silent,
 ) -> Garment:
     """Read a garment at rest, in the core's bind space [m], y up.
 
@@ -48,6 +54,7 @@ def read_garment(
         skeleton: skeleton of the character; weights are remapped to its joints by name.
         garment: the mesh, by path or name, if there are several.
         root: the character that the garment is fitted to, if the stage has several.
+        report: hears of weights that do not sum to one.
 
     Raises:
         SsilkError: there is no garment or several, or the data is malformed.
@@ -56,7 +63,7 @@ def read_garment(
     prim = find_garment(stage, garment)
     skel = fitted_skeleton(prim, root)
     mesh = read_mesh(prim, garment_to_core(prim, skel))
-    skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
+    skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
     if carried:
         assert skel is not None
@@ -117,7 +124,9 @@ def garment_to_core(prim: Usd.Prim, skel: SkelSource | None) -> Floats:
     return skel.bind_to_core @ skel.world_to_bind @ world_matrix(prim)
 
 
-def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
+def lbs_skin(
+    prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton, report: Reporter = silent
+) -> SkinWeights | None:
     """Return a garment's LBS weights over the character's joints, or None.
 
     Weights that were saved separately next to a proxy rig take precedence.
@@ -126,7 +135,7 @@ def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> Ski
         influences = read_influences(prim, joints, LBS_SKIN)
         assert influences is not None
         return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
-    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
+    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names, report)
 
 
 def _per_point(prim: Usd.Prim, name: str) -> Floats | None:

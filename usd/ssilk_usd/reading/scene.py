@@ -63,7 +63,7 @@ def read_scene(
         _announce_units(opened, report)
     skeleton = character.skeleton
     rig = read_proxy_rig(wardrobe, skeleton, **where, report=report)
-    return character, read_garment(wardrobe, skeleton, **where), rig
+    return character, read_garment(wardrobe, skeleton, **where, report=report), rig
 
 
 @needs_whole_files

@@ -12,6 +12,7 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
+from ..opening.times import change_times
 from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh
 from ..units import StageUnits
 
@@ -193,6 +194,6 @@ def _time_range(stage: Usd.Stage) -> tuple[float, float]:
     if stage.HasAuthoredTimeCodeRange():
         return stage.GetStartTimeCode(), stage.GetEndTimeCode()
     prims = Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
-    times = [attribute.GetTimeSamples() for prim in prims for attribute in prim.GetAuthoredAttributes()]
+    times = [change_times([attribute]) for prim in prims for attribute in prim.GetAuthoredAttributes()]
     spans = [(samples[0], samples[-1]) for samples in times if samples]
     return (min(low for low, _ in spans), max(high for _, high in spans)) if spans else (0.0, 0.0)

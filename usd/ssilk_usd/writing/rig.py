@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
@@ -20,6 +21,7 @@ from ..opening.stage import (
     PRIMS,
     apply,
     inherited,
+    location,
     open_stage,
     split_location,
     value,
@@ -30,6 +32,7 @@ from ..reading.mesh import is_garment
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
+from ..reading.surface import bound_material
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
@@ -119,10 +122,19 @@ def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Flo
         mesh = replace(mesh, points=mesh.points - moved)
     if reads_as(prim, mesh, surface):
         return
+    path = _free_path(skel, leaf(surface.path) if surface else f"{prim.GetName()}_without_physics")
     if surface is None:
-        shield_surface(prim, _free_path(skel, f"{prim.GetName()}_without_physics"))
+        shield_surface(prim, path)
     else:
-        write_surface(prim, _free_path(skel, leaf(surface.path)), surface)
+        write_surface(prim, path, surface)
+    bound = bound_material(prim)
+    if not (bound and bound.GetPath() == path):
+        fail(
+            location(prim),
+            "a physics material is bound above it, stronger than descendants or by a collection",
+            "beneath the SkelRoot the garment would lose its own",
+            "weaken that binding, or bind the garment's material in the same way",
+        )
 
 
 def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
