@@ -8,7 +8,7 @@ from itertools import count
 from typing import Literal
 
 from ..errors import fail
-from ..scene.assets import Body, Deformer, Scene, SkinWeights
+from ..scene.assets import Deformer, Scene, SkinWeights
 
 GLB = ".glb"  # suffix of a glTF binary, which is written and read without USD
 
@@ -88,8 +88,12 @@ def cap_influences(deformer: Deformer, target: Target) -> Deformer:
     if most is None:
         return deformer
     scene = deformer.scene
-    bodies = tuple(Body(body.mesh, _heaviest(body.skin, most)) for body in scene.character.bodies)
-    scene = replace(scene, character=replace(scene.character, bodies=bodies))
+    character = scene.character
+    bodies, stand_ins = (
+        tuple(replace(body, skin=_heaviest(body.skin, most)) for body in some)
+        for some in (character.bodies, character.stand_ins)
+    )
+    scene = replace(scene, character=replace(character, bodies=bodies, stand_ins=stand_ins))
     return replace(deformer, scene=scene, skin=_heaviest(deformer.skin, most))
 
 

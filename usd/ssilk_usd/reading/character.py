@@ -24,7 +24,7 @@ from ..opening.stage import (
     open_stage,
 )
 from .carried import carried_by
-from .mesh import is_drawn, is_garment, read_mesh
+from .mesh import is_drawn, is_garment, read_mesh, rendered
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin
 from .spaces import SkelSource
@@ -44,7 +44,8 @@ def read_character(
 ) -> Character:
     """Read a character; its bodies are all drawn meshes bound to its skeleton, except garments.
 
-    Meshes that a joint carries are bodies where they are named, or where none is bound.
+    Meshes that a joint carries are bodies where they are named, or where none is bound. Those of purpose "proxy"
+    stand in for bodies that are rendered, unless they are named.
 
     Points and bind transforms are in the core's bind space: UsdSkel's bind space (points after
     geomBindTransform) in metres, y up. It includes the uniform scale of the character's xforms but not their
@@ -64,10 +65,13 @@ def read_character(
     skel = find_skeleton(open_stage(source), root=root)
     skeleton = character_skeleton(skel)
     order = skeleton.joint_names
+    prims = _body_prims(skel, bodies, garment)
+    shown = prims if bodies else rendered(prims)
     return Character(
         location(skel.root),
         skeleton,
-        tuple(_read_body(prim, skel, order, report) for prim in _body_prims(skel, bodies, garment)),
+        tuple(_read_body(prim, skel, order, report) for prim in shown),
+        tuple(_read_body(prim, skel, order, report) for prim in prims if prim not in shown),
     )
 
 
@@ -108,11 +112,13 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
         report(
             Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
         )
+    purpose = str(UsdGeom.Imageable(prim).ComputePurpose())
     carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
     if carried:
         mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
-        return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
+        joint = order.index(skel.joints[carried.joint])
+        return Body(mesh, SkinWeights.rigid(mesh.path, joint, mesh.vertex_count), purpose)
     mesh = read_mesh(prim, geom_to_core(prim, skel))
     skin = read_skin(prim, skel.joints, order, report)
     assert skin is not None  # is_skinned
-    return Body(mesh, skin)
+    return Body(mesh, skin, purpose)

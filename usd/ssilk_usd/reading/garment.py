@@ -27,7 +27,7 @@ from ..opening.stage import (
 from ..units import StageUnits
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
-from .mesh import display_colour, is_drawn, is_garment, read_mesh
+from .mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
 from .skeleton import bound_skeleton, find_skeleton, skeletons
 from .skin import match_joints, read_influences, read_skin
 from .spaces import SkelSource
@@ -97,6 +97,7 @@ def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
                 "a garment has primvars:ssilk:class or ssilk:garment = true",
                 "name it with --garment",
             )
+        found = rendered(found)
     if len(found) != 1:
         fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
     return found[0]

@@ -26,6 +26,16 @@ def is_drawn(prim: Usd.Prim) -> bool:
     return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
 
 
+def is_stand_in(prim: Usd.Prim) -> bool:
+    """Return whether a prim is drawn in viewports alone, in place of what is rendered."""
+    return bool(UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.proxy)
+
+
+def rendered(prims: list[Usd.Prim]) -> list[Usd.Prim]:
+    """Return the prims that a render shows, or all where none of them is."""
+    return [prim for prim in prims if not is_stand_in(prim)] or prims
+
+
 def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
     """Return the mean of a mesh's displayColor, of linear light, each from 0 to 1; None without finite colours."""
     primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")

@@ -76,7 +76,8 @@ def write_shot(
             that do not spell the hierarchy, a file that cannot be written.
     """
     need_layer_suffix(path)
-    bodies = deformer.scene.character.bodies if include_body else ()
+    character = deformer.scene.character
+    bodies = (*character.bodies, *character.stand_ins) if include_body else ()
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)

@@ -79,7 +79,10 @@ def define_asset(
     bind_skin(garment, deformer.skin, skeleton)
     define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
-        bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
+        mesh = define_mesh(stage, path, body.mesh, units)
+        bind_skin(mesh, body.skin, skeleton)
+        if body.purpose != UsdGeom.Tokens.default_:
+            mesh.CreatePurposeAttr(body.purpose)
     if hidden_polygons is not None:
         hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
     return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes)
