@@ -87,6 +87,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         verify=not options.no_verify,
         tolerance=FitTolerance(options.tolerance / 1000, LARGEST * options.tolerance / 1000),
         device=options.device,
+        source=f"{split_location(options.cache)[0]}:{points.mesh}",
         report=report,
     )
     report(Result("skin", result.figures()))
