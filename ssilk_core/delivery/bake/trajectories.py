@@ -138,6 +138,8 @@ def skin_trajectories(
             verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
         else:
             report(Message("not verified, as asked", "warning"))
+    if summary.left_out:
+        report(Message(f"{path}: {summary.left_out}", "warning"))
     return BakeResult(
         path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
         proxies=summary.proxy_count, blendshapes=summary.shape_count, size_bytes=path.stat().st_size,

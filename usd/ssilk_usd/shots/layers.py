@@ -104,7 +104,9 @@ def write_asset(
     bodies = (*character.bodies, *character.stand_ins) if include_body else ()
     with replacing(layout.geometry, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
-        asset = define_asset(stage, deformer, bodies, units, name=layout.garment, record=record)
+        asset = define_asset(
+            stage, deformer, bodies, units, name=layout.garment, record=record, output=layout.geometry
+        )
         save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
         del stage

@@ -36,6 +36,7 @@ from ..reading.surface import bound_material
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
+from .look import copy_looks
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
 
@@ -61,7 +62,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved)
+    mesh, to_bind = _place_garment(stage, skel, source, scene.garment, moved, out)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
@@ -92,7 +93,12 @@ def _prim_path(where: str) -> str:
 
 
 def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, garment: Garment, moved: Floats | None
+    stage: Usd.Stage,
+    skel: SkelSource,
+    source: str | Path,
+    garment: Garment,
+    moved: Floats | None,
+    out: str | Path,
 ) -> tuple[UsdGeom.Mesh, Floats]:
     """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
 
@@ -103,7 +109,7 @@ def _place_garment(
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
     if not (same and old and old.IsA(UsdGeom.Mesh)):
-        return _copy_garment(stage, skel, garment), np.eye(4)
+        return _copy_garment(stage, skel, garment, out), np.eye(4)
     to_core = garment_to_core(old, skel)
     to_bind = np.linalg.inv(skel.bind_to_core) @ to_core
     if moved is not None:
@@ -153,14 +159,17 @@ def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
     return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
-def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
+def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path) -> UsdGeom.Mesh:
     """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
     name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
         stage.RemovePrim(older.GetPath())
     points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
-    return define_mesh(stage, _free_path(skel, name), replace(garment.mesh, points=points), StageUnits())
+    path, file = _free_path(skel, name), split_location(garment.mesh.path)[0]
+    mesh = define_mesh(stage, path, replace(garment.mesh, points=points), StageUnits())
+    copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
+    return mesh
 
 
 def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
