@@ -93,8 +93,6 @@ def define_asset(
     written = [scene.garment.mesh, *(body.mesh for body in bodies)]
     source = split_location(scene.character.path)[0]
     left = copy_looks(stage, root.GetPath(), source, list(zip(written, paths[2:])), output)
-    if not garment.GetDoubleSidedAttr().HasAuthoredValue():
-        garment.CreateDoubleSidedAttr(True)  # cloth is seen from both sides
     if hidden_polygons is not None:
         hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
     return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes, str(left))
@@ -193,12 +191,14 @@ def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
 
 
 def define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits) -> UsdGeom.Mesh:
-    """Define a polygon mesh at its bind pose, with its own polygons and texture coordinates."""
+    """Define a mesh at its bind pose, with its own polygons and texture coordinates.
+
+    Without normals, which would not turn with it, viewers shade it smoothly as a subdivision surface: USD's default.
+    """
     points = np.asarray(units.points_from_core(mesh.points), dtype=np.float32)
     prim = UsdGeom.Mesh.Define(stage, path)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     author_faces(prim, mesh)
-    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateExtentAttr(extent_array(points.min(axis=0), points.max(axis=0)))
     return prim
 
@@ -211,10 +211,12 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
 def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
     """Author a garment's vertex classes, what finds them, the joint paths of its proxies, each unless None.
 
-    Its colour is authored where the prim has none.
+    Its colour is authored where the prim has none, and that both sides are seen where it says nothing of that.
     """
     if garment.colour is not None and display_colour(prim) is None:
         UsdGeom.Gprim(prim).CreateDisplayColorAttr([Gf.Vec3f(*garment.colour)])
+    if not UsdGeom.Gprim(prim).GetDoubleSidedAttr().HasAuthoredValue():
+        UsdGeom.Gprim(prim).CreateDoubleSidedAttr(True)  # cloth is seen from both sides
     if garment.classes is not None:
         _author_rows(prim, CLASS, garment.classes[:, None].astype(np.int32))
     if garment.pins is not None:
