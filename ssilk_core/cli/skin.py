@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from ..delivery.targets import TARGETS
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result, Started
+from ..events import Message, Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.units import StageUnits
 
     from ..delivery.bake import cache_origin, motion_at, skin_trajectories
-    from ..delivery.targets import cap_influences
+    from ..delivery.targets import fit, joint_names
     from ..scene.decomposition import FitTolerance
 
     target, where = TARGETS[options.target], options.motion or split_location(options.cache)[0]
@@ -64,7 +64,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(options.output), f"the suffix is '{suffix}'", f"{options.target} takes {allowed}")
     inputs = (options.stage, options.model, split_location(options.cache)[0], split_location(where)[0])
     shared.check_output(options.output, *inputs)
-    deformer = cap_influences(_deformer(options, report), target)
+    deformer = _deformer(options, report)
+    if (names := joint_names(deformer.scene, target)).renamed:
+        report(Message(f"--target {options.target}: {names}", "warning"))
+    deformer = fit(deformer, target)
     mesh = deformer.scene.garment.mesh
     points = MeshTrajectories(options.cache, mesh.vertex_count, mesh.faces)
     skeleton = deformer.scene.character.skeleton
@@ -83,6 +86,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         verify=not options.no_verify,
         tolerance=FitTolerance(options.tolerance / 1000, LARGEST * options.tolerance / 1000),
         device=options.device,
+        source=f"{split_location(options.cache)[0]}:{points.mesh}",
         report=report,
     )
     report(Result("skin", result.figures()))

@@ -42,12 +42,15 @@ def in_order_of(trained: Skeleton, character: Character) -> Character:
     order = _places(character.skeleton, trained)
     _need_same_binds(character.skeleton, trained, order)
     joints = np.argsort(order)  # of the model, for each joint of the character
-    bodies = (
-        replace(body, skin=SkinWeights(body.skin.path, joints[body.skin.indices], body.skin.weights))
-        for body in character.bodies
+    bodies, stand_ins = (
+        tuple(
+            replace(body, skin=SkinWeights(body.skin.path, joints[body.skin.indices], body.skin.weights))
+            for body in some
+        )
+        for some in (character.bodies, character.stand_ins)
     )
     skeleton = replace(trained, placement=character.skeleton.placement)
-    return replace(character, skeleton=skeleton, bodies=tuple(bodies))
+    return replace(character, skeleton=skeleton, bodies=bodies, stand_ins=stand_ins)
 
 
 def _places(found: Skeleton, trained: Skeleton) -> Ints:

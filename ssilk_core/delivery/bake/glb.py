@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,7 +64,9 @@ def write_glb_shot(
         hidden_polygons=None if hidden_polygons is None else hidden_polygons.masks,
         provenance=provenance,
     )
-    return summary(path, deformer, motion, TimeSpan.of(motion, start, samples_per_frame), shapes)
+    left = "a glb keeps the mean colour and one UV set of each mesh; other sets, materials and subsets are left out"
+    told = summary(path, deformer, motion, TimeSpan.of(motion, start, samples_per_frame), shapes)
+    return replace(told, left_out=left)
 
 
 def warn_of_sets(deformer: Deformer, output: Path, report: Reporter) -> None:

@@ -255,6 +255,8 @@ def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report:
     )
     for change in written.changes:
         report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))
+    if written.asset.left_out:
+        report(Message(f"{layout.asset}: {written.asset.left_out}", "warning"))
     return written
 
 

@@ -16,7 +16,7 @@ from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
 from ...scene.assets import Deformer, Floats, Motion, Scene
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
-from ..targets import Target, cap_influences
+from ..targets import JointNames, Target, fit, joint_names
 from .character import on_character
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
@@ -53,6 +53,7 @@ class LoadedGarment:
     Attributes:
         model: the network; None under linear blend skinning.
         deformer: the garment as its target takes it.
+        names: its joints as its target finds them.
         units: units and up axis of what is written.
         model_held, stage_held: what model and stage held while they were read.
         provenance: where the model comes from, as a shot stores it.
@@ -63,6 +64,7 @@ class LoadedGarment:
     file: ModelFile
     model: GarmentModel | None
     deformer: Deformer
+    names: JointNames
     units: StageUnits
     model_held: InputContents
     stage_held: InputContents
@@ -99,6 +101,7 @@ class LoadedGarment:
             inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
             record=self.record,
+            names=self.names,
             fabric=self.file.fabric,
             reduction=reduction,
         )
@@ -159,7 +162,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         request=request,
         file=file,
         model=model,
-        deformer=cap_influences(deformer, request.receiver),
+        deformer=fit(deformer, request.receiver),
+        names=joint_names(scene, request.receiver),
         units=units,
         model_held=model_held,
         stage_held=stage_held,
@@ -198,7 +202,7 @@ def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> 
 
     model = network(file, replace(file.scene, character=like.scene.character))
     model.to(select_device(request.device))
-    return model, cap_influences(model.deformer(), request.receiver)
+    return model, fit(model.deformer(), request.receiver)
 
 
 def _sampled(motion: Motion, fps: float, position: Floats) -> Motion:

@@ -14,6 +14,7 @@ from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import deform, lbs_poses, slerp, split_at_cuts
+from ..targets import JointNames
 from .inputs import InputHashes
 from .request import BakeRequest
 from .result import FrameSpan, LatentSummary, RefinementSummary
@@ -68,6 +69,7 @@ class BakeRollout:
         inputs: what the request's inputs held while they were read.
         provenance: where all of this comes from, as a shot stores it.
         record: how the garment's model was made.
+        names: the joints as the shot's target finds them.
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
@@ -86,6 +88,7 @@ class BakeRollout:
     inputs: InputHashes
     provenance: dict[str, object]
     record: GarmentRecord
+    names: JointNames
     fabric: Fabric
     lead: int = 0
     frames: FrameRange | None = None
@@ -205,7 +208,9 @@ class BakeRollout:
         return decode(self.model, self.motion, pose)
 
     def tell(self, report: Reporter) -> None:
-        """Report which frames of the motion are played, unless it is all of them."""
+        """Report joints that are renamed, and which frames of the motion are played, unless it is all of them."""
+        if self.names.renamed:
+            report(Message(f"--target {self.request.target}: {self.names}", "warning"))
         if self.frames is None:
             return
         name = self.request.motion

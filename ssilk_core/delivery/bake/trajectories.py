@@ -19,6 +19,7 @@ from ...scene.kinematics import held_at_cuts, sample_motion
 from ..targets import GLB
 from .character import on_character
 from .glb import warn_of_sets, write_glb_shot
+from .nearness import need_near
 from .opened import open_shot
 from .result import SKINNED, BakeResult, ShotShapes, Verification
 from .verification import compare_trajectories, need_valid
@@ -88,6 +89,7 @@ def skin_trajectories(
     verify: bool = True,
     tolerance: FitTolerance | None = None,
     device: str = "cpu",
+    source: str = "the garment's points",
     report: Reporter = silent,
 ) -> BakeResult:
     """Write vertex trajectories as joints and blendshapes into one file, which appears once it is verified.
@@ -101,10 +103,11 @@ def skin_trajectories(
         about: what else the file says of itself.
         hidden: from which frames on the garment is hidden (True) or seen (False).
         tolerance: how near joints and blendshapes come to the points; `FitTolerance()` by default.
+        source: what the points come from, for messages.
 
     Raises:
-        SsilkError: points of another garment or motion, points that skinning cannot reach, or an output that cannot
-            be written.
+        SsilkError: points of another garment or motion, points far from the skinned garment in every frame or that
+            skinning cannot reach, or an output that cannot be written.
         VerificationError: the file is not what was computed; it is not kept.
     """
     from ssilk_usd.shots.shot import write_shot
@@ -114,6 +117,7 @@ def skin_trajectories(
     from ...scene.decomposition import FitTolerance, decompose
 
     path, tolerance = Path(output), tolerance or FitTolerance()
+    need_near(deformer, motion, points, source, report)
     found = decompose(deformer, motion, points, tolerance=tolerance, device=select_device(device))
     shapes = ShotShapes.of(found)
     if path.suffix == GLB:
@@ -134,6 +138,8 @@ def skin_trajectories(
             verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
         else:
             report(Message("not verified, as asked", "warning"))
+    if summary.left_out:
+        report(Message(f"{path}: {summary.left_out}", "warning"))
     return BakeResult(
         path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
         proxies=summary.proxy_count, blendshapes=summary.shape_count, size_bytes=path.stat().st_size,

@@ -65,6 +65,8 @@ def bake(
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
     meter = ShownSkinMeter(rollout)
     summary, verification = _write_verified(meter, path, include_body, hidden, verify, report)
+    if summary.left_out:
+        report(Message(f"{path}: {summary.left_out}", "warning"))
     result = result_of(meter, path, summary, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))

@@ -181,9 +181,7 @@ class LatentSolver:
         """Return the quadratic model of the energy about latents (N, m)."""
         return self._model(self._state(z, character, inputs), character, inputs)[1]
 
-    def _model(
-        self, state: _State, character: Tensor, inputs: StepInputs
-    ) -> tuple[DecodedPoints, NormalEquations]:
+    def _model(self, state: _State, character: Tensor, inputs: StepInputs) -> tuple[DecodedPoints, NormalEquations]:
         potential = self.potential
         decoded = self.decoder.linearise(state.z, character)
         gradient = potential.gradient(state.x, inputs, state.distance)[potential.free]

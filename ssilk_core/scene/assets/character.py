@@ -17,10 +17,14 @@ from .skin import SkinWeights
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A mesh that a skeleton deforms and garments collide with."""
+    """A mesh that a skeleton deforms and garments collide with.
+
+    `purpose` says who draws it, as UsdGeom has it: "default", "render" or "proxy".
+    """
 
     mesh: Mesh
     skin: SkinWeights
+    purpose: str = "default"
 
     def __post_init__(self) -> None:
         if self.skin.vertex_count != self.mesh.vertex_count:
@@ -34,15 +38,23 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A skeleton and the body meshes it deforms."""
+    """A skeleton and the body meshes it deforms.
+
+    Attributes:
+        path: source of the character, for messages.
+        skeleton: its joints.
+        bodies: what garments collide with.
+        stand_ins: meshes that viewports draw in place of the bodies; nothing collides with them.
+    """
 
     path: str
     skeleton: Skeleton
     bodies: tuple[Body, ...]
+    stand_ins: tuple[Body, ...] = ()
 
     def __post_init__(self) -> None:
-        assign(self, bodies=tuple(self.bodies))
-        for body in self.bodies:
+        assign(self, bodies=tuple(self.bodies), stand_ins=tuple(self.stand_ins))
+        for body in (*self.bodies, *self.stand_ins):
             body.skin.check_joints(self.skeleton.joint_count)
 
     def merged_body(self) -> Body:

@@ -102,9 +102,7 @@ def test_a_held_pose_stays_at_its_quasi_static_state_for_ten_seconds(scene, toy_
     """Also where states lie beyond half of their bound, which is smooth for P alone."""
     model, held = toy_model(scene, latent_bound=1.0, translations=translations), toy_motion(scene, 1)
     count = 300
-    rest = model.initial(
-        torch.randn(1, model.initialiser[0].in_features, generator=torch.Generator().manual_seed(0))
-    )
+    rest = model.initial(torch.randn(1, model.initialiser[0].in_features, generator=torch.Generator().manual_seed(0)))
     assert 0.5 < rest.abs().max() <= 1
     pose = torch.zeros(count, 1, model.stepper[0].in_features - 24 - 3 * model.feedback.count)
     still = Motion(

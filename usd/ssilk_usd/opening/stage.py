@@ -20,12 +20,12 @@ from . import memory, trial
 from .garment_api import register_schema
 from .memory import allowed_gib, bounded_memory
 from .specs import free_when_closed
+from .times import EARLIEST, earliest
 from .trial import allowed_seconds, tried
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
-EARLIEST = Usd.TimeCode.EarliestTime()
 # Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
 register_schema()  # before the first stage is opened, because USD reads its schema list only once
@@ -212,9 +212,9 @@ def column_matrix(matrix: object) -> Floats:
     return np.swapaxes(np.array(matrix, dtype=np.float64), -1, -2)
 
 
-def world_matrix(prim: Usd.Prim, time: Usd.TimeCode = EARLIEST) -> Floats:
-    """Return a prim's local-to-world matrix in stage units, column vectors, shape (4, 4)."""
-    return column_matrix(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim))
+def world_matrix(prim: Usd.Prim, time: Usd.TimeCode | None = None) -> Floats:
+    """Return a prim's local-to-world matrix in stage units at a time, else the earliest, column vectors, (4, 4)."""
+    return column_matrix(UsdGeom.XformCache(earliest(prim) if time is None else time).GetLocalToWorldTransform(prim))
 
 
 def apply(matrix: Floats, points: Floats) -> Floats:

@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdSkel
 
 from ssilk_core.scene.assets import Floats
 
 from ..opening.stage import PRIMS, apply, column_matrix, value, world_matrix
+from ..opening.times import change_times, xform_attributes
 from .spaces import SkelSource
 
 MOST_SAMPLES = 32  # of a motion that are looked at
@@ -56,12 +57,8 @@ def carried_by(prim: Usd.Prim, skel: SkelSource) -> CarriedMesh | None:
 
 
 def _sampled_codes(prim: Usd.Prim) -> list[float]:
-    """Return time codes at which the xforms of a prim and those above it have samples, some of them if many."""
-    codes: set[float] = set()
-    while prim and not prim.IsPseudoRoot():
-        codes.update(UsdGeom.Xformable(prim).GetTimeSamples() if prim.IsA(UsdGeom.Xformable) else ())
-        prim = prim.GetParent()
-    every = sorted(codes)
+    """Return time codes at which the xforms of a prim and those above it change, some of them if many."""
+    every = change_times(xform_attributes(prim))
     chosen = np.unique(np.linspace(0, len(every) - 1, min(len(every), MOST_SAMPLES)).round().astype(int))
     return [every[index] for index in chosen]
 

@@ -24,7 +24,7 @@ from ..opening.stage import (
     open_stage,
 )
 from .carried import carried_by
-from .mesh import is_drawn, is_garment, read_mesh
+from .mesh import is_drawn, is_garment, read_mesh, rendered
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin
@@ -45,7 +45,8 @@ def read_character(
 ) -> Character:
     """Read a character; its bodies are all drawn meshes bound to its skeleton, except garments.
 
-    Meshes that a joint carries are bodies where they are named, or where none is bound.
+    Meshes that a joint carries are bodies where they are named, or where none is bound. Those of purpose "proxy"
+    stand in for bodies that are rendered, unless they are named.
 
     Blendshapes that are on at the earliest time are part of a body's shape. Points and bind transforms are in the
     core's bind space: UsdSkel's bind space (points after geomBindTransform) in metres, y up. It includes the uniform
@@ -57,7 +58,8 @@ def read_character(
         root: SkelRoot or Skeleton, by path or name, if there are several.
         bodies: body meshes, by path or name; all if empty.
         garment: a garment mesh that is not marked as one, by path or name.
-        report: receives a warning about each body that does not use linear blend skinning.
+        report: receives a warning about each body that does not use linear blend skinning, or whose weights do not
+            sum to one.
 
     Raises:
         SsilkError: there is no character or several, a mesh is unknown, or the data is malformed.
@@ -65,10 +67,13 @@ def read_character(
     skel = find_skeleton(open_stage(source), root=root, garment=garment)
     skeleton = character_skeleton(skel)
     order = skeleton.joint_names
+    prims = _body_prims(skel, bodies, garment)
+    shown = prims if bodies else rendered(prims)
     return Character(
         location(skel.root),
         skeleton,
-        tuple(_read_body(prim, skel, order, report) for prim in _body_prims(skel, bodies, garment)),
+        tuple(_read_body(prim, skel, order, report) for prim in shown),
+        tuple(_read_body(prim, skel, order, report) for prim in prims if prim not in shown),
     )
 
 
@@ -109,11 +114,13 @@ def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report:
         report(
             Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
         )
+    purpose = str(UsdGeom.Imageable(prim).ComputePurpose())
     carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
     if carried:
         mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
-        return Body(mesh, SkinWeights.rigid(mesh.path, order.index(skel.joints[carried.joint]), mesh.vertex_count))
+        joint = order.index(skel.joints[carried.joint])
+        return Body(mesh, SkinWeights.rigid(mesh.path, joint, mesh.vertex_count), purpose)
     mesh = read_mesh(prim, geom_to_core(prim, skel), shape_offsets(prim, skel))
-    skin = read_skin(prim, skel.joints, order)
+    skin = read_skin(prim, skel.joints, order, report)
     assert skin is not None  # is_skinned
-    return Body(mesh, skin)
+    return Body(mesh, skin, purpose)

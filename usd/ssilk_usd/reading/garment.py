@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
+from ssilk_core.events import Reporter, silent
 from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
@@ -28,7 +29,7 @@ from ..opening.stage import (
 from ..units import StageUnits
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
-from .mesh import display_colour, is_drawn, is_garment, read_mesh
+from .mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
 from .rebinding import blended_moves, character_source, common_move, joint_moves, used_moves
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton, skeletons
@@ -45,6 +46,7 @@ def read_garment(
     garment: str | None = None,
     root: str | None = None,
     shaped: bool = True,
+    report: Reporter = silent,
 ) -> Garment:
     """Read a garment at rest, in the core's bind space [m], y up.
 
@@ -59,6 +61,7 @@ def read_garment(
         garment: the mesh, by path or name, if there are several.
         root: the character that the garment is fitted to, if the stage has several.
         shaped: with the blendshapes that are on at the earliest time; those of a baked garment move it in its shot.
+        report: hears of weights that do not sum to one.
 
     Raises:
         SsilkError: there is no garment or several, or the data is malformed.
@@ -69,7 +72,7 @@ def read_garment(
     place = garment_place(prim, skel, skeleton)
     mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
     mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
-    skin = lbs_skin(prim, skel.joints if skel else (), skeleton)
+    skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
     if carried:
         assert skel is not None
@@ -103,6 +106,7 @@ def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
                 "a garment has primvars:ssilk:class or ssilk:garment = true",
                 "name it with --garment",
             )
+        found = rendered(found)
     if len(found) != 1:
         fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
     return found[0]
@@ -176,7 +180,9 @@ def _rebound(prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton) -> GarmentPla
     return GarmentPlace(to_core, blended_moves(ordered, influences))
 
 
-def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> SkinWeights | None:
+def lbs_skin(
+    prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton, report: Reporter = silent
+) -> SkinWeights | None:
     """Return a garment's LBS weights over the character's joints, or None.
 
     Weights that were saved separately next to a proxy rig take precedence.
@@ -185,7 +191,7 @@ def lbs_skin(prim: Usd.Prim, joints: tuple[str, ...], skeleton: Skeleton) -> Ski
         influences = read_influences(prim, joints, LBS_SKIN)
         assert influences is not None
         return SkinWeights(influences.path, *influences.onto(skeleton.joint_names))
-    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names)
+    return None if has_value(prim, PROXIES) else read_skin(prim, joints, skeleton.joint_names, report)
 
 
 def _per_point(prim: Usd.Prim, name: str) -> Floats | None:

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Mesh
 
 from ..names import CLASS, GARMENT, PROXIES
-from ..opening.stage import EARLIEST, apply, has_value, location, value, world_matrix
+from ..opening.stage import EARLIEST, PRIMS, apply, has_value, location, value, world_matrix
 from .polygons import triangulate
 
 
@@ -24,6 +24,16 @@ def is_drawn(prim: Usd.Prim) -> bool:
     imageable = UsdGeom.Imageable(prim)
     invisible = imageable.ComputeVisibility(EARLIEST) == UsdGeom.Tokens.invisible
     return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
+
+
+def is_stand_in(prim: Usd.Prim) -> bool:
+    """Return whether a prim is drawn in viewports alone, in place of what is rendered."""
+    return bool(UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.proxy)
+
+
+def rendered(prims: list[Usd.Prim]) -> list[Usd.Prim]:
+    """Return the prims that a render shows, or all where none of them is."""
+    return [prim for prim in prims if not is_stand_in(prim)] or prims
 
 
 def display_colour(prim: Usd.Prim) -> tuple[float, float, float] | None:
@@ -53,8 +63,8 @@ def read_mesh(prim: Usd.Prim, to_core: Floats, offsets: Floats | None = None) ->
     where = location(prim)
     points = np.array(value(prim, "points") or [], dtype=np.float64).reshape(-1, 3)
     points = points if offsets is None else points + offsets
-    counts, indices = _polygons(prim, len(points), where)
-    corners, counts = _kept_corners(prim, counts)
+    counts, indices = polygons(prim, len(points), where)
+    corners, counts, _ = kept_faces(prim, counts)
     uvs = _texture_coordinates(prim, indices)
     return Mesh(
         where,
@@ -66,7 +76,7 @@ def read_mesh(prim: Usd.Prim, to_core: Floats, offsets: Floats | None = None) ->
     )
 
 
-def _polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]:
+def polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]:
     """Return checked face vertex counts and indices."""
     counts = np.array(value(prim, "faceVertexCounts") or [], dtype=np.int64)
     indices = np.array(value(prim, "faceVertexIndices") or [], dtype=np.int64)
@@ -91,15 +101,15 @@ def _polygons(prim: Usd.Prim, point_count: int, where: str) -> tuple[Ints, Ints]
     return counts, indices
 
 
-def _kept_corners(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints]:
-    """Return the face corners to keep, counter-clockwise from outside, and the vertex counts of their faces."""
+def kept_faces(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints, Ints]:
+    """Return face corners to keep, counter-clockwise from outside, the vertex counts of their faces, and these."""
     keep = np.ones(len(counts), dtype=bool)
     holes = np.array(value(prim, "holeIndices") or [], dtype=np.int64)
     keep[holes[(holes >= 0) & (holes < len(counts))]] = False
     starts = np.cumsum(counts) - counts
     step = -1 if winds_backwards(prim) else 1
     corners = [np.arange(start, start + count)[::step] for start, count in zip(starts[keep], counts[keep])]
-    return np.concatenate(corners) if corners else np.zeros(0, dtype=np.int64), counts[keep]
+    return np.concatenate(corners) if corners else np.zeros(0, dtype=np.int64), counts[keep], np.flatnonzero(keep)
 
 
 def winds_backwards(prim: Usd.Prim) -> bool:
@@ -112,11 +122,8 @@ def winds_backwards(prim: Usd.Prim) -> bool:
 
 
 def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
-    """Return (u, v) for each face corner from `primvars:st`, else the first primvar of that type, or None."""
-    primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
-    by_name = [primvar for primvar in primvars if primvar.GetPrimvarName() == "st"]
-    by_type = [primvar for primvar in primvars if primvar.GetTypeName() in _TEXTURE_TYPES]
-    chosen = next(iter(by_name + by_type), None)
+    """Return (u, v) for each face corner from the UV set of the mesh, or None."""
+    chosen = _uv_set(prim)
     if chosen is None:
         return None
     uvs = np.array(chosen.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1, 2)
@@ -137,6 +144,30 @@ def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
     return uvs[corners]
 
 
+def _uv_set(prim: Usd.Prim) -> UsdGeom.Primvar | None:
+    """Return the UV set that the mesh's material reads, else `primvars:st`, else one of a usual name, else any."""
+    primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
+    sets = {str(each.GetPrimvarName()): each for each in primvars if each.GetTypeName() in _TEXTURE_TYPES}
+    st = [each for each in primvars if each.GetPrimvarName() == "st"]
+    read = [sets[name] for name in _names_read(prim) if name in sets]
+    usual = [sets[name] for name in _USUAL_UV_SETS if name in sets]
+    return next(iter([*read, *st, *usual, *sets.values()]), None)
+
+
+def _names_read(prim: Usd.Prim) -> list[str]:
+    """Return the primvars that the material of a mesh, or those of its subsets, look up for textures."""
+    names = []
+    for holder in (prim, *(subset.GetPrim() for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)))):
+        material, _ = UsdShade.MaterialBindingAPI(holder).ComputeBoundMaterial()
+        for each in Usd.PrimRange(material.GetPrim(), PRIMS) if material else ():
+            shader = UsdShade.Shader(each)
+            if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
+                found = UsdShade.Utils.GetValueProducingAttributes(shader.GetInput("varname"))
+                names += [str(attribute.Get()) for attribute in found]
+    return names
+
+
+_USUAL_UV_SETS = ("UVMap", "map1", "uv", "uv0", "UV0", "Texture_uv")
 _TEXTURE_TYPES = (
     Sdf.ValueTypeNames.TexCoord2fArray,
     Sdf.ValueTypeNames.TexCoord2dArray,

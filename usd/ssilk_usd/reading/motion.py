@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
@@ -17,7 +17,6 @@ from ..opening.stage import (
     PRIMS,
     USD_SUFFIXES,
     StageLike,
-    inherited_target,
     listed,
     location,
     named,
@@ -26,7 +25,9 @@ from ..opening.stage import (
     split_location,
     world_matrix,
 )
+from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
+from .animation import PosedJoints, animation_source, posed_joints
 from .clips import LOOKED_AT, clip_placement, spread
 from .skeleton import of_bodies, skeletons
 from .skin import match_joints, need_unique
@@ -82,9 +83,10 @@ def read_motion(
     """Read a motion at its own rate: framesPerSecond if authored, else timeCodesPerSecond.
 
     Frames run from the first to the last authored sample, whatever range the stage says; USD interpolates between
-    samples. On a character, the root joints include the xforms above the skeleton, animated or not; one that stands
-    alone may be in the space of the character's skeleton (`clips`). Joints are matched by path, then by unique leaf
-    name. Joints that the animation lacks stay in the rest pose.
+    samples. On a character, the root joints include the xforms above the skeleton, animated or not, and the animation
+    poses the joints that UsdSkel poses; one that stands alone may be in the space of the character's skeleton
+    (`clips`). Joints are matched by path, then by unique leaf name. Joints that the animation lacks stay in the rest
+    pose.
 
     Args:
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
@@ -105,7 +107,8 @@ def read_motion(
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     need_unique(joints, where)
-    match = _matched(joints, skeleton, where)
+    posed = posed_joints(joints, placed) if placed else None
+    match = _matched(joints, posed, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed, within)
     placements = np.stack([world_matrix(placed, code) for code in codes]) if placed else np.eye(4)[None]
     if placed:
@@ -120,7 +123,11 @@ def read_motion(
     for first in range(0, len(codes), _FRAMES_AT_ONCE):
         part = slice(first, first + _FRAMES_AT_ONCE)
         turned, moved = read_samples(animation, codes[part], len(joints), where)
-        authored = rigid(matrix_from_quaternion(turned), moved)[:, match]
+        authored = rigid(matrix_from_quaternion(turned), moved)
+        if posed:
+            at_rest = np.broadcast_to(posed.rest, (len(authored), *posed.rest.shape))
+            authored = np.where((posed.source < 0)[:, None, None], at_rest, authored[:, posed.source])
+        authored = authored[:, match]
         placement = placements[part] if placed else placements
         local = joints_to_core(authored, skeleton.parents, placement, units, scale)
         local[:, match < 0] = skeleton.rest_transforms[match < 0]
@@ -138,17 +145,28 @@ def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tupl
     where = stage.GetRootLayer().identifier
     bound: dict[Usd.Prim, Usd.Prim] = {}
     own: dict[Usd.Prim, Usd.Prim] = {}
+    off: dict[Usd.Prim, str] = {}
     pairs = skeletons(stage)
     bodies = of_bodies(stage, pairs)
     # Garments may have skeletons of their own, which share the character's animation, or have copies of it.
     for top, skeleton in (*bodies, *(pair for pair in pairs if pair not in bodies)):
-        animation = inherited_target(skeleton, "skel:animationSource")
-        if animation:
-            bound.setdefault(animation, skeleton)
-        if animation and root and named([top, skeleton], root):
-            own[animation] = skeleton
+        source, is_own = animation_source(skeleton), bool(root and named([top, skeleton], root))
+        if source.prim:
+            bound.setdefault(source.prim, skeleton)
+        if source.prim and is_own:
+            own[source.prim] = skeleton
+        if source.off and (is_own or not root):
+            off[skeleton] = source.off
     moved = {skeleton for _, skeleton in bodies}
     bound = own or {animation: skeleton for animation, skeleton in bound.items() if skeleton in moved} or bound
+    if off and not prim and (not bound or (root and not own)):
+        skeleton, why = next(iter(off.items()))
+        fail(
+            location(skeleton),
+            f"USD plays no animation on it: {why}",
+            "a motion is a SkelAnimation that plays",
+            f"activate or bind one, or name one: {where}:/PRIM",
+        )
     every = [other for other in Usd.PrimRange.Stage(stage, PRIMS) if other.IsA(UsdSkel.Animation)]
     found = named(every, prim) if prim else list(bound) or every
     if not found:
@@ -168,11 +186,12 @@ def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tupl
     return found[0], bound.get(found[0])
 
 
-def _matched(joints: tuple[str, ...], skeleton: Skeleton, where: str) -> Ints:
-    """Return the index of each joint of the skeleton in the animation, or -1."""
-    match = np.array(match_joints(skeleton.joint_names, joints))
-    found, smaller = int(np.count_nonzero(match >= 0)), min(len(joints), skeleton.joint_count)
-    missing = [name for name, index in zip(skeleton.joint_names, match) if index < 0]
+def _matched(joints: tuple[str, ...], posed: PosedJoints | None, skeleton: Skeleton, where: str) -> Ints:
+    """Return the index of each joint of the skeleton among those posed, else in the animation, or -1."""
+    match = np.array(match_joints(skeleton.joint_names, posed.names if posed else joints))
+    moved = (match >= 0) & (posed.source[match] >= 0) if posed else match >= 0
+    found, smaller = int(np.count_nonzero(moved)), min(len(joints), skeleton.joint_count)
+    missing = [name for name, each in zip(skeleton.joint_names, moved) if not each]
     if not found or 2 * found < smaller:
         fail(
             where,
@@ -217,14 +236,9 @@ def frame_rate(stage: Usd.Stage) -> tuple[float, float]:
 
 def sampled_span(animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[float, float] | None:
     """Return the time codes of the first and last sample of a motion and its placement; None where there is none."""
-    samples = [
-        time for name in ("rotations", "translations") for time in animation.GetAttribute(name).GetTimeSamples()
-    ]
-    above = placed
-    while above and not above.IsPseudoRoot():
-        samples += UsdGeom.Xformable(above).GetTimeSamples() if above.IsA(UsdGeom.Xformable) else []
-        above = above.GetParent()
-    return (min(samples), max(samples)) if samples else None
+    attributes = [animation.GetAttribute(name) for name in ("rotations", "translations")]
+    times = change_times([*attributes, *(xform_attributes(placed) if placed else ())])
+    return (times[0], times[-1]) if times else None
 
 
 def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:

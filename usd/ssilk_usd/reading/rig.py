@@ -98,6 +98,7 @@ def _rig_skin(
         fail(
             location(prim), "the garment has proxies but no weights", "weights are needed", "bind it, or rig it again"
         )
+    influences.tell_sums(report)
     indices, weights = influences.onto((*skeleton.joint_names, *names))
     lost = (weights.sum(axis=1) <= 0) & (influences.weights.sum(axis=1) > 0)
     if not lost.any():

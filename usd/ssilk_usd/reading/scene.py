@@ -64,7 +64,7 @@ def read_scene(
         _announce_units(opened, report)
     skeleton = character.skeleton
     rig = read_proxy_rig(wardrobe, skeleton, garment=names[0], root=names[1], report=report)
-    return character, read_garment(wardrobe, skeleton, garment=names[0], root=names[1]), rig
+    return character, read_garment(wardrobe, skeleton, garment=names[0], root=names[1], report=report), rig
 
 
 @needs_whole_files

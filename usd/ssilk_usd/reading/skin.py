@@ -10,10 +10,13 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
+from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.scene.assets import Floats, Ints, SkinWeights
 
 from ..names import JOINTS, SKEL
 from ..opening.stage import EARLIEST, inherited, location
+
+WHOLE = 0.01  # how far weights of a vertex may sum from one: half floats and rounding tools stay within
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +36,17 @@ class AuthoredInfluences:
     def used_joints(self) -> list[str]:
         """Return the names of all joints with any weight, in joint order."""
         return [self.joints[index] for index in np.unique(self.indices[self.weights != 0])]
+
+    def tell_sums(self, report: Reporter) -> None:
+        """Report vertices whose weights do not sum to one: UsdSkel plays them so, here they are made whole."""
+        sums = self.weights.sum(axis=1)
+        off = np.abs(sums - 1) > WHOLE
+        if off.any():
+            low, high = sums[off].min(), sums[off].max()
+            said = f"to {low:.3g}" if high - low < WHOLE else f"from {low:.3g} to {high:.3g}"
+            text = f"{self.path}: the weights of {np.count_nonzero(off)} of {len(off)} vertices sum {said}"
+            text += ", and are made to sum to one; until they are normalised, USD shows these vertices elsewhere"
+            report(Message(text, "warning"))
 
 
 def match_joints(names: tuple[str, ...], among: tuple[str, ...]) -> list[int]:
@@ -63,13 +77,16 @@ def leaf(joint: str) -> str:
     return joint.rpartition("/")[2]
 
 
-def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -> SkinWeights | None:
+def read_skin(
+    prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...], report: Reporter = silent
+) -> SkinWeights | None:
     """Read a mesh's weights over the joints `names`; return None if it has none.
 
     Args:
         prim: a mesh with its own or inherited influences, of any element size, per vertex or constant.
         joints: joint order of its skeleton; the mesh's own `skel:joints` takes precedence.
         names: joint order of the result.
+        report: hears of weights that do not sum to one.
 
     Raises:
         SsilkError: counts do not match, an index has no joint, or a joint in use is not in `names`.
@@ -86,6 +103,7 @@ def read_skin(prim: Usd.Prim, joints: tuple[str, ...], names: tuple[str, ...]) -
             "weights belong to the character's joints",
             "bind the mesh to this skeleton again",
         )
+    influences.tell_sums(report)
     return SkinWeights(influences.path, *influences.onto(names))
 
 

@@ -13,14 +13,15 @@ from collections.abc import Sequence
 from math import inf, nan
 
 import numpy as np
-from pxr import Usd, UsdPhysics
+from pxr import Usd, UsdPhysics, UsdShade
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import PLATE_THICKNESS, Floats, Mesh, SurfaceMaterial
 
-from ..opening.stage import has_value, inherited_target, location, value
+from ..opening.stage import has_value, location, value
 from ..units import StageUnits
 
+PHYSICS = "physics"  # a purpose of bindings
 PROPOSAL, OMNI = "physics:", "omniphysics:"
 _STIFFNESSES = {  # name, that of older revisions, and the power of the thickness that makes a modulus a stiffness
     "stretch": ("surfaceStretchStiffness", "stretchStiffness", 1),
@@ -45,9 +46,9 @@ _CORRECT = "correct it, or remove the attribute"
 def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
     """Read the physics material of a garment's mesh; None where nothing says what a surface is made of.
 
-    The material that is bound for the purpose "physics", else for all, goes before the mesh. As in the proposal, the
-    mass of the mesh and of its deformable body go before densities, and the body's density before the material's.
-    Moduli and density of a material of volumes are none of a surface, unless it is a material of surfaces as well.
+    The material that UsdShade finds bound for the purpose "physics", else for all, goes before the mesh. As in the
+    proposal, the mass of the mesh and of its deformable body go before densities, and the body's density before the
+    material's. Moduli and density of a material of volumes are none of a surface, unless it is of surfaces as well.
 
     Args:
         prim: the mesh.
@@ -56,7 +57,7 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
     Raises:
         SsilkError: a value is not what its attribute allows.
     """
-    bound = inherited_target(prim, "material:binding:physics") or inherited_target(prim, "material:binding")
+    bound = bound_material(prim)
     said = [source for source in (bound, prim) if source]
     if not any(_is_of_surfaces(source) for source in said):
         return None
@@ -86,6 +87,12 @@ def read_surface(prim: Usd.Prim, mesh: Mesh) -> SurfaceMaterial | None:
         bend=stiffnesses[2],
         others=(*_others(bound, prim), *(["thickness that varies"] if len(set(thicknesses)) > 1 else [])),
     )
+
+
+def bound_material(prim: Usd.Prim) -> Usd.Prim | None:
+    """Return the material that is bound to a mesh for physics, else for all: by itself, above, or by collection."""
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(PHYSICS)
+    return material.GetPrim() if material else None
 
 
 def deformable_body(prim: Usd.Prim) -> Usd.Prim | None:

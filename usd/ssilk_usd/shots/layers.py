@@ -100,10 +100,13 @@ def write_asset(
         SsilkError: as `author.define_asset` does, or a file cannot be written.
     """
     before, unknown = _facts_before(layout)
-    bodies = deformer.scene.character.bodies if include_body else ()
+    character = deformer.scene.character
+    bodies = (*character.bodies, *character.stand_ins) if include_body else ()
     with replacing(layout.geometry, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
-        asset = define_asset(stage, deformer, bodies, units, name=layout.garment, record=record)
+        asset = define_asset(
+            stage, deformer, bodies, units, name=layout.garment, record=record, output=layout.geometry
+        )
         save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
         del stage

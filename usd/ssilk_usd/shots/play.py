@@ -12,7 +12,8 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
-from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh
+from ..opening.times import change_times
+from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
 from ..units import StageUnits
 
 
@@ -42,7 +43,7 @@ class Shot:
         stage, units: the opened stage and its units.
         fps: frames per second, and time codes too.
         frame_times: time code of each frame.
-        meshes: every visible mesh of the stage, in its order.
+        meshes: every visible mesh of the stage that a render shows, in its order; stand-ins where none does.
     """
 
     def __init__(self, source: StageLike) -> None:
@@ -58,6 +59,8 @@ class Shot:
         skinned = _skinning_of(self.stage)
         everything = Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS)
         prims = [prim for prim in everything if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
+        sides = [rendered([prim for prim in prims if is_garment(prim) == side]) for side in (False, True)]
+        prims = [prim for prim in prims if any(prim in side for side in sides)]
         if not prims:
             fail(self.name, "no visible mesh", "a shot has at least one", "check that this is the right file")
         self._players = [
@@ -193,6 +196,6 @@ def _time_range(stage: Usd.Stage) -> tuple[float, float]:
     if stage.HasAuthoredTimeCodeRange():
         return stage.GetStartTimeCode(), stage.GetEndTimeCode()
     prims = Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
-    times = [attribute.GetTimeSamples() for prim in prims for attribute in prim.GetAuthoredAttributes()]
+    times = [change_times([attribute]) for prim in prims for attribute in prim.GetAuthoredAttributes()]
     spans = [(samples[0], samples[-1]) for samples in times if samples]
     return (min(low for low, _ in spans), max(high for _, high in spans)) if spans else (0.0, 0.0)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ FRAMES_PER_SAVE = 4096
 
 @dataclass(frozen=True)
 class ShotSummary:
-    """Summary of a written shot; `start` and `end` are time codes."""
+    """Summary of a written shot; `start` and `end` are time codes, `left_out` says which looks are lost."""
 
     path: str
     frame_count: int
@@ -39,6 +39,7 @@ class ShotSummary:
     joint_count: int
     proxy_count: int
     shape_count: int
+    left_out: str = ""
 
 
 def write_shot(
@@ -76,12 +77,13 @@ def write_shot(
             that do not spell the hierarchy, a file that cannot be written.
     """
     need_layer_suffix(path)
-    bodies = deformer.scene.character.bodies if include_body else ()
+    character = deformer.scene.character
+    bodies = (*character.bodies, *character.stand_ins) if include_body else ()
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         hiding = hidden_polygons if include_body else None
-        asset = define_asset(stage, deformer, bodies, units, record=record, hidden_polygons=hiding)
+        asset = define_asset(stage, deformer, bodies, units, record=record, hidden_polygons=hiding, output=path)
         span = TimeSpan.of(motion, start, samples_per_frame)
         set_metadata(stage, span, units)
         set_visibility(stage, asset.root, span, hidden)
@@ -89,7 +91,7 @@ def write_shot(
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step)
         write_samples(samples, poses, path, provenance)
         del samples, layer  # the file is closed before it is renamed
-    return summary(path, deformer, motion, span, len(asset.shapes))
+    return replace(summary(path, deformer, motion, span, len(asset.shapes)), left_out=asset.left_out)
 
 
 def write_samples(

@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -17,10 +18,12 @@ from ssilk_core.scene.kinematics import local_transforms, sorted_influences, wor
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
 from ..opening.garment_api import GarmentRecord, apply_garment_api
+from ..opening.stage import split_location
 from ..reading.mesh import display_colour
 from ..reading.skin import leaf
 from ..units import StageUnits
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
+from .look import copy_looks
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,7 @@ class Asset:
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
         bodies, body_paths: the bodies whose meshes were written, and the prims of these.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
+        left_out: what the meshes lose of their looks, for messages; empty where nothing.
     """
 
     root: Sdf.Path
@@ -41,6 +45,7 @@ class Asset:
     bodies: tuple[Body, ...]
     body_paths: tuple[Sdf.Path, ...]
     shapes: Ints
+    left_out: str = ""
 
 
 def define_asset(
@@ -52,6 +57,7 @@ def define_asset(
     name: str | None = None,
     record: GarmentRecord | None = None,
     hidden_polygons: HiddenPolygons | None = None,
+    output: str | Path = "",
 ) -> Asset:
     """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
 
@@ -59,6 +65,7 @@ def define_asset(
         name: of the SkelRoot (default: the character's).
         record: how the garment was made, kept on its mesh.
         hidden_polygons: polygons of the bodies to hide.
+        output: where the layer will lie, which paths of textures are relative to.
 
     Raises:
         SsilkError: the joint paths spell another hierarchy than the parents.
@@ -79,10 +86,16 @@ def define_asset(
     bind_skin(garment, deformer.skin, skeleton)
     define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
     for path, body in zip(paths[3:], bodies):
-        bind_skin(define_mesh(stage, path, body.mesh, units), body.skin, skeleton)
+        mesh = define_mesh(stage, path, body.mesh, units)
+        bind_skin(mesh, body.skin, skeleton)
+        if body.purpose != UsdGeom.Tokens.default_:
+            mesh.CreatePurposeAttr(body.purpose)
+    written = [scene.garment.mesh, *(body.mesh for body in bodies)]
+    source = split_location(scene.character.path)[0]
+    left = copy_looks(stage, root.GetPath(), source, list(zip(written, paths[2:])), output)
     if hidden_polygons is not None:
         hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
-    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes)
+    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes, str(left))
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
@@ -178,12 +191,14 @@ def matrix_array(transforms: Floats) -> Vt.Matrix4dArray:
 
 
 def define_mesh(stage: Usd.Stage, path: Sdf.Path, mesh: Mesh, units: StageUnits) -> UsdGeom.Mesh:
-    """Define a polygon mesh at its bind pose, with its own polygons and texture coordinates."""
+    """Define a mesh at its bind pose, with its own polygons and texture coordinates.
+
+    Without normals, which would not turn with it, viewers shade it smoothly as a subdivision surface: USD's default.
+    """
     points = np.asarray(units.points_from_core(mesh.points), dtype=np.float32)
     prim = UsdGeom.Mesh.Define(stage, path)
     prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points))
     author_faces(prim, mesh)
-    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     prim.CreateExtentAttr(extent_array(points.min(axis=0), points.max(axis=0)))
     return prim
 
@@ -196,10 +211,12 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
 def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
     """Author a garment's vertex classes, what finds them, the joint paths of its proxies, each unless None.
 
-    Its colour is authored where the prim has none.
+    Its colour is authored where the prim has none, and that both sides are seen where it says nothing of that.
     """
     if garment.colour is not None and display_colour(prim) is None:
         UsdGeom.Gprim(prim).CreateDisplayColorAttr([Gf.Vec3f(*garment.colour)])
+    if not UsdGeom.Gprim(prim).GetDoubleSidedAttr().HasAuthoredValue():
+        UsdGeom.Gprim(prim).CreateDoubleSidedAttr(True)  # cloth is seen from both sides
     if garment.classes is not None:
         _author_rows(prim, CLASS, garment.classes[:, None].astype(np.int32))
     if garment.pins is not None:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
@@ -21,6 +21,7 @@ from ..opening.specs import free_when_closed
 from ..opening.stage import usd_reason
 from ..units import StageUnits
 
+UDIM = "<UDIM>"  # stands for the numbers of tiles
 PACKED = "shot.usdc"  # the layer in a package
 ZIP_HEADER, EXTRA_HEADER, EXTRA_FIELD, ALIGNMENT = 30, 4, 0x1986, 64  # bytes, and the field that USD pads with
 
@@ -81,12 +82,36 @@ def packaged(out: str | Path) -> Iterator[Path]:
 
 
 def _pack(layer: Path, out: Path) -> None:
-    """Write a package of one layer: a zip without compression, its data 64 bytes aligned, as USD maps it into memory.
+    """Write a package of a layer and its textures: a zip without compression, data 64 bytes aligned, as USD maps it.
 
     USD's own function stores times of day, so that no two packages are alike.
     """
-    entry = zipfile.ZipInfo(layer.name, date_time=(1980, 1, 1, 0, 0, 0))
-    padding = -(ZIP_HEADER + len(entry.filename) + EXTRA_HEADER) % ALIGNMENT
-    entry.extra = struct.pack("<HH", EXTRA_FIELD, padding) + bytes(padding)
-    with zipfile.ZipFile(out, "w") as package, layer.open("rb") as source, package.open(entry, "w") as target:
-        shutil.copyfileobj(source, target)
+    files = {layer.name: layer, **_gathered(layer)}
+    with zipfile.ZipFile(out, "w") as package:
+        for name, file in files.items():
+            entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+            start = package.fp.tell() if package.fp else 0
+            padding = -(start + ZIP_HEADER + len(entry.filename.encode()) + EXTRA_HEADER) % ALIGNMENT
+            entry.extra = struct.pack("<HH", EXTRA_FIELD, padding) + bytes(padding)
+            with file.open("rb") as source, package.open(entry, "w") as target:
+                shutil.copyfileobj(source, target)
+
+
+def _gathered(path: Path) -> dict[str, Path]:
+    """Rename the textures of a layer to their names in a package; return these with their files."""
+    layer, found, folders = Sdf.Layer.FindOrOpen(str(path)), dict[str, Path](), dict[str, str]()
+
+    def packaged_name(name: str) -> str:
+        file = path.parent / name
+        tiles = sorted(file.parent.glob(file.name.replace(UDIM, "[0-9]" * 4))) if UDIM in name else [file]
+        tiles = [tile for tile in tiles if name and tile.is_file()]
+        if not tiles:
+            return name
+        folder = folders.setdefault(str(file.parent.resolve()), f"textures/{len(folders)}")
+        found.update({f"{folder}/{tile.name}": tile for tile in tiles})
+        return f"{folder}/{file.name}"
+
+    UsdUtils.ModifyAssetPaths(layer, packaged_name)
+    if found:
+        save(layer, path)
+    return found

@@ -63,6 +63,7 @@ def write_garment(path: str | Path, mesh: Mesh) -> None:
         stage = new_stage(temporary, CORE_UNITS)
         prim = define_mesh(stage, _root_path(mesh.path), mesh, CORE_UNITS).GetPrim()
         Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
+        UsdGeom.Gprim(prim).CreateDoubleSidedAttr(True)
         stage.SetDefaultPrim(prim)
         save(stage.GetRootLayer(), path)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
+from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
@@ -31,9 +32,11 @@ from ..reading.mesh import is_garment, winds_backwards
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
+from ..reading.surface import bound_material
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
+from .look import copy_looks
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
 
@@ -59,7 +62,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene, moved)
+    mesh, to_bind = _place_garment(stage, skel, source, scene, moved, out)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
@@ -90,7 +93,7 @@ def _prim_path(where: str) -> str:
 
 
 def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None
+    stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None, out: str | Path
 ) -> tuple[UsdGeom.Mesh, Floats]:
     """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
 
@@ -102,7 +105,7 @@ def _place_garment(
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
     if not (same and old and old.IsA(UsdGeom.Mesh)):
-        return _copy_garment(stage, skel, garment), np.eye(4)
+        return _copy_garment(stage, skel, garment, out), np.eye(4)
     own = fitted_skeleton(old, str(skel.prim.GetPath())) or skel
     place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
     to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
@@ -129,10 +132,19 @@ def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Flo
         mesh = replace(mesh, points=mesh.points - moved)
     if reads_as(prim, mesh, surface):
         return
+    path = _free_path(skel, leaf(surface.path) if surface else f"{prim.GetName()}_without_physics")
     if surface is None:
-        shield_surface(prim, _free_path(skel, f"{prim.GetName()}_without_physics"))
+        shield_surface(prim, path)
     else:
-        write_surface(prim, _free_path(skel, leaf(surface.path)), surface)
+        write_surface(prim, path, surface)
+    bound = bound_material(prim)
+    if not (bound and bound.GetPath() == path):
+        fail(
+            location(prim),
+            "a physics material is bound above it, stronger than descendants or by a collection",
+            "beneath the SkelRoot the garment would lose its own",
+            "weaken that binding, or bind the garment's material in the same way",
+        )
 
 
 def _let_go(stage: Usd.Stage, skel: SkelSource, prim: Usd.Prim) -> Usd.Prim:
@@ -151,14 +163,17 @@ def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
     return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
-def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment) -> UsdGeom.Mesh:
+def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path) -> UsdGeom.Mesh:
     """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
     name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
         stage.RemovePrim(older.GetPath())
     points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
-    return define_mesh(stage, _free_path(skel, name), replace(garment.mesh, points=points), StageUnits())
+    path, file = _free_path(skel, name), split_location(garment.mesh.path)[0]
+    mesh = define_mesh(stage, path, replace(garment.mesh, points=points), StageUnits())
+    copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
+    return mesh
 
 
 def _free_path(skel: SkelSource, name: str) -> Sdf.Path:

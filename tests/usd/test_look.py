@@ -1,0 +1,259 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What look development puts on meshes comes through rigs and shots, or is told by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+from ssilk_usd.reading.mesh import read_mesh
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.shots.shot import ShotSummary, write_shot
+from ssilk_usd.units import StageUnits
+from ssilk_usd.writing.body_faces import BODY, COVERED_HIDDEN, FULL, HiddenPolygons
+from ssilk_usd.writing.export import packaged
+from ssilk_usd.writing.rig import write_rigged_stage
+
+from ssilk_core.scene.assets import Character, Deformer, Garment, Motion, ProxyRig, Scene, SkinWeights
+from ssilk_core.scene.kinematics import lbs_deformer, lbs_poses
+
+METRES = StageUnits(1.0, "Y")
+COLUMNS, ROWS = 4, 3
+TINT = Sdf.ValueTypeNames
+
+
+def material(stage: Usd.Stage, path: str, uv_set: str) -> UsdShade.Material:
+    """A network: a texture, looked up by a UV set, that colours a surface."""
+    found = UsdShade.Material.Define(stage, path)
+    reader, texture, surface = (
+        UsdShade.Shader.Define(stage, f"{path}/{name}") for name in ("Reader", "Texture", "Surface")
+    )
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", TINT.String).Set(uv_set)
+    texture.CreateIdAttr("UsdUVTexture")
+    texture.CreateInput("file", TINT.Asset).Set(Sdf.AssetPath("./textures/linen.png"))
+    texture.CreateInput("st", TINT.Float2).ConnectToSource(reader.ConnectableAPI(), "result")
+    surface.CreateIdAttr("UsdPreviewSurface")
+    surface.CreateInput("diffuseColor", TINT.Color3f).ConnectToSource(texture.ConnectableAPI(), "rgb")
+    found.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    return found
+
+
+def dressed(stage: Usd.Stage, path: str, depth: float) -> UsdGeom.Mesh:
+    """A grid of quads with all that look development knows."""
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    x, y = np.meshgrid(np.arange(COLUMNS + 1.0), np.arange(ROWS + 1.0))
+    mesh.CreatePointsAttr([Gf.Vec3f(a, b, depth) for a, b in zip(x.ravel().tolist(), y.ravel().tolist())])
+    corner = (np.arange(ROWS)[:, None] * (COLUMNS + 1) + np.arange(COLUMNS)).ravel()
+    quads = corner[:, None] + [0, 1, COLUMNS + 2, COLUMNS + 1]
+    mesh.CreateFaceVertexCountsAttr([4] * len(quads))
+    mesh.CreateFaceVertexIndicesAttr(quads.ravel().tolist())
+    mesh.CreateDoubleSidedAttr(True)
+    mesh.CreateSubdivisionSchemeAttr("catmullClark")
+    mesh.CreateInterpolateBoundaryAttr("edgeOnly")
+    mesh.CreateCreaseIndicesAttr([0, 1])
+    mesh.CreateCreaseLengthsAttr([2])
+    mesh.CreateCreaseSharpnessesAttr([3.0])
+    api = UsdGeom.PrimvarsAPI(mesh)
+    for name, start in (("lightmap", 500), ("map1", 0)):
+        values = [Gf.Vec2f(start + i, start - i) for i in range(4 * len(quads))]
+        api.CreatePrimvar(name, TINT.TexCoord2fArray, "faceVarying").Set(values)
+    dye = api.CreatePrimvar("dye", TINT.FloatArray, "uniform")
+    dye.Set([0.25, 0.5, 0.75])
+    dye.SetIndices([face % 3 for face in range(len(quads))])
+    api.CreatePrimvar("wear", TINT.FloatArray, "vertex").Set([float(i) for i in range(x.size)])
+    prim = mesh.GetPrim()
+    prim.CreateAttribute("userProperties:asset_id", TINT.String).Set("cape_0042")
+    prim.SetCustomDataByKey("department", "cloth")
+    name = prim.GetName()
+    cloth, trim = (material(stage, f"/Looks/{name}_{part}", "map1") for part in ("cloth", "trim"))
+    UsdShade.MaterialBindingAPI.Apply(prim).Bind(cloth)
+    subset = UsdShade.MaterialBindingAPI(prim).CreateMaterialBindSubset("trim", [0, 5, 7])
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(trim)
+    return mesh
+
+
+@pytest.fixture
+def hero(tmp_path: Path) -> Path:
+    path = tmp_path / "assets" / "hero.usda"
+    (path.parent / "textures").mkdir(parents=True)
+    (path.parent / "textures" / "linen.png").write_bytes(b"linen")
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    root = UsdSkel.Root.Define(stage, "/Hero")
+    rig = UsdSkel.Skeleton.Define(stage, "/Hero/Rig")
+    rig.CreateJointsAttr(["Hips"])
+    rig.CreateBindTransformsAttr([Gf.Matrix4d(1)])
+    rig.CreateRestTransformsAttr([Gf.Matrix4d(1)])
+    UsdSkel.BindingAPI.Apply(root.GetPrim()).CreateSkeletonRel().SetTargets([rig.GetPath()])
+    for name, depth in (("Body", 0.0), ("Cape", 0.1)):
+        binding = UsdSkel.BindingAPI.Apply(dressed(stage, f"/Hero/{name}", depth).GetPrim())
+        binding.CreateJointIndicesPrimvar(True, 1).Set([0])
+        binding.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    stage.GetPrimAtPath("/Hero/Cape").CreateAttribute("ssilk:garment", TINT.Bool).Set(True)
+    stage.Save()
+    return path
+
+
+def scene_of(character: Character, garment: Garment) -> Scene:
+    count = garment.mesh.vertex_count
+    skin = garment.skin or SkinWeights.rigid(garment.mesh.path, 0, count)
+    rig = ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), skin)
+    return Scene(character, replace(garment, skin=skin, classes=np.ones(count, dtype=int)), rig)
+
+
+def worn(hero: Path) -> Deformer:
+    character, garment, _ = read_scene(str(hero))
+    return lbs_deformer(scene_of(character, garment))
+
+
+def shoot(deformer: Deformer, path: Path, **more: object) -> ShotSummary:
+    motion = Motion("still", 30.0, np.tile([1.0, 0, 0, 0], (2, 1, 1)), np.zeros((2, 1, 3)))
+    return write_shot(path, deformer, motion, lbs_poses(2), units=METRES, **more)  # type: ignore[arg-type]
+
+
+def look(stage: Usd.Stage, path: str) -> dict[str, object]:
+    """All of the look as USD evaluates it: values at faces and corners, materials of all faces, textures."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    prim, api = mesh.GetPrim(), UsdGeom.PrimvarsAPI(mesh)
+    names = ("doubleSided", "subdivisionScheme", "interpolateBoundary", "creaseIndices", "creaseLengths",
+             "creaseSharpnesses", "userProperties:asset_id")  # fmt: skip
+    found: dict[str, object] = {name: prim.GetAttribute(name).Get() for name in names}
+    for primvar in api.GetPrimvarsWithValues():
+        if not primvar.GetPrimvarName().startswith(("skel:", "ssilk:")):
+            values = np.array(primvar.ComputeFlattened()).tolist()
+            found[primvar.GetPrimvarName()] = (str(primvar.GetInterpolation()), values)
+    found["department"] = prim.GetCustomDataByKey("department")
+    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    found["subsets"] = {subset.GetPrim().GetName(): list(subset.GetIndicesAttr().Get()) for subset in subsets}
+    for holder in (prim, *(subset.GetPrim() for subset in subsets)):
+        bound, _ = UsdShade.MaterialBindingAPI(holder).ComputeBoundMaterial()
+        surface, _, _ = bound.ComputeSurfaceSource()
+        texture = UsdShade.Shader(surface.GetInput("diffuseColor").GetConnectedSources()[0][0].source.GetPrim())
+        file = texture.GetInput("file").Get()
+        found[f"material of {holder.GetName()}"] = (bound.GetPrim().GetName(), Path(file.resolvedPath).name)
+    return found
+
+
+def test_a_shot_keeps_the_look_of_body_and_garment(hero, tmp_path):
+    summary = shoot(worn(hero), tmp_path / "shots" / "shot.usdc")
+    assert summary.left_out == ""
+    before, after = Usd.Stage.Open(str(hero)), Usd.Stage.Open(str(tmp_path / "shots" / "shot.usdc"))
+    for name in ("Cape", "Body"):
+        assert look(after, f"/Hero/{name}") == look(before, f"/Hero/{name}")
+    file = after.GetPrimAtPath("/Hero/Looks/Cape_trim/Texture").GetAttribute("inputs:file").Get()
+    assert file.path == "../assets/textures/linen.png"
+
+
+def test_faces_that_are_read_otherwise_keep_their_own_values(hero, tmp_path):
+    """A hole is left out, and faces that wind the other way are turned, with all that belongs to them."""
+    stage = Usd.Stage.Open(str(hero))
+    cape = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Cape"))
+    cape.CreateHoleIndicesAttr([2, 6])
+    cape.CreateOrientationAttr("leftHanded")
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usda")
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    after = UsdGeom.Mesh(shot.GetPrimAtPath("/Hero/Cape"))
+    api = {prim: UsdGeom.PrimvarsAPI(prim) for prim in (cape, after)}
+    kept = [face for face in range(COLUMNS * ROWS) if face not in (2, 6)]
+    dye = {prim: np.array(api[prim].GetPrimvar("dye").ComputeFlattened()) for prim in api}
+    np.testing.assert_array_equal(dye[after], dye[cape][kept])
+
+    def pairs(prim: UsdGeom.Mesh, faces: list[int]) -> set[tuple[int, float]]:
+        """Points and what `map1` says of them, face by face."""
+        points = np.array(prim.GetFaceVertexIndicesAttr().Get()).reshape(-1, 4)[faces]
+        values = np.array(api[prim].GetPrimvar("map1").ComputeFlattened())[:, 0].reshape(-1, 4)[faces]
+        return set(zip(points.ravel().tolist(), values.ravel().tolist()))
+
+    assert pairs(after, list(range(len(kept)))) == pairs(cape, kept)
+    subset = UsdShade.MaterialBindingAPI(after).GetMaterialBindSubsets()[0]
+    assert [kept[index] for index in subset.GetIndicesAttr().Get()] == [0, 5, 7]
+
+
+@pytest.mark.parametrize("variants", [True, False])
+def test_hidden_faces_take_what_belongs_to_them_along(hero, tmp_path, variants):
+    mask = np.zeros(COLUMNS * ROWS, dtype=bool)
+    mask[[0, 3]] = True
+    shoot(worn(hero), tmp_path / "shot.usda", hidden_polygons=HiddenPolygons((mask,), variants))
+    stage, before = Usd.Stage.Open(str(tmp_path / "shot.usda")), Usd.Stage.Open(str(hero))
+    body = stage.GetPrimAtPath("/Hero/Body")
+    whole = look(before, "/Hero/Body")
+    if variants:
+        stage.GetPrimAtPath("/Hero").GetVariantSet(BODY).SetVariantSelection(FULL)
+        assert look(stage, "/Hero/Body") == whole
+        stage.GetPrimAtPath("/Hero").GetVariantSet(BODY).SetVariantSelection(COVERED_HIDDEN)
+    found = look(stage, "/Hero/Body")
+    assert len(body.GetAttribute("faceVertexCounts").Get()) == COLUMNS * ROWS - 2
+    corners = np.repeat(~mask, 4)
+    for name, rows in (("map1", corners), ("lightmap", corners), ("dye", ~mask)):
+        np.testing.assert_array_equal(found[name][1], np.array(whole[name][1])[rows])
+    assert found["subsets"] == {"trim": [3, 5]}  # of 0, 5 and 7, without the first
+    assert found["wear"] == whole["wear"]
+
+
+def test_a_rig_of_a_garment_from_its_own_file_keeps_its_look(hero, tmp_path):
+    garment = tmp_path / "assets" / "cape.usda"
+    stage = Usd.Stage.CreateNew(str(garment))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    dressed(stage, "/Wardrobe/Cloak", 0.2)
+    stage.Save()
+    character, read, _ = read_scene(str(hero), garment=str(garment))
+    write_rigged_stage(hero, scene_of(character, read), tmp_path / "rigged.usda")
+    after = Usd.Stage.Open(str(tmp_path / "rigged.usda"))
+    assert look(after, "/Hero/Cloak") == look(stage, "/Wardrobe/Cloak")
+
+
+def test_what_is_lost_is_told_by_name(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    cape = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Cape"))
+    cape.CreateNormalsAttr([Gf.Vec3f(0, 0, 1)] * 20)
+    cape.GetPrim().GetAttribute("primvars:wear").Set([1.0] * 20, 5)
+    stage.Save()
+    assert shoot(worn(hero), tmp_path / "shot.usda").left_out == (
+        "Cape loses normals, the animation of primvars:wear, which keeps its first value"
+    )
+    deformer = worn(hero)
+    cut = replace(deformer.scene.garment.mesh, path="gone.usda:/Shawl", faces=deformer.scene.garment.mesh.faces[:-2],
+                  polygon_counts=deformer.scene.garment.mesh.polygon_counts[:-1],
+                  polygon_indices=deformer.scene.garment.mesh.indices_of_corners[:-4], uvs=None)  # fmt: skip
+    garment = replace(deformer.scene.garment, mesh=cut)
+    other = replace(deformer, scene=replace(deformer.scene, garment=garment))
+    assert "Shawl loses its look" in shoot(other, tmp_path / "other.usda").left_out
+
+
+def test_cloth_without_a_look_is_seen_from_both_sides(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    stage.GetPrimAtPath("/Hero/Cape").RemoveProperty("doubleSided")
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usda")
+    assert (
+        UsdGeom.Mesh(Usd.Stage.Open(str(tmp_path / "shot.usda")).GetPrimAtPath("/Hero/Cape"))
+        .GetDoubleSidedAttr()
+        .Get()
+    )
+
+
+@pytest.mark.parametrize(("read", "first"), [("lightmap", 500.0), ("map1", 0.0), (None, 0.0)])
+def test_the_uv_set_is_the_one_that_the_material_reads(hero, read, first):
+    stage = Usd.Stage.Open(str(hero))
+    prim = stage.GetPrimAtPath("/Hero/Cape")
+    for name in ("cloth", "trim"):
+        varname = UsdShade.Shader(stage.GetPrimAtPath(f"/Looks/Cape_{name}/Reader")).GetInput("varname")
+        varname.Set(read or "")
+    uvs = read_mesh(prim, np.eye(4)).uvs
+    assert uvs is not None and uvs[0, 0] == first
+
+
+def test_a_package_holds_its_textures(hero, tmp_path):
+    with packaged(tmp_path / "shot.usdz") as layer:
+        shoot(worn(hero), layer)
+    (tmp_path / "assets" / "textures" / "linen.png").unlink()
+    stage = Usd.Stage.Open(str(tmp_path / "shot.usdz"))
+    assert look(stage, "/Hero/Cape")["material of trim"] == ("Cape_trim", "linen.png]")
+    assert not UsdUtils.ComputeAllDependencies(str(tmp_path / "shot.usdz"))[2]

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What look development puts on a mesh, copied to where the mesh is written anew.
+
+Materials with their networks, subsets, sides, subdivision and creases, primvars with all UV sets, custom attributes
+and custom data. What skinning and simulation say is written by others, and normals of the bind pose are left out:
+they would not turn with the cloth.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
+
+from ssilk_core.scene.assets import Ints, Mesh
+
+from ..opening.stage import EARLIEST, PRIMS, location, open_stage, split_location
+from ..reading.mesh import is_garment, kept_faces, polygons
+from .body_faces import face_kind
+
+LOOKS = "Looks"  # scope of materials beneath the root
+_OTHERS = {
+    "points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "orientation", "extent", "xformOpOrder",
+    "visibility", "purpose", "proxyPrim",
+}  # fmt: skip
+_OTHER_SPACES = (
+    "xformOp:", "skel:", "primvars:skel:", "ssilk:", "primvars:ssilk:", "physics:", "omniphysics:", "physx",
+    "material:binding", "collection:",
+)  # fmt: skip
+_LEFT = ("normals", "primvars:normals", "velocities", "accelerations")
+_PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
+_METADATA = ("customData", "assetInfo", "displayName", "documentation")
+
+
+@dataclass(frozen=True, eq=False)
+class LookSource:
+    """A prim with the look of a mesh; `corners` and `faces` of it are those that the mesh has, in its order."""
+
+    prim: Usd.Prim
+    corners: Ints
+    faces: Ints
+
+
+@dataclass
+class LeftOut:
+    """What was not copied, by mesh, for messages."""
+
+    names: dict[str, list[str]] = field(default_factory=dict)
+
+    def add(self, mesh: str, name: str) -> None:
+        found = self.names.setdefault(mesh, [])
+        if name not in found:
+            found.append(name)
+
+    def __str__(self) -> str:
+        return "; ".join(f"{mesh} loses {', '.join(names)}" for mesh, names in self.names.items())
+
+
+def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
+    """Return the prim of a stage that a mesh was read from, or is of the same polygons as; None without one.
+
+    A garment that was trained from another file is found by its polygons, those marked as garments and those of its
+    name first.
+    """
+    path = split_location(mesh.path)[1] or "/"
+    meshes = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    name = path.rpartition("/")[2]
+    meshes.sort(key=lambda prim: (str(prim.GetPath()) != path, not is_garment(prim), prim.GetName() != name))
+    counts = np.asarray(mesh.polygon_counts)
+    for prim in meshes:
+        if len(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(EARLIEST) or []) < len(counts):
+            continue
+        points = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(EARLIEST) or [])
+        own, indices = polygons(prim, points, location(prim))
+        corners, kept, faces = kept_faces(prim, own)
+        same = points == mesh.vertex_count and np.array_equal(kept, counts)
+        if same and np.array_equal(indices[corners], mesh.indices_of_corners):
+            return LookSource(prim, corners, faces)
+    return None
+
+
+def copy_looks(
+    stage: Usd.Stage, root: Sdf.Path, source: str, meshes: Sequence[tuple[Mesh, Sdf.Path]], output: str | Path
+) -> LeftOut:
+    """Copy the looks of meshes from a stage to where they were defined; return what is left out.
+
+    Args:
+        root: prim that materials are written beneath.
+        source: file of the stage.
+        meshes: each with the path of its prim in `stage`.
+        output: where the layer of `stage` will lie, which relative paths of textures are relative to.
+    """
+    left = LeftOut()
+    if not Path(source).is_file():
+        return left
+    opened = open_stage(source)
+    found = [(mesh, path, look_source(mesh, opened)) for mesh, path in meshes]
+    for mesh, _, look in found:
+        if look is None:
+            left.add(mesh.path.rpartition("/")[2], f"its look, since {source} has no mesh of its polygons")
+    looks = [(path, look) for _, path, look in found if look is not None]
+    flat = _flattened(opened, [look.prim for _, look in looks])
+    layer = stage.GetEditTarget().GetLayer()
+    materials: dict[Sdf.Path, Sdf.Path] = {}
+    with Sdf.ChangeBlock():
+        for path, look in looks:
+            _copy_properties(flat, layer, look, path, left)
+    for path, look in looks:
+        _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
+        _copy_subsets(flat, stage, look, path)
+        _bind_materials(flat, stage, root, look, path, materials, left)
+    folder = os.path.abspath(os.path.dirname(output))
+    UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
+    return left
+
+
+def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:
+    """Return a layer of the meshes and of all materials that are bound to them or to their subsets, composed."""
+    wanted = [prim.GetPath() for prim in prims]
+    for prim in prims:
+        subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
+        for holder in (prim, *(subset.GetPrim() for subset in subsets)):
+            wanted += [material.GetPath() for material, _ in _bound(holder)]
+    mask = Usd.StagePopulationMask([Sdf.Path(path) for path in wanted] or [Sdf.Path("/__none")])
+    part = Usd.Stage.OpenMasked(stage.GetRootLayer(), Sdf.Layer.CreateAnonymous(), mask)
+    part.ExpandPopulationMask()
+    part.SetEditTarget(part.GetSessionLayer())
+    for path in wanted:
+        for prefix in path.GetPrefixes():
+            prim = part.GetPrimAtPath(prefix)
+            if prim and prim.IsInstance():
+                prim.SetInstanceable(False)
+    return part.Flatten()
+
+
+def _copy_properties(flat: Sdf.Layer, layer: Sdf.Layer, look: LookSource, path: Sdf.Path, left: LeftOut) -> None:
+    prim = flat.GetPrimAtPath(look.prim.GetPath())
+    for spec in list(prim.properties) if prim else []:
+        name = spec.name
+        if name in _OTHERS or name.startswith(_OTHER_SPACES):
+            continue
+        if name in _LEFT:
+            left.add(path.name, name)
+            continue
+        to = path.AppendProperty(name)
+        Sdf.CopySpec(flat, spec.path, layer, to)
+        if isinstance(spec, Sdf.RelationshipSpec):
+            continue
+        if flat.ListTimeSamplesForPath(spec.path):
+            for time in layer.ListTimeSamplesForPath(to):
+                layer.EraseTimeSample(to, time)
+            layer.GetAttributeAtPath(to).default = look.prim.GetAttribute(name).Get(EARLIEST)
+            left.add(path.name, f"the animation of {name}, which keeps its first value")
+        _keep_rows(layer, look, to, name)
+    here = layer.GetPrimAtPath(path)
+    for key in _METADATA:
+        if prim and prim.HasInfo(key):
+            here.SetInfo(key, prim.GetInfo(key))
+
+
+def _keep_rows(layer: Sdf.Layer, look: LookSource, to: Sdf.Path, name: str) -> None:
+    """Keep of a value for each face or corner those that the written mesh has."""
+    kind = face_kind(look.prim, name)
+    if kind is None:
+        return
+    spec = layer.GetAttributeAtPath(to)
+    values, rows = spec.default, look.corners if kind == "corner" else look.faces
+    size = UsdGeom.Primvar(look.prim.GetAttribute(name)).GetElementSize() if not name.endswith(":indices") else 1
+    if values is None or len(values) < size * len(rows):
+        return
+    array = np.array(values)
+    array = array.reshape(-1, size, *array.shape[1:])[rows].reshape(-1, *array.shape[1:])
+    spec.default = type(values).FromNumpy(np.ascontiguousarray(array))
+
+
+def _copy_meaning(look: LookSource, mesh: UsdGeom.Mesh) -> None:
+    purpose = UsdGeom.Imageable(look.prim).ComputePurpose()
+    if purpose != UsdGeom.Tokens.default_:
+        mesh.CreatePurposeAttr(purpose)
+    mesh.GetSubdivisionSchemeAttr().Set(UsdGeom.Mesh(look.prim).GetSubdivisionSchemeAttr().Get())
+    sets, own = UsdGeom.PrimvarsAPI(mesh), look.prim.GetAttribute("primvars:st")
+    if sets.HasPrimvar("st") and not own:  # the set has a name of its own
+        sets.RemovePrimvar("st")
+
+
+def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf.Path) -> None:
+    layer = stage.GetEditTarget().GetLayer()
+    position = np.full(int(look.faces.max(initial=-1)) + 1, -1)
+    position[look.faces] = np.arange(len(look.faces))
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(look.prim)):
+        to = path.AppendChild(subset.GetPrim().GetName())
+        Sdf.CopySpec(flat, subset.GetPath(), layer, to)
+        spec = layer.GetPrimAtPath(to)
+        for name in [each.name for each in spec.properties if each.name.startswith("material:binding")]:
+            spec.RemoveProperty(spec.properties[name])
+        copied = UsdGeom.Subset(stage.GetPrimAtPath(to))
+        if copied.GetElementTypeAttr().Get() == UsdGeom.Tokens.face:
+            indices = np.array(subset.GetIndicesAttr().Get(EARLIEST) or [], dtype=np.int64)
+            found = position[indices[(indices >= 0) & (indices < len(position))]]
+            copied.GetIndicesAttr().Set(Vt.IntArray.FromNumpy(found[found >= 0].astype(np.int32)))
+    family = flat.GetPrimAtPath(look.prim.GetPath())
+    for spec in family.properties if family else []:
+        if spec.name.startswith("subsetFamily:"):
+            Sdf.CopySpec(flat, spec.path, layer, path.AppendProperty(spec.name))
+
+
+def _bound(prim: Usd.Prim) -> Iterator[tuple[UsdShade.Material, str]]:
+    """Yield the materials that are bound to a prim, each with the purpose of its binding."""
+    for purpose in _PURPOSES:
+        material, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
+        if material and (purpose == UsdShade.Tokens.allPurpose or purpose in relationship.GetName().split(":")):
+            yield material, purpose
+
+
+def _bind_materials(
+    flat: Sdf.Layer, stage: Usd.Stage, root: Sdf.Path, look: LookSource, path: Sdf.Path,
+    materials: dict[Sdf.Path, Sdf.Path], left: LeftOut,
+) -> None:  # fmt: skip
+    """Bind what is bound to a mesh and to its subsets, copied beneath the root, once each."""
+    pairs = [(look.prim, path)]
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(look.prim)):
+        pairs.append((subset.GetPrim(), path.AppendChild(subset.GetPrim().GetName())))
+    inherited = {(purpose, material.GetPath()) for material, purpose in _bound(look.prim)}
+    for source, to in pairs:
+        for material, purpose in _bound(source):
+            if source != look.prim and (purpose, material.GetPath()) in inherited:
+                continue
+            copied = materials.get(material.GetPath()) or _copy_material(flat, stage, root, material, left)
+            materials[material.GetPath()] = copied
+            api = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(to))
+            api.Bind(UsdShade.Material(stage.GetPrimAtPath(copied)), UsdShade.Tokens.fallbackStrength, purpose)
+
+
+def _copy_material(
+    flat: Sdf.Layer, stage: Usd.Stage, root: Sdf.Path, material: UsdShade.Material, left: LeftOut
+) -> Sdf.Path:
+    layer, scope = stage.GetEditTarget().GetLayer(), root.AppendChild(LOOKS)
+    if not stage.GetPrimAtPath(scope):
+        UsdGeom.Scope.Define(stage, scope)
+    taken = {child.GetName() for child in stage.GetPrimAtPath(scope).GetAllChildren()}
+    own = material.GetPrim().GetName()
+    name = next(each for each in (own, *(f"{own}_{copy}" for copy in range(2, len(taken) + 3))) if each not in taken)
+    to = scope.AppendChild(name)
+    Sdf.CopySpec(flat, material.GetPath(), layer, to)
+    for prim in Usd.PrimRange(stage.GetPrimAtPath(to)):
+        for attribute in prim.GetAuthoredAttributes():
+            outside = [path for path in attribute.GetConnections() if not path.HasPrefix(to)]
+            if outside:
+                attribute.SetConnections([path for path in attribute.GetConnections() if path.HasPrefix(to)])
+                left.add(name, f"{outside[0]}, which stands outside the material")
+    return to
