@@ -16,6 +16,7 @@ import numpy as np
 from ..errors import SetupError
 
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
+LIVE = "ssilk_live"  # custom property of one that stands for live playback, until that ends
 SLOTS = hasattr(bpy.types, "ActionSlot")  # since Blender 4.4
 LINEAR = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
 
@@ -42,9 +43,19 @@ def is_baked(action: bpy.types.Action, garment: bpy.types.Object | None = None) 
     return baked and (garment is None or action[OWNER] == garment)
 
 
+def is_live(action: bpy.types.Action) -> bool:
+    """Return whether an action stands for live playback."""
+    return LIVE in action.keys()  # noqa: SIM118 (no dictionary)
+
+
 def has_keys(garment: bpy.types.Object) -> bool:
     """Return whether anything was baked for a garment."""
-    return any(is_baked(action, garment) for action in bpy.data.actions)
+    return any(is_baked(action, garment) and not is_live(action) for action in bpy.data.actions)
+
+
+def has_live_keys(garment: bpy.types.Object, things: Sequence[Any]) -> bool:
+    """Return whether keys of live playback are on tracks of each of these objects and shape keys."""
+    return all(_tracks(thing, garment, live=True) for thing in things)
 
 
 def curves_of(action: bpy.types.Action) -> Iterator[bpy.types.FCurve]:
@@ -75,7 +86,9 @@ def need_tracks(things: Sequence[Any]) -> None:
                 raise SetupError(f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
 
 
-def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]]) -> None:
+def bake_keys(
+    garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]], *, live: bool = False
+) -> None:
     """Put keys in place of those that were baked for a garment before.
 
     They lie on tracks of their own, beneath the action in which the artist animates; older ones keep their place.
@@ -83,18 +96,21 @@ def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, 
     Args:
         start: the first frame.
         moved: objects or shape keys, each with what moves on it, which may be nothing.
+        live: whether they stand for live playback; those of a bake stay beneath them.
     """
     for thing, channels in moved:
         if not channels:
-            _remove_tracks(thing, garment)
+            _remove_tracks(thing, garment, live)
     moving = [(thing, channels) for thing, channels in moved if channels]
-    tracks = [_cleared_track(thing, garment) for thing, _ in moving]
-    _remove_actions(garment)
+    tracks = [_cleared_track(thing, garment, live) for thing, _ in moving]
+    _remove_actions(garment, live)
     action = None
     for track, (thing, channels) in zip(tracks, moving):
         if action is None or not SLOTS:
-            action = bpy.data.actions.new(f"SSILK {garment.name}")
+            action = bpy.data.actions.new(track.name)
             action[OWNER] = garment
+            if live:
+                action[LIVE] = True
         bag = _Bag(action, thing)
         for channel in channels:
             _write(bag.new_curve(channel), start, channel.values)
@@ -115,40 +131,58 @@ def new_action(name: str, thing: Any, start: float, step: float, channels: Seque
     return action
 
 
-def remove_keys(garment: bpy.types.Object, things: Sequence[Any]) -> None:
-    """Remove what was baked for a garment from the animation of objects and shape keys."""
+def remove_keys(garment: bpy.types.Object, things: Sequence[Any], *, live: bool | None = None) -> None:
+    """Remove what was baked for a garment from the animation of objects and shape keys.
+
+    Args:
+        live: whether to remove what stands for live playback, or all but that; None for everything.
+    """
     for thing in things:
-        _remove_tracks(thing, garment)
-    _remove_actions(garment)
+        _remove_tracks(thing, garment, live)
+    _remove_actions(garment, live)
 
 
-def _remove_tracks(thing: Any, garment: bpy.types.Object) -> None:
-    for track in _tracks(thing, garment):
+def _is_of(action: bpy.types.Action | None, garment: bpy.types.Object, live: bool | None) -> bool:
+    return bool(action and is_baked(action, garment)) and live in (None, is_live(action))
+
+
+def _remove_tracks(thing: Any, garment: bpy.types.Object, live: bool | None) -> None:
+    for track in _tracks(thing, garment, live):
         thing.animation_data.nla_tracks.remove(track)
 
 
-def _tracks(thing: Any, garment: bpy.types.Object) -> list[bpy.types.NlaTrack]:
+def _tracks(thing: Any, garment: bpy.types.Object, live: bool | None) -> list[bpy.types.NlaTrack]:
     """Return the tracks on which something plays that was baked for a garment."""
     tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
-    return [t for t in tracks if any(strip.action and is_baked(strip.action, garment) for strip in t.strips)]
+    return [track for track in tracks if any(_is_of(strip.action, garment, live) for strip in track.strips)]
 
 
-def _cleared_track(thing: Any, garment: bpy.types.Object) -> bpy.types.NlaTrack:
+def _cleared_track(thing: Any, garment: bpy.types.Object, live: bool) -> bpy.types.NlaTrack:
     """Return the garment's track of a thing, made if there is none, without what was baked."""
-    found = _tracks(thing, garment)
+    found = _tracks(thing, garment, live)
     if not found:
         track = thing.animation_data_create().nla_tracks.new()
-        track.name = f"SSILK {garment.name}"
+        track.name = f"SSILK {garment.name}{' live' if live else ''}"
         return track
     for strip in list(found[0].strips):
-        if strip.action and is_baked(strip.action, garment):
+        if _is_of(strip.action, garment, live):
             found[0].strips.remove(strip)
     return found[0]
 
 
-def _remove_actions(garment: bpy.types.Object) -> None:
-    for action in [action for action in bpy.data.actions if is_baked(action, garment)]:
+def _remove_actions(garment: bpy.types.Object, live: bool | None) -> None:
+    for action in [action for action in bpy.data.actions if _is_of(action, garment, live)]:
         bpy.data.actions.remove(action)
+
+
+def continuous(turns: np.ndarray) -> np.ndarray:
+    """Return rotations with the signs that are nearest from frame to frame: Blender interpolates numbers between keys.
+
+    Args:
+        turns: unit quaternions (w, x, y, z), shape (F, ..., 4).
+    """
+    flips = np.where((turns[1:] * turns[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return np.concatenate([turns[:1], turns[1:] * np.cumprod(flips, axis=0)[..., None]])
 
 
 class _Bag:

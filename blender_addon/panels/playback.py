@@ -18,7 +18,13 @@ def live_line(garment: bpy.types.Object) -> str:
         return playing.reason(garment)
     if played.done is not None:
         return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
-    return "The motion changed since it was read" if played.stale else "Follows the armature"
+    if played.behind:
+        return "The frame range or the rate changed since the motion was read"
+    if played.unkeyed:
+        return f"Renders lack it: {played.unkeyed}"
+    if played.stale:
+        return "The motion changed since it was read"
+    return playing.warning(garment) or "Follows the armature"
 
 
 class PlaybackPanel(SidebarPanel, bpy.types.Panel):
@@ -40,7 +46,7 @@ class PlaybackPanel(SidebarPanel, bpy.types.Panel):
         else:
             layout.operator("ssilk.play_live", icon="PLAY")
         if line:
-            layout.label(text=line)
+            draw_text(layout, line)
 
 
 def model_line(garment: bpy.types.Object) -> str:

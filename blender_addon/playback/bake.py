@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from ssilk_usd.shots.skinned import BakedGarment, SkinnedGarment
 
+from ssilk_core.scene.assets import GarmentPose
 from ssilk_core.scene.kinematics import (
     local_transforms,
     matrix_from_quaternion,
@@ -18,7 +19,7 @@ from ssilk_core.scene.kinematics import (
 
 from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
-from ..motions.keys import Channel, bake_keys, remove_keys
+from ..motions.keys import Channel, bake_keys, continuous, remove_keys
 from ..scene.armature import proxy_names
 from ..scene.garment import need_uncarried
 from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
@@ -80,18 +81,39 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     if baked.pose.translations is not None:  # before anything changes
         need_movable(armature, [joints.proxies[index] for index in np.flatnonzero(there)])
     shapes = apply_deformation(garment, armature, joints, baked.garment, order)
-    rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
-    rotations[:, there] = baked.pose.rotations[:, proxies[there]]
-    channels = _channels(joints.proxies, "rotation_quaternion", turns_from_rest(joints, rotations))
-    if baked.pose.translations is not None:
-        places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
-        places[:, there] = baked.pose.translations[:, proxies[there]]
+    put_keys(garment, armature, joints, proxies, shapes, baked.pose, round(baked.start))
+
+
+def put_keys(
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    joints: Joints,
+    proxies: np.ndarray,
+    shapes: Sequence[str],
+    pose: GarmentPose,
+    start: int,
+    *,
+    live: bool = False,
+) -> None:
+    """Put poses of a garment as keys onto its proxies and shape keys.
+
+    Args:
+        proxies: where each proxy stands among those of the poses, -1 for none, shape (P,).
+        shapes: the shape keys, as the poses weigh them.
+        start: the first frame.
+        live: whether they stand for live playback.
+    """
+    there = proxies >= 0
+    rotations = np.tile(rest_rotations(joints), (pose.frame_count, 1, 1))
+    rotations[:, there] = pose.rotations[:, proxies[there]]
+    turns = continuous(turns_from_rest(joints, rotations))
+    channels = _channels(joints.proxies, "rotation_quaternion", turns)
+    if pose.translations is not None:
+        places = np.tile(_rest_places(joints), (pose.frame_count, 1, 1))
+        places[:, there] = pose.translations[:, proxies[there]]
         channels += _channels(joints.proxies, "location", shifts_from_rest(armature, joints, places))
-    moved = [
-        (armature, channels),
-        (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
-    ]
-    bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
+    moved = [(armature, channels), (garment.data.shape_keys, _weight_channels(shapes, pose.weights))]
+    bake_keys(garment, start, [(thing, channels) for thing, channels in moved if thing], live=live)
 
 
 def apply_deformation(
