@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
+from ..scene.objects import scene_step
 
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
 LIVE = "ssilk_live"  # custom property of one that stands for live playback, until that ends
@@ -58,22 +59,23 @@ def has_live_keys(garment: bpy.types.Object, things: Sequence[Any]) -> bool:
     return all(_tracks(thing, garment, live=True) for thing in things)
 
 
-def curves_of(action: bpy.types.Action) -> Iterator[bpy.types.FCurve]:
-    """Yield the F-curves of all slots."""
+def curves_of(action: bpy.types.Action, slot: Any = None) -> Iterator[bpy.types.FCurve]:
+    """Yield the F-curves of all slots, or of one."""
     if not SLOTS:
         yield from action.fcurves
         return
     for layer in action.layers:
         for strip in layer.strips:
             for bag in strip.channelbags:
-                yield from bag.fcurves
+                if slot is None or bag.slot_handle == slot.handle:
+                    yield from bag.fcurves
 
 
 def need_tracks(things: Sequence[Any]) -> None:
     """Check that tracks can be added to the animation of objects and shape keys.
 
     Raises:
-        SetupError: one is in tweak mode, or its tracks are switched off.
+        SetupError: one is in tweak mode, a track is solo, or all are switched off.
     """
     for thing in things:
         animation = thing.animation_data
@@ -84,6 +86,12 @@ def need_tracks(things: Sequence[Any]) -> None:
             off = len(animation.nla_tracks) and not animation.use_nla
             if off:
                 raise SetupError(f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
+            solo = next((track for track in animation.nla_tracks if track.is_solo), None)
+            if solo:
+                raise SetupError(
+                    f"The NLA track '{solo.name}' of {name} is solo, so that baked keys would not show; "
+                    "switch its star off in the NLA editor."
+                )
 
 
 def bake_keys(
@@ -104,7 +112,7 @@ def bake_keys(
     moving = [(thing, channels) for thing, channels in moved if channels]
     tracks = [_cleared_track(thing, garment, live) for thing, _ in moving]
     _remove_actions(garment, live)
-    action = None
+    action, step = None, scene_step()
     for track, (thing, channels) in zip(tracks, moving):
         if action is None or not SLOTS:
             action = bpy.data.actions.new(track.name)
@@ -113,8 +121,8 @@ def bake_keys(
                 action[LIVE] = True
         bag = _Bag(action, thing)
         for channel in channels:
-            _write(bag.new_curve(channel), start, channel.values)
-        bag.play_on(track, start, start + len(channels[0].values) - 1)
+            _write(bag.new_curve(channel), start * step, channel.values, step)
+        bag.play_on(track, start * step, (start + len(channels[0].values) - 1) * step)
 
 
 def new_action(name: str, thing: Any, start: float, step: float, channels: Sequence[Channel]) -> bpy.types.Action:
@@ -176,7 +184,7 @@ def _remove_actions(garment: bpy.types.Object, live: bool | None) -> None:
 
 
 def continuous(turns: np.ndarray) -> np.ndarray:
-    """Return rotations with the signs that are nearest from frame to frame: Blender interpolates numbers between keys.
+    """Return rotations with signs that are nearest from frame to frame: Blender interpolates numbers between keys.
 
     Args:
         turns: unit quaternions (w, x, y, z), shape (F, ..., 4).
@@ -203,9 +211,9 @@ class _Bag:
         curve.group = self.bag.groups.get(channel.group) or self.bag.groups.new(channel.group)
         return curve
 
-    def play_on(self, track: bpy.types.NlaTrack, start: int, end: int) -> None:
+    def play_on(self, track: bpy.types.NlaTrack, start: float, end: float) -> None:
         """Play the curves on a track, frame by frame where their keys are."""
-        strip = track.strips.new(self.action.name, start, self.action)
+        strip = track.strips.new(self.action.name, round(start), self.action)
         strip.action_frame_start, strip.action_frame_end = start, end
         strip.frame_start, strip.frame_end = start, max(end, start + 1)
         if SLOTS:

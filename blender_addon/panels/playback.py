@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import bpy
 
+from ..motions.keys import has_keys
 from ..playback import playing
 from ..playback.models import no_model
-from ..scene.garment import unusable
+from ..playback.overrides import overriding
+from ..scene.garment import armature_of, unusable
 from .base import SidebarPanel, draw_text, saying_errors
 
 
@@ -55,6 +57,12 @@ def model_line(garment: bpy.types.Object) -> str:
     return no_model(garment) or own
 
 
+def overridden_line(garment: bpy.types.Object) -> str:
+    """Return what has priority over a garment's baked keys; empty where nothing has, or nothing was baked."""
+    found = overriding(garment, armature_of(garment)) if has_keys(garment) else []
+    return f"Blender does not show the bake: {'; '.join(found)}" if found else ""
+
+
 class BakingPanel(SidebarPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
@@ -69,6 +77,8 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
+        if line := overridden_line(context.object):
+            draw_text(layout, line, icon="ERROR")
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
         layout.operator("ssilk.export_gltf", icon="EXPORT")

@@ -20,8 +20,8 @@ from ssilk_core.scene.kinematics import (
 from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
 from ..motions.keys import Channel, bake_keys, continuous, remove_keys
-from ..scene.armature import proxy_names
-from ..scene.garment import need_uncarried
+from ..scene.armature import bring_back, proxy_names, put_away
+from ..scene.garment import bodies_of, need_linear, need_own_mesh, need_uncarried
 from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
@@ -42,7 +42,11 @@ def need_bakeable(
     need_relative(garment)
     need_uncarried(garment)
     need_plain_modifiers(garment, simulated=simulated)
-    _need_linear(garment, armature)
+    need_own_mesh(garment)
+    if not need_linear(garment, armature):
+        raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+    for body in bodies_of(garment, armature):  # cloth that lies on one would show through another
+        need_linear(body, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
         bone = armature.data.bones[name]
@@ -137,6 +141,7 @@ def apply_deformation(
     weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
     put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
     _free(armature, joints.proxies)
+    put_away(armature, garment)
     return shapes
 
 
@@ -178,25 +183,7 @@ def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     remove_shapes(garment)
     restore_own_weights(armature, garment)
     _free(armature, proxy_names(armature, garment))
-
-
-def _need_linear(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-    for modifier in garment.modifiers:
-        if modifier.type != "ARMATURE" or modifier.object != armature:
-            continue
-        options = {
-            "Preserve Volume": modifier.use_deform_preserve_volume,
-            "Bone Envelopes": modifier.use_bone_envelopes,
-            "a vertex group": bool(modifier.vertex_group),
-            "Multi Modifier": modifier.use_multi_modifier,
-        }
-        for label, on in options.items():
-            if on:
-                raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' uses {label}; switch that off.")
-        if not modifier.use_vertex_groups:
-            raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' ignores vertex groups.")
-        return
-    raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+    bring_back(armature, garment)
 
 
 def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarment, order: np.ndarray) -> np.ndarray:

@@ -28,7 +28,7 @@ from ..motions.sampling import SampledTake, motion_of, need_company, prepare_tak
 from ..motions.sources import TIMELINE, Source
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
-from ..scene.objects import found_again, scene_rate
+from ..scene.objects import found_again, scene_rate, scene_step
 from .bake import (
     animated,
     apply_deformation,
@@ -120,8 +120,7 @@ class Live:
         return garment.name in scene.objects
 
     def show(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        """Put proxies and shape keys where the garment is in this frame, unless keys do; outside the range it is held.
-        """
+        """Put proxies and shape keys where the garment is in this frame, unless keys do; else it is held."""
         if self.playback is None or not self.is_in(scene):
             return
         garment, armature = self.objects()
@@ -152,11 +151,6 @@ class Live:
         inside = 0 <= index < len(self.placed)
         return not inside or not self._is_as_read(self._placed(armature.evaluated_get(depsgraph)), index)
 
-    def leave(self) -> None:
-        """Remove the keys; the garment stays as it is in this frame."""
-        garment, _ = self.objects()
-        remove_live_keys(garment)
-
     def missing(self) -> bool:
         """Return whether shapes or keys are not there any more, as after an undo."""
         garment, armature = self.objects()
@@ -184,9 +178,7 @@ class Live:
             self.unkeyed = str(error)
             return
         self.unkeyed = ""
-        put_keys(
-            garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True
-        )
+        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
 
     def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
         """Check that nothing that is written to was deleted."""
@@ -214,9 +206,7 @@ class Live:
     def _rolling(
         self, trained: TrainedGarment, placed: np.ndarray, done: float
     ) -> Generator[float, None, tuple[Playback, list[GarmentPose]]]:
-        """Return what plays joints to the world, shape (F, J, 4, 4), with all poses; yield the part that is done, from
-        `done` on.
-        """
+        """Return what plays joints to the world, (F, J, 4, 4), with all poses; yield the part that is done."""
         playback, poses = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK), []
         for pose in playback.poses():
             poses.append(pose)
@@ -282,9 +272,9 @@ def remove_live_keys(garment: bpy.types.Object) -> None:
     remove_keys(garment, [thing for thing in own if not thing.library], live=True)
 
 
-def _times() -> tuple[int, int, float]:
+def _times() -> tuple[int, int, float, float]:
     scene = bpy.context.scene
-    return scene.frame_start, scene.frame_end, scene_rate()
+    return scene.frame_start, scene.frame_end, scene_rate(), scene_step()
 
 
 def _joined(poses: list[GarmentPose]) -> GarmentPose:

@@ -190,8 +190,8 @@ def _compare(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
         if _attempt(uid, played.disagrees, scene, depsgraph):
             garment, armature = played.objects()
             told = (
-                f"Frame {scene.frame_current} was rendered with another pose of '{armature.name}' than '{garment.name}' "
-                "follows; bake it over the frames that you render."
+                f"Frame {scene.frame_current} was rendered with another pose of '{armature.name}' than "
+                f"'{garment.name}' follows; bake it over the frames that you render."
             )
             print(f"SSILK: {told}")
             _warnings[uid] = told
