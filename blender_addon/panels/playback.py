@@ -77,11 +77,11 @@ class BakingPanel(SidebarPanel, bpy.types.Panel):
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
-        if line := overridden_line(context.object):
-            draw_text(layout, line, icon="ERROR")
         layout.operator("ssilk.bake", icon="REC")
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
         layout.operator("ssilk.export_gltf", icon="EXPORT")
         layout.operator("ssilk.remove_bake", icon="TRASH")
         layout.operator("ssilk.hide_covered", icon="HIDE_ON")
         layout.operator("ssilk.show_covered", icon="HIDE_OFF")
+        if line := overridden_line(context.object):
+            draw_text(layout, line, icon="ERROR")

@@ -21,7 +21,7 @@ from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
 from ..motions.keys import Channel, bake_keys, continuous, remove_keys
 from ..scene.armature import bring_back, proxy_names, put_away
-from ..scene.garment import bodies_of, need_linear, need_own_mesh, need_uncarried
+from ..scene.garment import need_linear, need_linear_bodies, need_own_mesh, need_uncarried
 from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
@@ -45,8 +45,7 @@ def need_bakeable(
     need_own_mesh(garment)
     if not need_linear(garment, armature):
         raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
-    for body in bodies_of(garment, armature):  # cloth that lies on one would show through another
-        need_linear(body, armature)
+    need_linear_bodies(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
         bone = armature.data.bones[name]

@@ -257,7 +257,8 @@ def _render_began(scene: bpy.types.Scene, *_: object) -> None:
         while _read() is not None:
             pass
     else:  # the main thread reads, by its timer, while the render waits here
-        _read_soon(0.0)
+        if not bpy.app.timers.is_registered(_read):
+            bpy.app.timers.register(_read)
         while any(uid in _outdated or played.done is not None for uid, played in list(_played.items())):
             time.sleep(BETWEEN)
     _rendering = True

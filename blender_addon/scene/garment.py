@@ -195,6 +195,14 @@ def need_linear(thing: bpy.types.Object, armature: bpy.types.Object) -> bool:
     return False
 
 
+def need_linear_bodies(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    """Raise `SetupError` if Blender shows what a garment collides with elsewhere than linear blend skinning does."""
+    chosen = garment.ssilk.bodies
+    for thing in chosen.all_objects if chosen else bpy.context.view_layer.objects:
+        if thing.type == "MESH" and thing != garment and (chosen or not is_garment(thing)):
+            need_linear(thing, armature)
+
+
 def need_uncarried(thing: bpy.types.Object) -> None:
     """Raise `SetupError` if a bone carries an object that weights are to move."""
     if carrier := carrier_of(thing):

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .scenes import proxies_of
+from .scenes import proxies_of, shown
 
 FRAMES = (3, 17, 18, 36)
 PIXELS = 96
@@ -115,6 +115,7 @@ def test_saved_files_render_alike_with_the_extension_and_without(ready, stage, b
     try:
         ready.ops.wm.open_mainfile(filepath=str(tmp_path / "live.blend"))
         assert away(rendered(ready, tmp_path), baked["sharp"]) < 1e-3
+        assert away(animation(ready, tmp_path), baked["animation"]) < 1e-3
     finally:
         assert addon_utils.enable("blender_addon", default_set=True)
 
@@ -144,6 +145,65 @@ def test_a_frame_that_was_not_read_is_told(ready, stage, tmp_path, capfd):
     rendered(ready, tmp_path)
     assert "Frame 36 was rendered with another pose" in playing.warning(stage)
     assert "Frame 36 was rendered with another pose" in capfd.readouterr().out
+
+
+def test_a_render_in_another_thread_waits_until_the_main_one_has_read(ready, stage):
+    """As beside an unlocked interface: its first frame comes after the keys of what the armature does by now."""
+    import threading
+    import time
+
+    from blender_addon.playback import playing
+
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    live, first = playing.live(stage), playing.live(stage).placed.copy()
+    ready.data.objects["Rig"].animation_data.action = ready.data.actions["Spin Ö"]
+    render = threading.Thread(target=playing._render_began, args=(ready.context.scene,))
+    render.start()
+    time.sleep(0.2)
+    assert render.is_alive() and not playing._rendering
+    while render.is_alive():
+        playing._read()
+        time.sleep(0.001)
+    try:
+        assert playing._rendering and playing._read() == playing.PATIENCE
+        assert not live.stale and np.abs(live.placed - first).max() > 0.1
+    finally:
+        playing._render_ended()
+    spun = shown(ready, stage, range(1, 41))
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    np.testing.assert_allclose(shown(ready, stage, range(1, 41)), spun, atol=2e-5)
+
+
+def test_undo_takes_live_playback_back_and_redo_dresses_again(ready, stage):
+    from blender_addon.playback import playing
+
+    ready.context.preferences.edit.use_global_undo = True
+    ready.ops.ed.undo_push(message="before")
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    ready.ops.ed.undo_push(message="Play Live")
+    right = shown(ready, stage, range(1, 41))
+    ready.ops.ed.undo()
+    garment = ready.data.objects["Skirt"]
+    assert playing.live(garment) is None and not playing.reason(garment)
+    assert not garment.data.shape_keys
+    ready.ops.ed.redo()
+    garment = ready.data.objects["Skirt"]
+    np.testing.assert_allclose(shown(ready, garment, range(1, 41)), right, atol=2e-5)
+
+
+def test_what_an_undo_took_from_a_garment_that_is_played_comes_back(ready, stage):
+    from blender_addon.motions.keys import remove_keys
+    from blender_addon.playback import playing
+    from blender_addon.playback.bake import animated
+    from blender_addon.scene.meshes import remove_shapes
+
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    right = shown(ready, stage, range(1, 41))
+    remove_keys(stage, animated(stage, ready.data.objects["Rig"]))
+    remove_shapes(stage)
+    playing._undone()
+    assert playing.live(stage) and not playing.reason(stage)
+    np.testing.assert_allclose(shown(ready, stage, range(1, 41)), right, atol=2e-5)
 
 
 def test_keys_of_live_playback_go_when_it_stops_and_a_bake_stays(ready, stage):
