@@ -58,9 +58,10 @@ def model_line(garment: bpy.types.Object) -> str:
 
 
 def overridden_line(garment: bpy.types.Object) -> str:
-    """Return what has priority over a garment's baked keys; empty where nothing has, or nothing was baked."""
-    found = overriding(garment, armature_of(garment)) if has_keys(garment) else []
-    return f"Blender does not show the bake: {'; '.join(found)}" if found else ""
+    """Return what has priority over keys that were baked or are played live; empty where nothing has, or none are."""
+    keyed = has_keys(garment) or playing.live(garment)
+    found = overriding(garment, armature_of(garment)) if keyed else []
+    return f"Blender does not show what was baked or is played: {'; '.join(found)}" if found else ""
 
 
 class BakingPanel(SidebarPanel, bpy.types.Panel):
