@@ -162,10 +162,10 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     try:
         return call(*arguments)
     except SsilkError as error:
-        _played.pop(uid, None)
+        played = _played.pop(uid, None)
         _reasons[uid] = str(error)
-        for garment in bpy.data.objects:
-            if garment.session_uid == uid and not _rendering:
+        if played and played.playback and not _rendering:  # else a file's own keys stay, as where it lacks its model
+            for garment in (thing for thing in bpy.data.objects if thing.session_uid == uid):
                 remove_live_keys(garment)
         return None
 

@@ -120,6 +120,23 @@ def test_saved_files_render_alike_with_the_extension_and_without(ready, stage, b
         assert addon_utils.enable("blender_addon", default_set=True)
 
 
+def test_a_file_without_its_model_renders_what_was_played(ready, stage, baked, tmp_path):
+    import shutil
+
+    from blender_addon.playback import playing
+    from blender_addon.playback.models import model_of
+
+    model = shutil.copy(model_of(stage), tmp_path / "model.safetensors")
+    stage.ssilk.model = str(model)
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    ready.ops.wm.save_as_mainfile(filepath=str(tmp_path / "live.blend"), copy=True)
+    (tmp_path / "model.safetensors").unlink()
+    ready.ops.wm.open_mainfile(filepath=str(tmp_path / "live.blend"))
+    garment = ready.data.objects["Skirt"]
+    assert playing.live(garment) is None and "has no model" in playing.reason(garment)
+    assert away(rendered(ready, tmp_path), baked["sharp"]) < 1e-3
+
+
 def test_edits_of_which_nothing_told_are_read_before_the_first_frame(ready, stage, tmp_path):
     """A constraint's target moves, which Blender tells of as of any other object."""
     armature = ready.data.objects["Rig"]
