@@ -14,7 +14,7 @@ from ssilk_core.scene.kinematics import motion_transforms, quaternion_from_matri
 
 from ..arrays.joints import Joints
 from ..scene.objects import scene_rate, scene_units
-from .keys import Channel, new_action
+from .keys import Channel, continuous, new_action
 
 PREFIX = "Demo "  # begins the names of the actions
 FIRST = 1.0  # frame
@@ -65,8 +65,7 @@ def add_action(armature: bpy.types.Object, motion: Motion, channels: list[Channe
 def _channels(name: str, local: np.ndarray, still: float) -> list[Channel]:
     """Return the turns of a bone from its transforms in its own space at rest, (F, 4, 4), and its shifts, if any."""
     turns = quaternion_from_matrix(local[:, :3, :3] / np.cbrt(np.linalg.det(local[:, :3, :3]))[:, None, None])
-    flips = np.where((turns[1:] * turns[:-1]).sum(-1) < 0, -1.0, 1.0)  # the shorter way from key to key
-    turns[1:] *= np.cumprod(flips)[:, None]
+    turns = continuous(turns)
     base = f'pose.bones["{bpy.utils.escape_identifier(name)}"]'
     found = [Channel(f"{base}.rotation_quaternion", axis, name, turns[:, axis]) for axis in range(4)]
     shifts = local[:, :3, 3]

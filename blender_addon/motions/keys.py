@@ -14,8 +14,10 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
+from ..scene.objects import scene_step
 
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
+LIVE = "ssilk_live"  # custom property of one that stands for live playback, until that ends
 SLOTS = hasattr(bpy.types, "ActionSlot")  # since Blender 4.4
 LINEAR = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
 
@@ -42,27 +44,38 @@ def is_baked(action: bpy.types.Action, garment: bpy.types.Object | None = None) 
     return baked and (garment is None or action[OWNER] == garment)
 
 
+def is_live(action: bpy.types.Action) -> bool:
+    """Return whether an action stands for live playback."""
+    return LIVE in action.keys()  # noqa: SIM118 (no dictionary)
+
+
 def has_keys(garment: bpy.types.Object) -> bool:
     """Return whether anything was baked for a garment."""
-    return any(is_baked(action, garment) for action in bpy.data.actions)
+    return any(is_baked(action, garment) and not is_live(action) for action in bpy.data.actions)
 
 
-def curves_of(action: bpy.types.Action) -> Iterator[bpy.types.FCurve]:
-    """Yield the F-curves of all slots."""
+def has_live_keys(garment: bpy.types.Object, things: Sequence[Any]) -> bool:
+    """Return whether keys of live playback are on tracks of each of these objects and shape keys."""
+    return all(_tracks(thing, garment, live=True) for thing in things)
+
+
+def curves_of(action: bpy.types.Action, slot: Any = None) -> Iterator[bpy.types.FCurve]:
+    """Yield the F-curves of all slots, or of one."""
     if not SLOTS:
         yield from action.fcurves
         return
     for layer in action.layers:
         for strip in layer.strips:
             for bag in strip.channelbags:
-                yield from bag.fcurves
+                if slot is None or bag.slot_handle == slot.handle:
+                    yield from bag.fcurves
 
 
 def need_tracks(things: Sequence[Any]) -> None:
     """Check that tracks can be added to the animation of objects and shape keys.
 
     Raises:
-        SetupError: one is in tweak mode, or its tracks are switched off.
+        SetupError: one is in tweak mode, a track is solo, or all are switched off.
     """
     for thing in things:
         animation = thing.animation_data
@@ -73,9 +86,17 @@ def need_tracks(things: Sequence[Any]) -> None:
             off = len(animation.nla_tracks) and not animation.use_nla
             if off:
                 raise SetupError(f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
+            solo = next((track for track in animation.nla_tracks if track.is_solo), None)
+            if solo:
+                raise SetupError(
+                    f"The NLA track '{solo.name}' of {name} is solo, so that baked keys would not show; "
+                    "switch its star off in the NLA editor."
+                )
 
 
-def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]]) -> None:
+def bake_keys(
+    garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, Sequence[Channel]]], *, live: bool = False
+) -> None:
     """Put keys in place of those that were baked for a garment before.
 
     They lie on tracks of their own, beneath the action in which the artist animates; older ones keep their place.
@@ -83,22 +104,25 @@ def bake_keys(garment: bpy.types.Object, start: int, moved: Sequence[tuple[Any, 
     Args:
         start: the first frame.
         moved: objects or shape keys, each with what moves on it, which may be nothing.
+        live: whether they stand for live playback; those of a bake stay beneath them.
     """
     for thing, channels in moved:
         if not channels:
-            _remove_tracks(thing, garment)
+            _remove_tracks(thing, garment, live)
     moving = [(thing, channels) for thing, channels in moved if channels]
-    tracks = [_cleared_track(thing, garment) for thing, _ in moving]
-    _remove_actions(garment)
-    action = None
+    tracks = [_cleared_track(thing, garment, live) for thing, _ in moving]
+    _remove_actions(garment, live)
+    action, step = None, scene_step()
     for track, (thing, channels) in zip(tracks, moving):
         if action is None or not SLOTS:
-            action = bpy.data.actions.new(f"SSILK {garment.name}")
+            action = bpy.data.actions.new(track.name)
             action[OWNER] = garment
+            if live:
+                action[LIVE] = True
         bag = _Bag(action, thing)
         for channel in channels:
-            _write(bag.new_curve(channel), start, channel.values)
-        bag.play_on(track, start, start + len(channels[0].values) - 1)
+            _write(bag.new_curve(channel), start * step, channel.values, step)
+        bag.play_on(track, start * step, (start + len(channels[0].values) - 1) * step)
 
 
 def new_action(name: str, thing: Any, start: float, step: float, channels: Sequence[Channel]) -> bpy.types.Action:
@@ -115,40 +139,58 @@ def new_action(name: str, thing: Any, start: float, step: float, channels: Seque
     return action
 
 
-def remove_keys(garment: bpy.types.Object, things: Sequence[Any]) -> None:
-    """Remove what was baked for a garment from the animation of objects and shape keys."""
+def remove_keys(garment: bpy.types.Object, things: Sequence[Any], *, live: bool | None = None) -> None:
+    """Remove what was baked for a garment from the animation of objects and shape keys.
+
+    Args:
+        live: whether to remove what stands for live playback, or all but that; None for everything.
+    """
     for thing in things:
-        _remove_tracks(thing, garment)
-    _remove_actions(garment)
+        _remove_tracks(thing, garment, live)
+    _remove_actions(garment, live)
 
 
-def _remove_tracks(thing: Any, garment: bpy.types.Object) -> None:
-    for track in _tracks(thing, garment):
+def _is_of(action: bpy.types.Action | None, garment: bpy.types.Object, live: bool | None) -> bool:
+    return bool(action and is_baked(action, garment)) and live in (None, is_live(action))
+
+
+def _remove_tracks(thing: Any, garment: bpy.types.Object, live: bool | None) -> None:
+    for track in _tracks(thing, garment, live):
         thing.animation_data.nla_tracks.remove(track)
 
 
-def _tracks(thing: Any, garment: bpy.types.Object) -> list[bpy.types.NlaTrack]:
+def _tracks(thing: Any, garment: bpy.types.Object, live: bool | None) -> list[bpy.types.NlaTrack]:
     """Return the tracks on which something plays that was baked for a garment."""
     tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
-    return [t for t in tracks if any(strip.action and is_baked(strip.action, garment) for strip in t.strips)]
+    return [track for track in tracks if any(_is_of(strip.action, garment, live) for strip in track.strips)]
 
 
-def _cleared_track(thing: Any, garment: bpy.types.Object) -> bpy.types.NlaTrack:
+def _cleared_track(thing: Any, garment: bpy.types.Object, live: bool) -> bpy.types.NlaTrack:
     """Return the garment's track of a thing, made if there is none, without what was baked."""
-    found = _tracks(thing, garment)
+    found = _tracks(thing, garment, live)
     if not found:
         track = thing.animation_data_create().nla_tracks.new()
-        track.name = f"SSILK {garment.name}"
+        track.name = f"SSILK {garment.name}{' live' if live else ''}"
         return track
     for strip in list(found[0].strips):
-        if strip.action and is_baked(strip.action, garment):
+        if _is_of(strip.action, garment, live):
             found[0].strips.remove(strip)
     return found[0]
 
 
-def _remove_actions(garment: bpy.types.Object) -> None:
-    for action in [action for action in bpy.data.actions if is_baked(action, garment)]:
+def _remove_actions(garment: bpy.types.Object, live: bool | None) -> None:
+    for action in [action for action in bpy.data.actions if _is_of(action, garment, live)]:
         bpy.data.actions.remove(action)
+
+
+def continuous(turns: np.ndarray) -> np.ndarray:
+    """Return rotations with signs that are nearest from frame to frame: Blender interpolates numbers between keys.
+
+    Args:
+        turns: unit quaternions (w, x, y, z), shape (F, ..., 4).
+    """
+    flips = np.where((turns[1:] * turns[:-1]).sum(-1) < 0, -1.0, 1.0)
+    return np.concatenate([turns[:1], turns[1:] * np.cumprod(flips, axis=0)[..., None]])
 
 
 class _Bag:
@@ -169,9 +211,9 @@ class _Bag:
         curve.group = self.bag.groups.get(channel.group) or self.bag.groups.new(channel.group)
         return curve
 
-    def play_on(self, track: bpy.types.NlaTrack, start: int, end: int) -> None:
+    def play_on(self, track: bpy.types.NlaTrack, start: float, end: float) -> None:
         """Play the curves on a track, frame by frame where their keys are."""
-        strip = track.strips.new(self.action.name, start, self.action)
+        strip = track.strips.new(self.action.name, round(start), self.action)
         strip.action_frame_start, strip.action_frame_end = start, end
         strip.frame_start, strip.frame_end = start, max(end, start + 1)
         if SLOTS:

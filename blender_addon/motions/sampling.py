@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The motion of an armature, sampled as Blender evaluates it with constraints and drivers, a little at a time.
 
-Each slice of time uses a temporary scene that holds the armature alone. So nothing of the artist's scene is evaluated
-or moved, and nothing is left behind if the artist saves or undoes in between. `ChosenMotions` are those of a
-training, sampled here or read from USD files.
+Each slice of time uses a temporary scene that holds the armature alone, where nothing reads the artist's. So nothing
+of that is evaluated or moved, and nothing is left behind if the artist saves or undoes in between. `ChosenMotions`
+are those of a training, sampled here or read from USD files.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from ..scene.armature import leader_of
 from ..scene.gather import ROOT
 from ..scene.handover import MOTIONS, loading_usd
 from ..scene.objects import found_again, scene_rate, scene_units
+from .evaluating import evaluating
 from .sources import FILE, Source, frames_of, playing
 
 SLICE = 0.04  # seconds that Blender waits for us at a time
@@ -115,25 +115,14 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: SampledTake)
         raise SetupError(f"'{armature.name}' lost the bone '{lost[0]}' meanwhile; begin again.")
     columns = [armature.pose.bones.find(name) for name in joints.names]
     until = time.monotonic() + SLICE
-    with playing(leader_of(armature), take.source), _alone(armature) as scene:
+    with playing(leader_of(armature), take.source), evaluating(armature) as frames:
         while True:
             frame = take.frames[len(take.worlds)]
-            scene.frame_set(frame)
-            evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
+            evaluated = armature.evaluated_get(frames(frame))
             take.placements.append(np.array(evaluated.matrix_world))
             take.worlds.append(_rigid(worlds(evaluated)[columns], joints, take.source.name, frame))
             if take.complete or time.monotonic() > until:
                 return
-
-
-@contextmanager
-def _alone(armature: bpy.types.Object) -> Iterator[bpy.types.Scene]:
-    scene = bpy.data.scenes.new("SSILK")
-    try:
-        scene.collection.objects.link(armature)
-        yield scene
-    finally:
-        bpy.data.scenes.remove(scene)
 
 
 def worlds(armature: bpy.types.Object) -> np.ndarray:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import bpy
 
@@ -40,12 +41,13 @@ def sources(armature: bpy.types.Object) -> list[Source]:
     """Return all motions of an armature except baked ones; a strip that plays an action as it is counts as that."""
     if armature.library:  # of which nothing can be changed, not even for a moment
         return [Source(TIMELINE, "Timeline")]
-    bones = set(armature.pose.bones.keys())
-    actions = [action for action in bpy.data.actions if not is_baked(action) and _moves(action, bones)]
+    actions = [action for action in bpy.data.actions if not is_baked(action) and _is_for(armature, action)]
     tracks = armature.animation_data.nla_tracks if armature.animation_data else ()
     strips = [(track, strip) for track in tracks for strip in track.strips]
     own = [(track, strip) for track, strip in strips if not (strip.action and is_baked(strip.action))]
-    own = [(track, strip) for track, strip in own if not (strip.action in actions and _plays_as_it_is(strip))]
+    own = [
+        (track, strip) for track, strip in own if not (strip.action in actions and _plays_as_it_is(armature, strip))
+    ]
     return [
         Source(TIMELINE, "Timeline"),
         *(Source(ACTION, action.name) for action in actions),
@@ -77,7 +79,7 @@ def frames_of(armature: bpy.types.Object, source: Source) -> range:
     if source.kind == TIMELINE:
         return range(bpy.context.scene.frame_start, bpy.context.scene.frame_end + 1)
     if source.kind == ACTION:
-        first, last = _action(source).frame_range
+        first, last = _range(_action(source), slot_of(armature, _action(source)))
     else:
         strip = _strip(armature, source)
         first, last = strip.frame_start, strip.frame_end
@@ -102,7 +104,7 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
     try:
         if source.kind == ACTION:
             animation.use_nla = False
-            assign(animation, _action(source))
+            assign(animation, _action(source), slot_of(armature, _action(source)))
         else:
             _play_alone(animation, _strip(armature, source))
         yield
@@ -114,13 +116,73 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
             armature.animation_data_clear()
 
 
-def _moves(action: bpy.types.Action, bones: set[str]) -> bool:
-    return any(_bone(curve.data_path) in bones for curve in curves_of(action))
+def slot_of(armature: bpy.types.Object, action: bpy.types.Action) -> Any:
+    """Return the slot of an action that is an armature's own; None where actions have none, or none moves its bones.
+
+    What the armature plays says it, then what of its tracks do: names of slots stay as they were where objects are
+    renamed, appended or copied. A slot that other objects use alone is theirs.
+
+    Raises:
+        SetupError: several slots could be meant.
+    """
+    candidates = _slots_for(armature, action)
+    if len(candidates) < 2:
+        return candidates[0] if candidates else None
+    animation = armature.animation_data
+    strips = [strip for track in animation.nla_tracks for strip in track.strips] if animation else []
+    for player in [animation, *strips] if animation else ():
+        if player.action == action and player.action_slot in candidates:
+            return player.action_slot
+    own = [slot for slot in candidates if armature in slot.users() or not slot.users()]
+    last = animation.last_slot_identifier if animation else ""
+    for wanted in (last, f"OB{armature.name}"):
+        found = [slot for slot in own if slot.identifier == wanted]
+        if found:
+            return found[0]
+    if len(own) == 1:
+        return own[0]
+    names = ", ".join(f"'{slot.name_display}'" for slot in candidates)
+    raise SetupError(
+        f"The action '{action.name}' has the slots {names}, and none is told to be of '{armature.name}'; give "
+        f"'{armature.name}' this action and its slot once, or make it a strip."
+    )
 
 
-def _plays_as_it_is(strip: bpy.types.NlaStrip) -> bool:
+def _slots_for(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any]:
+    """Return the slots of an action that move bones of an armature."""
+    if not SLOTS:
+        return []
+    kinds = ("OBJECT", "UNSPECIFIED")
+    return [slot for slot in action.slots if slot.target_id_type in kinds and _moves(action, armature, slot)]
+
+
+def _is_for(armature: bpy.types.Object, action: bpy.types.Action) -> bool:
+    """Return whether an action moves an armature; not where it is of several others, each with a slot of its own."""
+    if not SLOTS:
+        return _moves(action, armature, None)
+    slots = _slots_for(armature, action)
+    return len(slots) == 1 or any(armature in slot.users() or not slot.users() for slot in slots)
+
+
+def _moves(action: bpy.types.Action, armature: bpy.types.Object, slot: Any) -> bool:
+    bones = armature.pose.bones
+    return any(_bone(curve.data_path) in bones for curve in curves_of(action, slot))
+
+
+def _range(action: bpy.types.Action, slot: Any) -> tuple[float, float]:
+    """Return the first and the last frame of an action, or of what one of its slots holds."""
+    ends = [curve.range() for curve in curves_of(action, slot)] if slot and len(action.slots) > 1 else []
+    if action.use_frame_range or not ends:
+        return tuple(action.frame_range)
+    return min(first for first, _ in ends), max(last for _, last in ends)
+
+
+def _plays_as_it_is(armature: bpy.types.Object, strip: bpy.types.NlaStrip) -> bool:
     """Return whether a strip plays the whole of its action, once, forwards, at its own speed, and in full."""
-    whole = (strip.action_frame_start, strip.action_frame_end) == tuple(strip.action.frame_range)
+    slot = slot_of(armature, strip.action)
+    if slot and strip.action_slot != slot:
+        return False
+    whole = (strip.action_frame_start, strip.action_frame_end) == tuple(_range(strip.action, slot))
     plain = (strip.scale, strip.repeat) == (1.0, 1.0) and strip.blend_type == "REPLACE"
     changed = strip.use_reverse or strip.use_animated_influence or strip.use_animated_time or strip.modifiers
     faded = strip.blend_in or strip.blend_out or strip.use_auto_blend
@@ -147,10 +209,12 @@ def _strip(armature: bpy.types.Object, source: Source) -> bpy.types.NlaStrip:
         raise SetupError(text) from error
 
 
-def assign(animation: bpy.types.AnimData, action: bpy.types.Action) -> None:
-    """Play an action, by the slot that suits."""
+def assign(animation: bpy.types.AnimData, action: bpy.types.Action, slot: Any = None) -> None:
+    """Play an action by one of its slots, by one that suits where none is given."""
     animation.action = action
-    if SLOTS and animation.action_slot is None and animation.action_suitable_slots:
+    if slot:
+        animation.action_slot = slot
+    elif SLOTS and animation.action_slot is None and animation.action_suitable_slots:
         animation.action_slot = animation.action_suitable_slots[0]
 
 

@@ -28,6 +28,7 @@ from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.models import model_of, no_model
+from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
 from ..scene.classes import current_classes
@@ -99,7 +100,10 @@ class TimelineOperator(tasks.OutsideOperator):
         order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
         left = int(np.count_nonzero(order < 0))
         still = f" ({left} proxies are not in it and stay at rest)" if left else ""
-        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}"
+        overridden = told(garment, armature, joints, self.baked)
+        self.level = "WARNING" if overridden else "INFO"
+        said = f", {overridden}" if overridden else ""
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{said}"
 
 
 class BakeGarment(TimelineOperator, bpy.types.Operator):

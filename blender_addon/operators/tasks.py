@@ -26,6 +26,7 @@ class OutsideOperator(RefusingOperator):
     """
 
     undo = ""
+    level = "INFO"  # of the report at the end; "WARNING" where something besides the work is wrong
     work: Work | None = None
     timer: bpy.types.Timer | None = None
 
@@ -97,7 +98,8 @@ class OutsideOperator(RefusingOperator):
             reason = work.error and self.explain(work)
             if reason:
                 raise SetupError(reason)
-            self.report({"INFO"}, self.finish(context, work))
+            sentence = self.finish(context, work)
+            self.report({self.level}, sentence)
         except SsilkError as error:
             failed = "" if work.cancelled else str(error)
             self.report({"WARNING" if work.cancelled else "ERROR"}, str(error))

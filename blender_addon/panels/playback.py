@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import bpy
 
+from ..motions.keys import has_keys
 from ..playback import playing
 from ..playback.models import no_model
+from ..playback.overrides import overriding
+from ..scene.garment import armature_of
 from .base import UsableGarmentPanel, draw_text, saying_errors
 
 
@@ -17,7 +20,13 @@ def live_line(garment: bpy.types.Object) -> str:
         return playing.reason(garment)
     if played.done is not None:
         return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
-    return "The motion changed since it was read" if played.stale else "Follows the armature"
+    if played.behind:
+        return "The frame range or the rate changed since the motion was read"
+    if played.unkeyed:
+        return f"Renders lack it: {played.unkeyed}"
+    if played.stale:
+        return "The motion changed since it was read"
+    return playing.warning(garment) or "Follows the armature"
 
 
 class PlaybackPanel(UsableGarmentPanel, bpy.types.Panel):
@@ -35,13 +44,20 @@ class PlaybackPanel(UsableGarmentPanel, bpy.types.Panel):
         else:
             layout.operator("ssilk.play_live", icon="PLAY")
         if line:
-            layout.label(text=line)
+            draw_text(layout, line)
 
 
 def model_line(garment: bpy.types.Object) -> str:
     """Return which model is baked, or why there is none."""
     own = "Bakes the chosen model" if garment.ssilk.model else "Bakes the best model of its training"
     return no_model(garment) or own
+
+
+def overridden_line(garment: bpy.types.Object) -> str:
+    """Return what has priority over keys that were baked or are played live; empty where nothing has, or none are."""
+    keyed = has_keys(garment) or playing.live(garment)
+    found = overriding(garment, armature_of(garment)) if keyed else []
+    return f"Blender does not show what was baked or is played: {'; '.join(found)}" if found else ""
 
 
 class BakingPanel(UsableGarmentPanel, bpy.types.Panel):
@@ -60,3 +76,5 @@ class BakingPanel(UsableGarmentPanel, bpy.types.Panel):
         layout.operator("ssilk.remove_bake", icon="TRASH")
         layout.operator("ssilk.hide_covered", icon="HIDE_ON")
         layout.operator("ssilk.show_covered", icon="HIDE_OFF")
+        if line := overridden_line(context.object):
+            draw_text(layout, line, icon="ERROR")

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from ssilk_usd.shots.skinned import BakedGarment, SkinnedGarment
 
+from ssilk_core.scene.assets import GarmentPose
 from ssilk_core.scene.kinematics import (
     local_transforms,
     matrix_from_quaternion,
@@ -18,9 +19,9 @@ from ssilk_core.scene.kinematics import (
 
 from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
-from ..motions.keys import Channel, bake_keys, remove_keys
-from ..scene.armature import proxy_names
-from ..scene.garment import need_uncarried
+from ..motions.keys import Channel, bake_keys, continuous, remove_keys
+from ..scene.armature import bring_back, proxy_names, put_away
+from ..scene.garment import need_linear, need_linear_bodies, need_own_mesh, need_uncarried
 from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
@@ -41,7 +42,10 @@ def need_bakeable(
     need_relative(garment)
     need_uncarried(garment)
     need_plain_modifiers(garment, simulated=simulated)
-    _need_linear(garment, armature)
+    need_own_mesh(garment)
+    if not need_linear(garment, armature):
+        raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+    need_linear_bodies(garment, armature)
     names = joints.names
     for name, parent in list(zip(names, joints.parents))[joints.character_count :]:
         bone = armature.data.bones[name]
@@ -80,18 +84,39 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     if baked.pose.translations is not None:  # before anything changes
         need_movable(armature, [joints.proxies[index] for index in np.flatnonzero(there)])
     shapes = apply_deformation(garment, armature, joints, baked.garment, order)
-    rotations = np.tile(rest_rotations(joints), (baked.pose.frame_count, 1, 1))
-    rotations[:, there] = baked.pose.rotations[:, proxies[there]]
-    channels = _channels(joints.proxies, "rotation_quaternion", turns_from_rest(joints, rotations))
-    if baked.pose.translations is not None:
-        places = np.tile(_rest_places(joints), (baked.pose.frame_count, 1, 1))
-        places[:, there] = baked.pose.translations[:, proxies[there]]
+    put_keys(garment, armature, joints, proxies, shapes, baked.pose, round(baked.start))
+
+
+def put_keys(
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    joints: Joints,
+    proxies: np.ndarray,
+    shapes: Sequence[str],
+    pose: GarmentPose,
+    start: int,
+    *,
+    live: bool = False,
+) -> None:
+    """Put poses of a garment as keys onto its proxies and shape keys.
+
+    Args:
+        proxies: where each proxy stands among those of the poses, -1 for none, shape (P,).
+        shapes: the shape keys, as the poses weigh them.
+        start: the first frame.
+        live: whether they stand for live playback.
+    """
+    there = proxies >= 0
+    rotations = np.tile(rest_rotations(joints), (pose.frame_count, 1, 1))
+    rotations[:, there] = pose.rotations[:, proxies[there]]
+    turns = continuous(turns_from_rest(joints, rotations))
+    channels = _channels(joints.proxies, "rotation_quaternion", turns)
+    if pose.translations is not None:
+        places = np.tile(_rest_places(joints), (pose.frame_count, 1, 1))
+        places[:, there] = pose.translations[:, proxies[there]]
         channels += _channels(joints.proxies, "location", shifts_from_rest(armature, joints, places))
-    moved = [
-        (armature, channels),
-        (garment.data.shape_keys, _weight_channels(shapes, baked.pose.weights)),
-    ]
-    bake_keys(garment, round(baked.start), [(thing, channels) for thing, channels in moved if thing])
+    moved = [(armature, channels), (garment.data.shape_keys, _weight_channels(shapes, pose.weights))]
+    bake_keys(garment, start, [(thing, channels) for thing, channels in moved if thing], live=live)
 
 
 def apply_deformation(
@@ -115,6 +140,7 @@ def apply_deformation(
     weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
     put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
     _free(armature, joints.proxies)
+    put_away(armature, garment)
     return shapes
 
 
@@ -156,25 +182,7 @@ def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     remove_shapes(garment)
     restore_own_weights(armature, garment)
     _free(armature, proxy_names(armature, garment))
-
-
-def _need_linear(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-    for modifier in garment.modifiers:
-        if modifier.type != "ARMATURE" or modifier.object != armature:
-            continue
-        options = {
-            "Preserve Volume": modifier.use_deform_preserve_volume,
-            "Bone Envelopes": modifier.use_bone_envelopes,
-            "a vertex group": bool(modifier.vertex_group),
-            "Multi Modifier": modifier.use_multi_modifier,
-        }
-        for label, on in options.items():
-            if on:
-                raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' uses {label}; switch that off.")
-        if not modifier.use_vertex_groups:
-            raise SetupError(f"The modifier '{modifier.name}' of '{garment.name}' ignores vertex groups.")
-        return
-    raise SetupError(f"'{garment.name}' has no Armature modifier for '{armature.name}'; generate its rig.")
+    bring_back(armature, garment)
 
 
 def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarment, order: np.ndarray) -> np.ndarray:

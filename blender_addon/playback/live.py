@@ -4,6 +4,10 @@
 The armature's motion over the scene's frames is read once, a little at a time. Latents are rolled out in blocks, as
 far as frames are shown, and kept. A frame therefore looks the same whether it was scrubbed or played to. Where the
 armature differs from what was read, latents are kept up to that frame and rolled out again from there.
+
+What was rolled out stands as keys on tracks of its own while it is played. Every evaluation of the file reads these:
+renders with an unlocked interface, in other scenes and on farms. Only what differs from them by an edit is written
+frame by frame, in the viewport, until the motion is read again.
 """
 
 from __future__ import annotations
@@ -16,15 +20,24 @@ import numpy as np
 from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ssilk_core.network.runtime import Playback
-from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.assets import GarmentPose, Motion
 
 from ..errors import SetupError
+from ..motions.keys import has_live_keys, need_tracks, remove_keys
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
 from ..motions.sources import TIMELINE, Source
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
-from ..scene.objects import found_again
-from .bake import apply_deformation, need_bakeable, need_movable, shifts_from_rest, turns_from_rest
+from ..scene.objects import found_again, scene_rate, scene_step
+from .bake import (
+    animated,
+    apply_deformation,
+    need_bakeable,
+    need_movable,
+    put_keys,
+    shifts_from_rest,
+    turns_from_rest,
+)
 from .models import TrainedGarment
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
@@ -39,6 +52,7 @@ class Live:
     Attributes:
         done: the part of the motion that was read; None when there is nothing to read.
         stale: whether the armature does something else by now than what was read.
+        unkeyed: why what is played stands not as keys, so that renders lack it; empty where it does.
         model_only: whether a newer model is read, for the motion that was read before.
 
     Raises:
@@ -54,13 +68,14 @@ class Live:
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.done: float | None = None
         self.stale = self.model_only = False
+        self.unkeyed = ""
         self.refresh()
 
     def refresh(self) -> None:
         """Read the motion again; the old one is played until that is done."""
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self._steps = self._reading(take)
+        self._steps, self.times = self._reading(take), _times()
         self.done, self.stale, self.model_only = 0.0, False, False
 
     def take_up(self) -> None:
@@ -74,6 +89,11 @@ class Live:
     def renewed(self) -> bool:
         """Whether the model was written since it was read, as by a training that goes on."""
         return _written(self.model) not in (0.0, self._written)
+
+    @property
+    def behind(self) -> bool:
+        """Whether the scene's frames or its rate are others by now than those that were read."""
+        return self.times != _times()
 
     def read(self) -> bool:
         """Read a little of the model, then of the motion; return whether there is more.
@@ -100,15 +120,17 @@ class Live:
         return garment.name in scene.objects
 
     def show(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-        """Put proxies and shape keys where the garment is in this frame; what lies outside the range is held."""
+        """Put proxies and shape keys where the garment is in this frame, unless keys do; else it is held."""
         if self.playback is None or not self.is_in(scene):
             return
         garment, armature = self.objects()
+        self._need_all(garment, armature)
         index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
+        if not self.stale and not self.unkeyed:
+            return
         pose = self.playback.pose(index)
-        self._need_all(garment, armature)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
@@ -120,13 +142,54 @@ class Live:
         for name, weight in zip(self.shapes, pose.weights[0].tolist()):
             blocks[name].value = weight
 
+    def disagrees(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> bool:
+        """Return whether an evaluated frame shows another pose than what was read, or none that was."""
+        if self.playback is None or not self.is_in(scene):
+            return False
+        _, armature = self.objects()
+        index = scene.frame_current - self.first
+        inside = 0 <= index < len(self.placed)
+        return not inside or not self._is_as_read(self._placed(armature.evaluated_get(depsgraph)), index)
+
+    def missing(self) -> bool:
+        """Return whether shapes or keys are not there any more, as after an undo."""
+        garment, armature = self.objects()
+        if self.playback is None:
+            return False
+        return bool(self._lost(garment, armature)) or not (
+            self.unkeyed or has_live_keys(garment, self._moved(garment, armature))
+        )
+
+    def dress_again(self) -> None:
+        """Give the garment its shapes, weights and keys once more."""
+        self.trained = self.playback = None
+        self.refresh()
+
+    def _moved(self, garment: bpy.types.Object, armature: bpy.types.Object) -> list[object]:
+        keys = garment.data.shape_keys
+        return [armature, *([keys] if self.shapes and keys else [])]
+
+    def _key(self, poses: list[GarmentPose], first: int) -> None:
+        """Let keys show what was rolled out."""
+        garment, armature = self.objects()
+        try:
+            need_tracks(animated(garment, armature))
+        except SetupError as error:  # the artist tweaks a strip: it is played nevertheless
+            self.unkeyed = str(error)
+            return
+        self.unkeyed = ""
+        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
+
     def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
         """Check that nothing that is written to was deleted."""
-        keys = garment.data.shape_keys
-        lost = [name for name in self.joints.names if name not in armature.pose.bones]
-        lost += [name for name in self.shapes if not keys or name not in keys.key_blocks]
+        lost = self._lost(garment, armature)
         if lost:
             raise SetupError(f"'{lost[0]}' was deleted while '{garment.name}' was played; play it again.")
+
+    def _lost(self, garment: bpy.types.Object, armature: bpy.types.Object) -> list[str]:
+        keys = garment.data.shape_keys
+        lost = [name for name in self.joints.names if name not in armature.pose.bones]
+        return lost + [name for name in self.shapes if not keys or name not in keys.key_blocks]
 
     def _reading(self, take: SampledTake) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
@@ -136,16 +199,19 @@ class Live:
         yield from (READING * done for done in sample(armature, self.joints.character, [take]))
         need_company(*self.objects(), take)
         placed = np.array(take.worlds)
-        playback = yield from self._rolling(self.trained, placed, READING)
+        playback, poses = yield from self._rolling(self.trained, placed, READING)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
+        self._key(poses, self.first)
 
-    def _rolling(self, trained: TrainedGarment, placed: np.ndarray, done: float) -> Generator[float, None, Playback]:
-        """Return what plays joints to the world, shape (F, J, 4, 4); yield the part that is done, from `done` on."""
-        playback = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK)
-        for frame in range(0, len(placed), BLOCK):
-            playback.pose(frame)
-            yield done + (1 - done) * frame / len(placed)
-        return playback
+    def _rolling(
+        self, trained: TrainedGarment, placed: np.ndarray, done: float
+    ) -> Generator[float, None, tuple[Playback, list[GarmentPose]]]:
+        """Return what plays joints to the world, (F, J, 4, 4), with all poses; yield the part that is done."""
+        playback, poses = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK), []
+        for pose in playback.poses():
+            poses.append(pose)
+            yield done + (1 - done) * pose.start / len(placed)
+        return playback, poses
 
     def _trained(self) -> TrainedGarment:
         """Read the model, and check that the bones move as it says."""
@@ -159,7 +225,7 @@ class Live:
         written, trained, placed = _written(self.model), self._trained(), self.placed.copy()
         yield 0.0
         skinned = SkinnedGarment.of(trained.player.deformer())
-        playback = yield from self._rolling(trained, placed, 0.0)
+        playback, poses = yield from self._rolling(trained, placed, 0.0)
         garment, armature = self.objects()
         if not self.ready():  # the artist edits it; the model is still a new one afterwards
             return
@@ -168,6 +234,7 @@ class Live:
             playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback, self._written = trained, playback, written
+        self._key(poses, self.first)
 
     def _dressing(self) -> Iterator[float]:
         """Read the model and give the garment its shapes and weights; it is held until it is played by them."""
@@ -185,12 +252,40 @@ class Live:
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
         """Roll out again from a pose that differs from the one that was read."""
-        bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
-        placed = worlds(armature)[bones]
-        if np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED):
+        placed = self._placed(armature)
+        if self._is_as_read(placed, index):
             return
         self.placed[index] = placed
         self.playback, self.stale = self.playback.with_motion(_motion(self.trained, self.placed), index), True
+
+    def _placed(self, armature: bpy.types.Object) -> np.ndarray:
+        bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
+        return worlds(armature)[bones]
+
+    def _is_as_read(self, placed: np.ndarray, index: int) -> bool:
+        return bool(np.allclose(placed, self.placed[index], rtol=MOVED, atol=MOVED))
+
+
+def remove_live_keys(garment: bpy.types.Object) -> None:
+    """Remove the keys that stand for live playback of a garment, wherever they are."""
+    own = (thing for things in (bpy.data.objects, bpy.data.shape_keys) for thing in things)
+    remove_keys(garment, [thing for thing in own if not thing.library], live=True)
+
+
+def _times() -> tuple[int, int, float, float]:
+    scene = bpy.context.scene
+    return scene.frame_start, scene.frame_end, scene_rate(), scene_step()
+
+
+def _joined(poses: list[GarmentPose]) -> GarmentPose:
+    """Return consecutive poses as one."""
+    moved = [pose.translations for pose in poses]
+    return GarmentPose(
+        poses[0].start,
+        np.concatenate([pose.rotations for pose in poses]),
+        np.concatenate([pose.weights for pose in poses]),
+        None if moved[0] is None else np.concatenate(moved),
+    )
 
 
 def _motion(trained: TrainedGarment, placed: np.ndarray) -> Motion:

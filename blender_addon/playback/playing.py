@@ -1,25 +1,31 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The garments that are played live, and the handlers that update them on frame changes, loading and rendering.
 
-Nothing is written while Blender renders in another thread and its interface is not locked: both would write at once.
+A render reads the keys that stand for what is played. The motion is therefore read again before its first frame, in
+the main thread, and nothing is written from then on until it ends: Blender may render in another thread.
 """
 
 from __future__ import annotations
+
+import threading
+import time
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ssilk_core.errors import SsilkError
 
+from ..motions.keys import is_baked
 from ..outside.jobs import MODEL, read_state
 from ..scene import overlay
-from .live import Live
+from .live import Live, remove_live_keys
 from .models import job_of, model_of
 
 PATIENCE = 0.3  # seconds after an edit before the motion is read again
 BETWEEN = 0.01  # seconds between two slices of reading, for the artist
 _played: dict[int, Live] = {}
 _reasons: dict[int, str] = {}
+_warnings: dict[int, str] = {}  # about frames of the latest render
 _outdated: set[int] = set()  # those whose keys were edited since their motion was read
 _rendering = False
 
@@ -32,6 +38,11 @@ def live(garment: bpy.types.Object) -> Live | None:
 def reason(garment: bpy.types.Object) -> str:
     """Return why a garment is no longer played; empty if nothing went wrong."""
     return _reasons.get(garment.session_uid, "")
+
+
+def warning(garment: bpy.types.Object) -> str:
+    """Return what was wrong with the latest render of a garment that is played; empty if nothing was."""
+    return _warnings.get(garment.session_uid, "")
 
 
 def play(garment: bpy.types.Object) -> None:
@@ -50,6 +61,7 @@ def play(garment: bpy.types.Object) -> None:
 def stop(garment: bpy.types.Object) -> None:
     """Play a garment no longer; it stays as it is."""
     _played.pop(garment.session_uid, None)
+    remove_live_keys(garment)
     garment.ssilk.live = False
 
 
@@ -102,7 +114,7 @@ def stop_listening() -> None:
 
 
 def _forget() -> None:
-    for known in (_played, _reasons, _outdated):
+    for known in (_played, _reasons, _warnings, _outdated):
         known.clear()
 
 
@@ -112,6 +124,8 @@ def _handlers() -> list[tuple[list, object]]:
         (calls.frame_change_post, _frame_changed),
         (calls.depsgraph_update_post, _edited),
         (calls.load_post, _loaded),
+        (calls.undo_post, _undone),
+        (calls.redo_post, _undone),
         (calls.render_init, _render_began),
         (calls.render_complete, _render_ended),
         (calls.render_cancel, _render_ended),
@@ -129,6 +143,8 @@ def _read_soon(seconds: float) -> None:
 
 def _read() -> float | None:
     """Read a little of one motion; return when to be called again."""
+    if _rendering:
+        return PATIENCE
     for uid, played in list(_played.items()):
         if uid in _outdated:
             _outdated.discard(uid)
@@ -146,34 +162,78 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     try:
         return call(*arguments)
     except SsilkError as error:
-        _played.pop(uid, None)
+        played = _played.pop(uid, None)
         _reasons[uid] = str(error)
+        if played and played.playback and not _rendering:  # else a file's own keys stay, as where it lacks its model
+            for garment in (thing for thing in bpy.data.objects if thing.session_uid == uid):
+                remove_live_keys(garment)
         return None
 
 
 def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if _rendering and not (scene.render.use_lock_interface or bpy.app.background):
-        return
     for uid, played in list(_played.items()):
         _attempt(uid, played.show, scene, depsgraph)
 
 
 @persistent
 def _frame_changed(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    _show_all(scene, depsgraph)
+    if not _rendering:
+        _look_at_times(scene)
+        _show_all(scene, depsgraph)
+    elif depsgraph.mode == "RENDER":
+        _compare(scene, depsgraph)
+
+
+def _compare(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
+    """Say where a rendered frame shows another motion than the one that the garment follows."""
+    for uid, played in list(_played.items()):
+        if _attempt(uid, played.disagrees, scene, depsgraph):
+            garment, armature = played.objects()
+            told = (
+                f"Frame {scene.frame_current} was rendered with another pose of '{armature.name}' than "
+                f"'{garment.name}' follows; bake it over the frames that you render."
+            )
+            print(f"SSILK: {told}")
+            _warnings[uid] = told
 
 
 @persistent
 def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Read the motion again when keys were edited; what else may move the armature is for the artist to say."""
-    if not _played or not any(isinstance(update.id, bpy.types.Action) for update in depsgraph.updates):
+    if not _played or _rendering:
         return
+    _look_at_times(scene)
+    if any(isinstance(update.id, bpy.types.Action) and not is_baked(update.id) for update in depsgraph.updates):
+        _read_again(scene)
+
+
+def _look_at_times(scene: bpy.types.Scene) -> None:
+    """Read motions again where the scene's frames or its rate are others by now."""
+    if scene == bpy.context.scene and any(played.done is None and played.behind for played in _played.values()):
+        _read_again(scene)
+
+
+def _read_again(scene: bpy.types.Scene) -> None:
     for uid, played in list(_played.items()):
         if _attempt(uid, played.is_in, scene):
             played.stale = True
             _outdated.add(uid)
     if not bpy.app.background:
         _read_soon(PATIENCE)
+
+
+@persistent
+def _undone(*_: object) -> None:
+    """Play no longer what was not played by then, and dress again what lost its shapes or keys."""
+    for uid, played in list(_played.items()):
+        found = _attempt(uid, played.objects)
+        if not found:
+            continue
+        if not found[0].ssilk.live:
+            del _played[uid]
+        elif played.done is not None or _attempt(uid, played.missing):
+            _attempt(uid, played.dress_again)
+    _read_soon(PATIENCE)
 
 
 @persistent
@@ -186,9 +246,25 @@ def _loaded(_: str) -> None:
 
 
 @persistent
-def _render_began(*_: object) -> None:
+def _render_began(scene: bpy.types.Scene, *_: object) -> None:
+    """Read again what the armatures do, before the first frame: constraints and drivers tell of no edits."""
     global _rendering
+    for uid, played in list(_played.items()):
+        _warnings.pop(uid, None)
+        if _attempt(uid, played.is_in, scene):
+            _outdated.add(uid)
+    if threading.current_thread() is threading.main_thread():
+        while _read() is not None:
+            pass
+    else:  # the main thread reads, by its timer, while the render waits here
+        if not bpy.app.timers.is_registered(_read):
+            bpy.app.timers.register(_read)
+        while any(uid in _outdated or played.done is not None for uid, played in list(_played.items())):
+            time.sleep(BETWEEN)
     _rendering = True
+    for played in _played.values():
+        if played.unkeyed:
+            print(f"SSILK: The render lacks what is played live. {played.unkeyed}")
 
 
 @persistent

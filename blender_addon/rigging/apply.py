@@ -11,9 +11,9 @@ from ssilk_core.scene.assets import ProxyRig
 from ..arrays.edits import Edits
 from ..arrays.joints import Joints
 from ..errors import SetupError
-from ..scene.armature import need_editable, proxy_names
+from ..scene.armature import bring_back, need_editable, proxy_names
 from ..scene.classes import write_classes, write_levels
-from ..scene.garment import hang_on_armature
+from ..scene.garment import hang_on_armature, need_own_mesh
 from ..scene.gather import own_weights
 from ..scene.weights import PLAIN, discard_own_weights, keep_weights, own_groups, read_kept, write_groups
 from .edit_tracking import find_edits, generated, remember_weights
@@ -52,6 +52,7 @@ def apply_rig(
         SetupError: the garment or the armature was edited meanwhile, or the armature cannot be edited.
     """
     _need_same_vertices(garment, classes)
+    need_own_mesh(garment)
     lost = [name for name in joints.names if name not in armature.data.bones]
     if lost:
         raise SetupError(f"'{armature.name}' lost {lost[:1]} while the rig was made; make it again.")
@@ -65,6 +66,7 @@ def apply_rig(
     carriers = list(names)
     if old or rig.proxy_count:
         need_editable(armature)
+        bring_back(armature, garment)
         carriers = replace_proxies(armature, garment, joints, rig, edits)
     weights = rig.skin.dense(len(names) + rig.proxy_count).astype(np.float32)
     _give_weights(garment, armature, weights, carriers, edits.repainted, old)

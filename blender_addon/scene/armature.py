@@ -22,6 +22,7 @@ from .objects import scene_units
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
 MADE = "ssilk_made"  # custom property of a generated bone: its key; of the collection: the proxies by key
+AWAY = "ssilk_away"  # custom property of the collection: whether its proxies were put away since they were made
 UNEQUAL = 1e-3  # relative difference of scales that still counts as uniform
 
 
@@ -104,6 +105,37 @@ def made_collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> 
         collection = armature.collections.new(f"{garment.name} proxies")
         collection[OWNER] = garment
     return collection
+
+
+def put_away(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
+    """Hide and lock the proxies of a garment once, so that *Select All* and *Insert Keys* pass them by.
+
+    Whoever shows their bone collection again wants them, and they stay.
+    """
+    collection = collection_of(armature.data, garment)
+    if collection is None or AWAY in collection.keys():  # noqa: SIM118 (no dictionary)
+        return
+    collection[AWAY], collection.is_visible = True, False
+    _lock(armature, garment, True)
+
+
+def bring_back(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
+    """Show and unlock the proxies of a garment."""
+    collection = collection_of(armature.data, garment)
+    if collection is None or AWAY not in collection.keys():  # noqa: SIM118 (no dictionary)
+        return
+    del collection[AWAY]
+    collection.is_visible = True
+    _lock(armature, garment, False)
+
+
+def _lock(armature: bpy.types.Object, garment: bpy.types.Object, locked: bool) -> None:
+    for name in proxy_names(armature, garment):
+        bone = armature.pose.bones[name]
+        bone.lock_location = bone.lock_rotation = bone.lock_scale = (locked,) * 3
+        bone.lock_rotation_w = locked
+        if locked:
+            (bone if "select" in bone.bl_rna.properties else bone.bone).select = False
 
 
 def _parent(bone: bpy.types.Bone, index: dict[str, int]) -> int:

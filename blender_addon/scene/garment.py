@@ -161,6 +161,48 @@ def hang_on_armature(thing: bpy.types.Object) -> None:
     bpy.context.view_layer.update()
 
 
+def need_own_mesh(thing: bpy.types.Object) -> None:
+    """Raise `SetupError` if other objects share the mesh of one whose weights and shape keys are to be written."""
+    others = [other.name for other in bpy.data.objects if other.data == thing.data and other != thing]
+    if others:
+        raise SetupError(
+            f"'{thing.name}' shares its mesh with '{others[0]}', which would change with it; make it a single user "
+            "(Object > Relations > Make Single User > Object & Data)."
+        )
+
+
+def need_linear(thing: bpy.types.Object, armature: bpy.types.Object) -> bool:
+    """Return whether an Armature modifier lets an armature move an object, which it must do by linear blend skinning.
+
+    Raises:
+        SetupError: an option of the modifier is in the way.
+    """
+    for modifier in thing.modifiers:
+        if modifier.type != "ARMATURE" or modifier.object not in (armature, leader_of(armature)):
+            continue
+        options = {
+            "Preserve Volume": modifier.use_deform_preserve_volume,
+            "Bone Envelopes": modifier.use_bone_envelopes,
+            "a vertex group": bool(modifier.vertex_group),
+            "Multi Modifier": modifier.use_multi_modifier,
+        }
+        for label, on in options.items():
+            if on:
+                raise SetupError(f"The modifier '{modifier.name}' of '{thing.name}' uses {label}; switch that off.")
+        if not modifier.use_vertex_groups:
+            raise SetupError(f"The modifier '{modifier.name}' of '{thing.name}' ignores vertex groups.")
+        return True
+    return False
+
+
+def need_linear_bodies(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+    """Raise `SetupError` if Blender shows what a garment collides with elsewhere than linear blend skinning does."""
+    chosen = garment.ssilk.bodies
+    for thing in chosen.all_objects if chosen else bpy.context.view_layer.objects:
+        if thing.type == "MESH" and thing != garment and (chosen or not is_garment(thing)):
+            need_linear(thing, armature)
+
+
 def need_uncarried(thing: bpy.types.Object) -> None:
     """Raise `SetupError` if a bone carries an object that weights are to move."""
     if carrier := carrier_of(thing):

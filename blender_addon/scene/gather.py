@@ -17,7 +17,7 @@ from ..arrays.joints import Joints, identifiers
 from ..errors import SetupError
 from .armature import leader_of, read_joints
 from .classes import current_classes
-from .garment import armature_of, bodies_of, carried_weights, is_carried, rest_world
+from .garment import armature_of, bodies_of, carried_weights, is_carried, need_linear, rest_world
 from .masks import unmasked
 from .modifiers import need_plain_modifiers, reshapes
 from .objects import scene_units
@@ -129,7 +129,12 @@ def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Jo
 
 
 def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
-    """Return a body at rest; evaluated where modifiers shape it before its armature does."""
+    """Return a body at rest; evaluated where modifiers shape it before its armature does.
+
+    Raises:
+        SetupError: Blender deforms it otherwise than by linear blend skinning, or vertices have no weight.
+    """
+    need_linear(thing, armature)
     if not reshapes(thing):
         return _bound(thing, thing.data, armature, joints, path)
     with _at_rest(armature) as depsgraph:

@@ -61,6 +61,12 @@ def scene_rate() -> float:
     return render.fps / render.fps_base
 
 
+def scene_step() -> float:
+    """Return by how much animation goes on from frame to frame: other than 1 where the scene's time is stretched."""
+    render = bpy.context.scene.render
+    return render.frame_map_old / render.frame_map_new
+
+
 def select_elements(thing: bpy.types.Object, elements: str, indices: Sequence[int]) -> None:
     """Be in edit mode of a mesh with these of its "vertices" or "polygons" selected, and nothing else."""
     select_object(thing)
@@ -81,6 +87,9 @@ def select_bones(armature: bpy.types.Object, names: Sequence[str]) -> None:
     """Be in pose mode of an armature with these bones selected, and no other."""
     select_object(armature)
     bpy.ops.object.mode_set(mode="POSE")
+    for name in names:
+        for collection in armature.data.bones[name].collections:  # proxies are put away by a bake
+            collection.is_visible = True
     for bone in armature.pose.bones:
         # Since Blender 5 pose bones are selected, before it was their bones.
         (bone if "select" in bone.bl_rna.properties else bone.bone).select = bone.name in names

@@ -142,7 +142,13 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
     yield "found", found
     yield "heat", shown_heat
     yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=True)
-    yield "stale", live(monkeypatch, done=None, stale=True, renewed=False)
+    for name, fields in (
+        ("stale", {"stale": True}),
+        ("behind", {"behind": True}),
+        ("unkeyed", {"unkeyed": "A strip of 'Rig' is being tweaked; leave tweak mode (Tab) first."}),
+    ):
+        still = {"done": None, "stale": False, "behind": False, "unkeyed": "", "renewed": False}
+        yield name, live(monkeypatch, **(still | fields))
     yield "another drive", lambda garment: setattr(garment.ssilk, "model", __file__)
     yield "no folder", training(folder / "none")
     for state in ("waiting", "running", "done", "stopped", "failed", "unknown"):
