@@ -59,7 +59,8 @@ def rolled(subject: Subject, clip: str, frames: int, options: Any) -> Looped:
     """Roll a model over a looped clip."""
     dressed = subject.dressed
     motion, length = back_and_forth(clip_of(options, clip, subject), dressed.fps, frames)
-    take_set = build_take_set([Take(clip, 0, motion)], dressed, subject.model.joints)
+    model, takes = subject.model, [Take(clip, 0, motion)]
+    take_set = build_take_set(takes, dressed, model.joints, model.config.descriptors)
     network = Network(subject.model, take_set)
     values = recorded(dressed, take_set, network, 0).values
     return Looped({name: values[name] for name in TERMS}, length, float(network.states[0].abs().max()))

@@ -167,7 +167,7 @@ def measure(subject: Subject, options: Namespace) -> dict[str, float]:
     fps = subject.file.config.fps
     skeleton, clips = subject.scene.character.skeleton, options.clips
     takes = [take for name in clips for take in takes_of(name, clip_of(options, name, subject), skeleton, fps)]
-    take_set = build_take_set(takes, subject.dressed, subject.model.joints)
+    take_set = build_take_set(takes, subject.dressed, subject.model.joints, subject.model.config.descriptors)
     played = Network(subject.model, take_set)
     steps, drifts, begun = [], [], time.perf_counter()
     for take, frames in windows_of(subject.dressed, take_set, range(len(takes))):

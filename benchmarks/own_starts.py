@@ -204,7 +204,8 @@ def measure_all(options: argparse.Namespace, report: Reporter) -> tuple[list[lis
     plain = build_take_set(chosen.takes, first.dressed, first.model.joints)
     add(NO_MODEL, first.dressed, plain, SKINNING, LinearBlendSkinning(first.dressed, plain))
     for subject in subjects:
-        take_set = build_take_set(chosen.takes, subject.dressed, subject.model.joints)
+        model = subject.model
+        take_set = build_take_set(chosen.takes, subject.dressed, model.joints, model.config.descriptors)
         for label, method in methods_of(subject, take_set, options.iterations, report):
             add(subject.name, subject.dressed, take_set, label, method)
     names = iter([subject.name for subject in subjects])

@@ -60,7 +60,7 @@ def played(
         read = kept_simulation(options.simulation, first.dressed, take.motion, report)
         yield "simulator", first, plain, CachedPoints(read, first.dressed, plain)
     for subject in subjects:
-        take_set = build_take_set([take], subject.dressed, subject.model.joints)
+        take_set = build_take_set([take], subject.dressed, subject.model.joints, subject.model.config.descriptors)
         for name, method in methods_of(subject, take_set, options.iterations, report):
             yield f"{subject.name}, {name}" if len(subjects) > 1 else name, subject, take_set, method
     yield SKINNING, first, plain, LinearBlendSkinning(first.dressed, plain)

@@ -157,7 +157,10 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
         names = [
             name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)
         ]
-    return [EvaluatedMethod(name, one.file.joints, one.on) for name, one in zip(names, models)]
+    return [
+        EvaluatedMethod(name, one.file.joints, one.on, one.file.config.descriptors)
+        for name, one in zip(names, models)
+    ]
 
 
 def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device, exact: bool) -> EvaluationScene:

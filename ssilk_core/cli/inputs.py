@@ -54,7 +54,9 @@ def need_input(named: str, kind: Kind) -> None:
 
     Names that USD resolves in its own way, such as a file in a package, are left to it.
     """
-    path = Path(named.partition(":/")[0])
+    file, colon, _ = named.rpartition(":/")
+    # "C:/file.usd" is a file: what stands before a prim has a suffix.
+    path = Path(file if colon and Path(file).suffix else named)
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
     found, near = f"there is no such {kind.name}", ""

@@ -76,7 +76,8 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
-    tell_animated_shapes(options.stage, [motion.path for motion in motions], report, root=options.root)
+    paths = [motion.path for motion in motions]
+    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,

@@ -94,6 +94,8 @@ def _asked(words: Sequence[str]) -> Collection[str]:
     """Return the verbs whose options a command may need."""
     if words[:1] == ["completion"]:
         return tuple(VERBS)
+    if words[:1] == ["wardrobe"]:  # a list is a list of trainings
+        return ("wardrobe", "train")
     return words[:2] if words[:1] == ["help"] else words[:1]
 
 

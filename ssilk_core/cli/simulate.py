@@ -103,7 +103,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
-    tell_animated_shapes(options.stage, [motion.path for motion in motions], report, root=options.root)
+    paths = [motion.path for motion in motions]
+    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric))
         for output, motion, path in zip(outputs, motions, options.motion)

@@ -174,7 +174,7 @@ class Bench:
         from ..quality.trade.measure import VariantMeter
 
         dressed = self._dressed(file)
-        take_set = build_take_set(self.takes, dressed, file.joints)
+        take_set = build_take_set(self.takes, dressed, file.joints, file.config.descriptors)
         return VariantMeter(path.stem, Reducer(file, self.others), dressed, take_set, self._weigh(path))
 
     def _dressed(self, file: ModelFile) -> EvaluationScene:

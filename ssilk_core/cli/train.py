@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 from ..devices import default_preset, select_device
@@ -85,7 +86,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     shared.check_output(options.output)
     if isinstance(report, TextReporter):
         report.since = time.monotonic()
-    with join_process_group(options.device) as (group, device), stop_on_signals(report, PATIENCE) as stop:
+    with ExitStack() as running:
+        group, device = running.enter_context(join_process_group(options.device))
+        # A process of a group that stops inside a step would leave the others waiting.
+        stop = running.enter_context(stop_on_signals(report, PATIENCE if group.size == 1 else None))
         report = report if group.is_first else silent
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
@@ -141,7 +145,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
     paths = [motion.path for motion in (*motions, *held)]
-    tell_animated_shapes(options.stage, paths, report, root=options.root)
+    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))

@@ -469,7 +469,7 @@ def train(
     try:
         finished = _loop(run, stop)
     except KeyboardInterrupt:
-        report(Message(f"stopped inside a step; --resume continues from iteration {run.saved}."))
+        report(Message(f"stopped at once; --resume continues from iteration {run.saved}."))
         raise
     if isinstance(stop, PatientStop):
         stop.obeyed()
@@ -488,6 +488,8 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
             run.end_early()
             return True
         run.step()
+        if stop.is_set() and isinstance(stop, PatientStop):
+            stop.obeyed()  # before a validation, which takes longer
         steps += 1
         left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.clock.time_left))
         if run.state.iteration % CHECK_INTERVAL == 0 or run.state.iteration == total or steps == 1:

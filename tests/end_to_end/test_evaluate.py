@@ -221,7 +221,7 @@ def test_models_whose_files_have_one_name_are_told_apart_and_given_twice_refused
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        ("--stage rigged.usda --motions nowhere", "nowhere: there is no such folder"),
+        ("--stage rigged.usda --motions nowhere", "nowhere: there is no such file or folder"),
         (f"{QUICK} --clips brief walk", "1 clips are missing (walk)"),
         (f"{QUICK} --index index.json --clips walk", "no clip of valid, test, inertia, flips is chosen"),
         (f"{QUICK} --index model.safetensors", "no index of clips"),

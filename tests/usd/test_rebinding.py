@@ -202,6 +202,24 @@ def test_a_garment_in_its_own_file_goes_from_its_bind_pose_to_the_characters(tmp
     np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
 
 
+def test_other_axes_of_the_same_joints_move_no_garment_in_its_own_file(tmp_path):
+    """Programs turn the axes of joints as they like; where the joints stand is the pose."""
+    hero, own = tmp_path / "hero.usda", tmp_path / "cape.usda"
+    stage = Usd.Stage.CreateNew(str(hero))
+    character(stage)
+    stage.Save()
+    stage = Usd.Stage.CreateNew(str(own))
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    UsdSkel.Root.Define(stage, "/Cape")
+    turned = Rotation.from_euler("x", [[90], [0], [45]], degrees=True).as_matrix()
+    skeleton(stage, "/Cape/Rig", kinematics.rigid(BIND[:, :3, :3] @ turned, BIND[:, :3, 3]))
+    mesh(stage, "/Cape/Cape", CLOTH, FACES, OF_JOINTS, "/Cape/Rig")
+    stage.Save()
+    garment = read_scene(hero, garment=f"{own}:/Cape/Cape")[1]
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+
+
 def test_a_joint_that_only_the_garments_skeleton_has_is_refused_by_name(tmp_path):
     path = outfit(tmp_path, "geomBindTransform")
     stage = Usd.Stage.Open(str(path))

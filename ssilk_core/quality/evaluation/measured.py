@@ -63,7 +63,8 @@ class MeasuredMethod:
         told: Callable[[], None],
     ) -> None:
         self.dressed, self.joints, self._seen, self._told = dressed, method.joints, playlist.seen, told
-        self.take_set = build_take_set(takes, dressed, method.joints)
+        self.take_set = build_take_set(takes, dressed, method.joints, method.descriptors)
+        self._descriptors = method.descriptors
         self.clips = {number: take.clip for number, take in enumerate(takes)}
         self.played = method.on(self.take_set)
         self._cache = CachedPoints(playlist.read, dressed, self.take_set) if playlist.read else None
@@ -86,7 +87,9 @@ class MeasuredMethod:
         if not self._seen:
             return {}
         skeleton, bank = self.dressed.scene.character.skeleton, self.take_set.bank
-        known = build_bank(self._seen, skeleton, self.joints, self.dressed.fps, self.dressed.device)
+        known = build_bank(
+            self._seen, skeleton, self.joints, self.dressed.fps, self.dressed.device, kind=self._descriptors
+        )
         far = pose_distance(_upright(bank), _upright(known), len(self.joints))
         return dict(enumerate(far.split((bank.stops - bank.starts).tolist())))
 
@@ -114,7 +117,7 @@ class Probes:
         held, first = stopped_takes(takes, dressed.fps, options.stops, options.hold)
         if not held:
             return
-        take_set = build_take_set(held, dressed, self._method.joints)
+        take_set = build_take_set(held, dressed, self._method.joints, self._method.descriptors)
         method = self._method.on(take_set)
         settled = settling(dressed, take_set, method, first)
         rested: Sequence[MinimumErrors | None] = [None] * len(held)
@@ -126,7 +129,7 @@ class Probes:
         if not self._options.loop:
             return
         looped, lengths = looped_takes(takes, self._dressed.fps, self._options.loop)
-        take_set = build_take_set(looped, self._dressed, self._method.joints)
+        take_set = build_take_set(looped, self._dressed, self._method.joints, self._method.descriptors)
         found = loop_drift(self._dressed, take_set, self._method.on(take_set), lengths)
         yield from ((take.clip, loop) for take, loop in zip(looped, found))
 

@@ -55,11 +55,13 @@ class EvaluatedMethod:
     Attributes:
         joints: of the character, which the takes' descriptors are of.
         on: returns the method over takes.
+        descriptors: their kind, as `ModelConfig` has it.
     """
 
     name: str
     joints: np.ndarray
     on: Callable[[TakeSet], Method]
+    descriptors: str = "relative"
 
 
 class EvaluationScene:
@@ -133,15 +135,18 @@ class TakeSet:
         return torch.as_tensor(local.transpose(1, 2, 0).copy(), dtype=torch.float32, device=self.bank.root.device)
 
 
-def build_take_set(takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray) -> TakeSet:
-    """Return takes with their descriptors of these joints.
+def build_take_set(
+    takes: Sequence[Take], dressed: EvaluationScene, joints: np.ndarray, descriptors: str = "relative"
+) -> TakeSet:
+    """Return takes with their descriptors of these joints, of a kind that `ModelConfig` has.
 
     Raises:
         SsilkError: there is no take.
     """
     need_takes(takes)
     skeleton = dressed.scene.character.skeleton
-    bank = build_bank([take.motion for take in takes], skeleton, joints, dressed.fps, dressed.device)
+    motions = [take.motion for take in takes]
+    bank = build_bank(motions, skeleton, joints, dressed.fps, dressed.device, kind=descriptors)
     assert len(bank.starts) == len(takes)
     return TakeSet(tuple(takes), bank, tuple(first_place(take.motion, skeleton) for take in takes))
 

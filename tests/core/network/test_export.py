@@ -109,5 +109,6 @@ def test_what_goes_in_and_comes_out_is_told(exported, model):
 
 
 def test_other_suffixes_are_refused(tmp_path, capsys):
+    (tmp_path / "toy.safetensors").touch()
     assert main(["export", str(tmp_path / "toy.safetensors"), "-o", str(tmp_path / "toy.bin")]) == 2
     assert "ends in '.bin'; ONNX files end in .onnx" in capsys.readouterr().err

@@ -268,6 +268,9 @@ def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path,
     monkeypatch.setattr(parallel, "join_process_group", lambda device: nullcontext((ProcessGroup(rank, 2), "cpu")))
     monkeypatch.setattr("ssilk_core.training.run.train", lambda *_: trained)
     monkeypatch.setattr("ssilk_core.cli.train.training_job", lambda *_: job)
+    monkeypatch.chdir(tmp_path)
+    for name in ("stage.usda", "clip.usda"):
+        (tmp_path / name).touch()
     words = ["train", "stage.usda", "--motions", "clip.usda", "-o", str(tmp_path / "model.safetensors")]
     assert cli.main(words) == code
 

@@ -804,6 +804,9 @@ def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goe
         and "4.30% of the covered skin shows, 10.2% in the worst frame; above 0.05%, or 0.5% in a frame" in told.text
     )
     assert "iterations" not in told.text and "--minutes 12'" in told.text
+    monkeypatch.chdir(tmp_path)
+    for name in ("hero.usda", "walks"):
+        (tmp_path / name).touch()
     model = tmp_path / "skirt.safetensors"
     trained = training.TrainingResult(True, 86, shows, Score({"stretch": 1.0}, 0.0), 360.0)
     monkeypatch.setattr(training, "train", lambda *_: trained)
@@ -851,7 +854,7 @@ def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job
         patched.setattr(Stepper, "run", endless)
         train(asked, heard.append)
     said = [event.text for event in heard if isinstance(event, Message)]
-    assert said[-1] == "stopped inside a step; --resume continues from iteration 2."
+    assert said[-1] == "stopped at once; --resume continues from iteration 2."
     assert train(replace(asked, resume=True), silent).iterations == 6
 
 

@@ -14,13 +14,15 @@ from pxr import Usd, UsdSkel
 from ssilk_core.scene.assets import Floats, Skeleton
 from ssilk_core.scene.kinematics import world_transforms
 
-from ..opening.stage import EARLIEST, PRIMS, column_matrix, inherited_target, location
+from ..opening.stage import EARLIEST, PRIMS, column_matrix, location
 from ..units import scaling
+from .animation import animation_source
 from .skeleton import skeleton_at, skeletons
 from .skin import AuthoredInfluences, match_joints
 from .spaces import SkelSource
 
 SAME = 1e-5  # [m], and of rotation matrices: two bind poses that differ by less are one, rounded
+SAME_PLACE = 1e-3  # of the size of the skeleton, within which joints stand where those of another do
 
 
 def character_source(stage: Usd.Stage, skeleton: Skeleton) -> SkelSource | None:
@@ -45,9 +47,12 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
     theirs, binds = own.binds_to_core(own.bind), skeleton.bind_transforms
     character = character_source(own.stage, skeleton)
     if character is None:
+        places, wanted = theirs[match >= 0, :3, 3], binds[match[match >= 0], :3, 3]
+        if len(places) and np.abs(places - wanted).max() <= SAME_PLACE * max(np.ptp(wanted, axis=0).max(), SAME):
+            return None  # one pose: programs give the same joints other axes
         to_character = binds[match] @ np.linalg.inv(theirs)
     else:
-        animated = all(inherited_target(source.prim, "skel:animationSource") for source in (own, character))
+        animated = all(animation_source(source.prim).prim for source in (own, character))
         kept = character.character_joints
         shown = _shown(character, animated)[kept] @ np.linalg.inv(binds)
         to_character = np.linalg.inv(shown)[match] @ _shown(own, animated) @ np.linalg.inv(theirs)

@@ -76,14 +76,19 @@ class AnimatedShape:
 
 
 def tell_animated_shapes(
-    source: StageLike, motions: Iterable[str], report: Reporter, *, root: str | None = None
+    source: StageLike,
+    motions: Iterable[str],
+    report: Reporter,
+    *,
+    root: str | None = None,
+    garment: str | None = None,
 ) -> None:
     """Report which blendshapes of the character's meshes motions change, in which cloth does not meet them.
 
     Args are those of `animated_shapes`, for each of several motions.
     """
     for motion in motions:
-        found = animated_shapes(source, motion, root=root)
+        found = animated_shapes(source, motion, root=root, garment=garment)
         if found:
             text = f"{motion}: it weighs blendshapes that are not followed: {found[0]}"
             more = f", and {len(found) - 1} more" if len(found) > 1 else ""
@@ -91,13 +96,16 @@ def tell_animated_shapes(
 
 
 @needs_whole_files
-def animated_shapes(source: StageLike, motion: str, *, root: str | None = None) -> list[AnimatedShape]:
+def animated_shapes(
+    source: StageLike, motion: str, *, root: str | None = None, garment: str | None = None
+) -> list[AnimatedShape]:
     """Return the blendshapes of a character's meshes that a motion weighs otherwise than its stage does.
 
     Args:
         source: the character's stage.
         motion: "file[:/Prim/Path]", as for `read_motion`.
         root: the character, if there are several.
+        garment: its mesh, whose skeleton is not the character's.
 
     Raises:
         SsilkError: as `read_motion` and `read_character`.
@@ -109,7 +117,7 @@ def animated_shapes(source: StageLike, motion: str, *, root: str | None = None) 
     if not names:
         return []
     stage = open_stage(source)
-    skel = find_skeleton(stage, root=root)
+    skel = find_skeleton(stage, root=root, garment=garment)
     attribute = animation.GetBlendShapeWeightsAttr()
     codes = attribute.GetTimeSamples() or [Usd.TimeCode.Default()]
     rows = np.array(

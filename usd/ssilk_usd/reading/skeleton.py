@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
-from ssilk_core.errors import fail
+from ssilk_core.errors import SsilkError, fail
 from ssilk_core.scene.assets import Floats, Ints, Skeleton
 
 from ..names import PROXIES, SKEL
@@ -121,7 +121,10 @@ def _moved_weights(source: SkelSource) -> Floats:
     total = np.zeros(len(source.joints) + 1)
     for prim in Usd.PrimRange(source.root, PRIMS):
         if prim.IsA(UsdGeom.Mesh) and is_drawn(prim) and not is_garment(prim) and bound_skeleton(prim) == source.prim:
-            influences = read_influences(prim, source.joints)
+            try:
+                influences = read_influences(prim, source.joints)
+            except SsilkError:  # told where the mesh is read as a body; others may be as they like
+                continue
             if influences is not None:
                 at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
                 np.add.at(total, at, np.abs(influences.weights) / max(len(at), 1))

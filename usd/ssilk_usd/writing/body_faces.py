@@ -21,7 +21,7 @@ from ssilk_core.scene.assets import Ints, Mesh
 from ..opening.stage import StageLike, open_stage
 
 BODY, FULL, COVERED_HIDDEN = "body", "full", "covered_hidden"  # a variant set and its choices
-FACES = ("faceVertexCounts", "faceVertexIndices", "primvars:st")
+FACES = ("faceVertexCounts", "faceVertexIndices")
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ def hide_polygons(
                     _leave_out(stage, path, mesh, mask, rows[path])
                 elif local[path]:  # a variant is weaker than what stands beside it
                     prim = UsdGeom.Mesh(stage.OverridePrim(path))
-                    author_faces(prim, mesh, coordinates=FACES[2] in local[path])
+                    author_faces(prim, mesh, coordinates=False)
                     for each in rows[path]:
                         stage.GetAttributeAtPath(each.path).Set(each.values)
 
@@ -134,13 +134,9 @@ def _leave_out(
     if mask.all():
         prim.SetActive(False)  # a mesh without faces is malformed to some readers
         return
-    author_faces(UsdGeom.Mesh(prim), mesh, mask, coordinates=prim.HasAttribute(FACES[2]) or _has_no_set(rows))
+    author_faces(UsdGeom.Mesh(prim), mesh, mask, coordinates=False)  # these are among the rows
     for each in rows:
         stage.GetAttributeAtPath(each.path).Set(each.without(mask, np.asarray(mesh.polygon_counts)))
-
-
-def _has_no_set(rows: Sequence[_FaceRows]) -> bool:
-    return not any(isinstance(each.values, Vt.Vec2fArray) for each in rows)
 
 
 def _remove_faces(stage: Usd.Stage, path: Sdf.Path, rows: Sequence[_FaceRows]) -> list[str]:

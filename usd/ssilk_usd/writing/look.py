@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage, split_location
@@ -75,10 +76,14 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
         if len(UsdGeom.Mesh(prim).GetFaceVertexCountsAttr().Get(EARLIEST) or []) < len(counts):
             continue
         points = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(EARLIEST) or [])
-        own, indices = polygons(prim, points, location(prim))
+        if points != mesh.vertex_count:
+            continue
+        try:
+            own, indices = polygons(prim, points, location(prim))
+        except SsilkError:  # a prop that is malformed, which nobody asked for
+            continue
         corners, kept, faces = kept_faces(prim, own)
-        same = points == mesh.vertex_count and np.array_equal(kept, counts)
-        if same and np.array_equal(indices[corners], mesh.indices_of_corners):
+        if np.array_equal(kept, counts) and np.array_equal(indices[corners], mesh.indices_of_corners):
             return LookSource(prim, corners, faces)
     return None
 
