@@ -277,6 +277,9 @@ WORDS = {
     "A first look, after minutes on any machine": "Ein erster Eindruck, nach Minuten auf jedem Rechner",
     "Preview": "Vorschau",
     "Nearly the final quality, after minutes on a GPU": "Fast die endgültige Qualität, nach Minuten auf einer GPU",
+    "The paper's own model and training, for comparison; far slower": (
+        "Modell und Training wie im Paper, zum Vergleich; viel langsamer"
+    ),
     "Light": "Leicht",
     "A small network for many characters, after minutes on a GPU": (
         "Ein kleines Netz für viele Figuren, nach Minuten auf einer GPU"
