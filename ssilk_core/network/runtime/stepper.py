@@ -162,6 +162,21 @@ class NumpyStepper(ABC, Generic[Inputs]):
     def _buffers(self) -> list[LayerBuffers]:
         return [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
 
+    def _evaluate(self, buffers: list[LayerBuffers], state: NDArray, pose_sum: NDArray, out: NDArray) -> None:
+        """Write the output of S at `state` (inputs,) into `out` (latent,).
+
+        Args:
+            buffers: of `_buffers`; pose_sum: what the pose adds to the first layer, shape (hidden,).
+        """
+        sums = buffers[0].sums
+        np.dot(state, self.first, sums)
+        np.add(sums, pose_sum, sums)
+        hidden = buffers[0].activate()
+        for buffer in buffers[1:]:
+            np.dot(hidden, buffer.rows, buffer.sums)
+            hidden = buffer.activate()
+        np.dot(hidden, self.later[-1].rows, out)
+
 
 class SpringStepper(NumpyStepper[SpringInputs]):
     """Rolls out latents of `SpringVerlet`.
@@ -204,7 +219,6 @@ class SpringStepper(NumpyStepper[SpringInputs]):
         differences, seen = state[: 2 * z].reshape(2, z), state[2 * z :]
         along, pull, own = (np.empty(z, np.float32) for _ in range(3))
         away, velocity = differences
-        sums, last = buffers[0].sums, self.later[-1].rows
         clamp_step, clamp = SoftClamp(self.config.max_latent_step, (z,)), self.config.latent_bound or np.inf
         poses = inputs.pose_sums[start:], inputs.output_at_rest[start:], inputs.rate_allowance[start:].tolist()
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
@@ -215,13 +229,7 @@ class SpringStepper(NumpyStepper[SpringInputs]):
                 if cloth:
                     cloth.look()
                     rate_limit += RATE_ALLOWANCE * sqrt(seen.dot(seen))
-                np.dot(state, self.first, sums)
-                np.add(sums, pose_sum, sums)
-                hidden = buffers[0].activate()
-                for buffer in buffers[1:]:
-                    np.dot(hidden, buffer.rows, buffer.sums)
-                    hidden = buffer.activate()
-                np.dot(hidden, last, own)
+                self._evaluate(buffers, state, pose_sum, own)
                 if not own.dot(own) < SAFE_SQUARED_NORM:
                     np.clip(own, -MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT, own)
                 np.multiply(self.beta, velocity, along)
@@ -263,7 +271,7 @@ class VerletStepper(NumpyStepper[StepperInputs]):
 
     def _advance(self, inputs: StepperInputs, start: int) -> None:
         z, history, buffers = self.config.latent, inputs.history[start:, 1], self._buffers()
-        state, sums, last = np.zeros(len(self.first), np.float32), buffers[0].sums, self.later[-1].rows
+        state = np.zeros(len(self.first), np.float32)
         forward, newest, seen = state[:z], state[z : 2 * z], state[2 * z :]
         velocity, added = np.empty(z, np.float32), np.empty(z, np.float32)
         clamp_step, clamp = SoftClamp(self.config.max_latent_step, (z,)), self.config.latent_bound or np.inf
@@ -277,13 +285,7 @@ class VerletStepper(NumpyStepper[StepperInputs]):
                 newest[:] = now
                 if cloth:
                     cloth.look()
-                np.dot(state, self.first, sums)
-                np.add(sums, pose_sum, sums)
-                hidden = buffers[0].activate()
-                for buffer in buffers[1:]:
-                    np.dot(hidden, buffer.rows, buffer.sums)
-                    hidden = buffer.activate()
-                np.dot(hidden, last, added)
+                self._evaluate(buffers, state, pose_sum, added)
                 clamp_step(added)
                 np.add(forward, added, new)
                 np.clip(new, -clamp, clamp, new)
