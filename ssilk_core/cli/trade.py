@@ -70,8 +70,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models)
-    if not options.stage.is_file():
-        fail(str(options.stage), "there is no such file", "a USD stage with the character is needed")
     bench = Bench(options)
     results = Results(options.output, bench.asked)
     results.resume(report)

@@ -13,7 +13,10 @@ import torch
 
 from ..errors import fail
 from ..network.settings import ModelConfig
+from ..physics.collision.samples import contact_samples
+from ..physics.energy.stitching import held_stitches
 from ..scene.assets import PINNED, Scene
+from ..scene.fabrics import Fabric
 from .settings import MOST_SMOOTHED_VERTICES, TrainConfig
 
 PLANNED_SHARE = 0.8  # of the free memory
@@ -76,6 +79,16 @@ class StepMemory:
     samples: int
     stitches: int = 0
     smoothed: int = 0
+
+    @classmethod
+    def of(
+        cls, scene: Scene, model: ModelConfig, config: TrainConfig, fabric: Fabric, body_vertices: int
+    ) -> StepMemory:
+        """Return that of a training of which nothing is built yet."""
+        mesh = scene.garment.mesh
+        samples = len(contact_samples(mesh, fabric).area)
+        stitches = len(held_stitches(mesh, fabric, scene.classes))
+        return cls(scene, model, body_vertices, samples, stitches, smoothed_vertices(scene, model, config))
 
     def needed(self, frames: int) -> int:
         """Predict the bytes of a step that decodes so many frames at once."""

@@ -18,15 +18,13 @@ from torch import Tensor
 from ..devices import busy_cores, select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
-from ..physics.collision.samples import contact_samples
-from ..physics.energy.stitching import held_stitches
 from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
 from .budget import VALIDATION_SHARE, check_estimate, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .job import TrainJob
-from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory, smoothed_vertices
+from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .parts import build_parts
 from .run_files import RunFiles
@@ -122,14 +120,12 @@ class TrainingRun:
 
         The whole body is counted, so that the batch is no larger than the one that `_fit_batch` finds.
         """
-        job, config, scene = self.job, self.config, self.job.scene
-        samples = len(contact_samples(scene.garment.mesh, job.fabric).area)
-        stitches = len(held_stitches(scene.garment.mesh, job.fabric, scene.classes))
-        body = scene.character.merged_body().mesh.vertex_count
-        memory = StepMemory(scene, job.model, body, samples, stitches, smoothed_vertices(scene, job.model, config))
+        job, config = self.job, self.config
+        body = job.scene.character.merged_body().mesh.vertex_count
+        memory = StepMemory.of(job.scene, job.model, config, job.fabric, body)
         batch, poses = memory.fitting_batch(config, free_memory(self.device))
         fitting = replace(config, batch=batch, pretraining_batch=poses)
-        check_estimate(fitting, samples, self.device.type, 60 * minutes, str(job.output))
+        check_estimate(fitting, memory.samples, self.device.type, 60 * minutes, str(job.output))
 
     def _score_lbs(self) -> Score:
         """Return the score of linear blend skinning, whose validation is the first to be timed."""

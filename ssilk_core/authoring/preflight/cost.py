@@ -32,17 +32,12 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
     from ...devices import select_device
-    from ...physics.collision.samples import contact_samples
-    from ...physics.energy.stitching import held_stitches
     from ...scene.fabrics import FABRICS
-    from ...training.memory import StepMemory, decoded_frames, free_memory, smoothed_vertices
+    from ...training.memory import StepMemory, decoded_frames, free_memory
 
     model, train, device = preset.model, preset.train, select_device("auto")
     free = free_memory(device)
-    samples = len(contact_samples(scene.garment.mesh, FABRICS["default"]).area)
-    stitches = len(held_stitches(scene.garment.mesh, FABRICS["default"], scene.classes))
-    smoothed = smoothed_vertices(scene, model, train)
-    step = StepMemory(scene, model, body_vertices, samples, stitches, smoothed)
+    step = StepMemory.of(scene, model, train, FABRICS["default"], body_vertices)
     needed = step.needed(decoded_frames(train, train.batch))
     batch, pretraining_batch = step.fitting_batch(train, free)
     lowered = (batch, pretraining_batch) != (train.batch, train.pretraining_batch)
@@ -59,7 +54,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         why="training progresses more slowly per step with smaller batches" if lowered else "",
         fix="free memory, or choose another device or a smaller preset" if lowered else "",
     )
-    seconds = training_seconds(samples, train, device.type)
+    seconds = training_seconds(step.samples, train, device.type)
     found = f"preset '{preset.name}' takes about {format_seconds(seconds)} on {device}" if seconds else (
         f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
