@@ -58,8 +58,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--stepper-of",
         type=Path,
         metavar="MODEL",
-        help="keep the initialiser and decoder of a trained model of this scene, and train a new stepper for them: "
-        "for other motion, in a third of the time",
+        help="keep the initialiser and decoder of a trained model of this scene, and train its stepper on, or a new "
+        "one where it steps otherwise: for other motion, in a third of the time",
     )
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")

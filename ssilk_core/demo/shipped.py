@@ -68,10 +68,14 @@ def need_trained_on(mesh: Mesh, file: ModelFile, path: Path) -> None:
 
 def origin(file: ModelFile) -> str:
     """Return in words how a shipped model came to be."""
-    made, shipped = file.provenance, file.provenance["shipped"]
+    made, shipped, later = file.provenance, file.provenance["shipped"], list[str]()
+    while "base" in made:  # `train --stepper-of`
+        later.insert(0, f"{made['iteration']:,}")
+        made = made["base"]
+    alone = f", then {' and '.join(later)} of the stepper alone," if later else ""
     return (
-        f"{made['iteration']:,} iterations on {len(made['motions'])} motions, seed {made['seed']}, {made['device']}, "
-        f"ssilk {made['ssilk']}, {shipped['date']}; on {shipped['held-out clips']} held-out motions "
+        f"{made['iteration']:,} iterations{alone} on {len(made['motions'])} motions, seed {made['seed']}, "
+        f"{made['device']}, ssilk {made['ssilk']}, {shipped['date']}; on {shipped['held-out clips']} held-out motions "
         f"{shipped['energy [J]']:.3g} J, linear blend skinning {shipped['linear blend skinning [J]']:.3g} J, "
         f"{shipped['inside the body']:.2%} of its vertices inside the body; stored to 16 bits"
     )

@@ -16,7 +16,7 @@ NO_BOUND = 1e9  # upper limit of settings without a limit of their own
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
 VELOCITY_SCALE, DISTANCE_SCALE, OUTPUT_SCALE = 10.0, 3.0, 0.1
 MAX_OUTPUT = 100.0  # limit of each output of S: finite, and far above `max_latent_step`
-SPRING_ALLOWANCE, RATE_ALLOWANCE = 0.5, 0.05
+SPRING_ALLOWANCE, RATE_ALLOWANCE, SEEN_ALLOWANCE = 0.5, 0.05, 0.25
 FREE_ACTIVATION = 32.0  # limit of activations without a tanh: a file needs some range, and trainings stay far within
 DIVERGENCE_BOUND = 1e3  # a latent beyond this has diverged; those of trained models stay below ten
 RECOVERY_FRAMES = 15  # frames at rest after a diverged state, half a second at 30 frames per second

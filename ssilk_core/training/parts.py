@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ..events import Message, Reporter, format_count, silent
 from ..network.checkpoint import ModelFile
@@ -25,6 +25,7 @@ from .step import Stepper
 from .validation import Validator
 from .windows import WindowSampler
 
+FIRST_WEIGHT = "stepper.0.weight"
 POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 
 
@@ -103,7 +104,9 @@ def build_parts(
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed)
     if job.base:
-        _keep_all_but_the_stepper(model, job.base)
+        goes_on = _take_over(model, job.base)
+        start = "goes on from that of the given model" if goes_on else "starts anew: it steps otherwise, or sees less"
+        report(Message(f"the stepper {start}"))
     model = model.to(device)
     kind = job.model.descriptors
     bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
@@ -123,10 +126,28 @@ def build_parts(
     return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)
 
 
-def _keep_all_but_the_stepper(model: GarmentModel, base: ModelFile) -> None:
-    """Give a network the initialiser and decoder of a trained one, and no gradients to them."""
+def _take_over(model: GarmentModel, base: ModelFile) -> bool:
+    """Give a network the initialiser and decoder of a trained one, and no gradients to them.
+
+    The stepper starts as the trained one where it sees no less than that: what it saw comes first, and more of the
+    cloth counts nothing yet.
+
+    Returns:
+        Whether it does.
+    """
     learns = ("stepper.", "integrator.")
     kept = {name: torch.from_numpy(value.copy()) for name, value in base.parameters.items()}
-    model.load_state_dict({name: value for name, value in kept.items() if not name.startswith(learns)}, strict=False)
+    own, before = model.config, base.config
+    alike = all(getattr(own, name) == getattr(before, name) for name in ("scheme", "descriptors", "feedback_proxies"))
+    more_points = own.feedback_points - before.feedback_points
+    # Proxies come after points.
+    goes_on = alike and (more_points == 0 or (more_points > 0 and not own.feedback_proxies))
+    if goes_on and FIRST_WEIGHT in kept:
+        more = model.stepper[0].in_features - kept[FIRST_WEIGHT].shape[1]
+        kept[FIRST_WEIGHT] = nn.functional.pad(kept[FIRST_WEIGHT], (0, more))
+    model.load_state_dict(
+        {name: value for name, value in kept.items() if goes_on or not name.startswith(learns)}, strict=False
+    )
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.startswith(learns))
+    return goes_on

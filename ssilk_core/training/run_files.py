@@ -61,7 +61,7 @@ class RunFiles:
             save_fault(self.fault, stepper, self.job.training_motions(), found)
 
     def provenance(self, state: RunState, score: Score, lbs: Score) -> dict[str, Any]:
-        """Return the provenance of a model: inputs, settings, versions and validation."""
+        """Return the provenance of a model: inputs, settings, versions, validation, and that of its base."""
         return json_round_trip(
             {
                 **state.asked,
@@ -76,5 +76,6 @@ class RunFiles:
                 "validation": summary(score),
                 "lbs": summary(lbs),
                 "worse_than_lbs": is_worse(score, lbs),
+                **({"base": self.job.base.provenance} if self.job.base else {}),
             }
         )

@@ -18,6 +18,7 @@ from ..settings import (
     MAX_OUTPUT,
     OUTPUT_SCALE,
     RATE_ALLOWANCE,
+    SEEN_ALLOWANCE,
     SPRING_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
@@ -130,7 +131,7 @@ class SpringVerlet(Integrator):
     p is the only equilibrium, whatever S has learned, because S gives at most half of what the spring gives, and
     more only while something moves, with a = `config.velocity_allowance`:
 
-        |u| <= |f| / 2 + a |v| + (|rates of the pose| + |what S sees of the cloth|) / 20
+        |u| <= |f| / 2 + a |v| + |rates of the pose| / 20 + |what S sees of the cloth| / 4
 
     So nothing rests elsewhere. A swing is not bounded by this: S may add energy while something moves, as learned.
     Eq. 2's alpha is one: a larger one would undo the spring.
@@ -168,7 +169,7 @@ class SpringVerlet(Integrator):
         scales = VELOCITY_SCALE, DISTANCE_SCALE
         inputs = torch.cat([pose, seen], dim=1)
         output = stepper(stepper_input_kernel(before, now, rest, inputs, self.beta, scales))
-        rate_allowance = rate_allowance + RATE_ALLOWANCE * length(seen)
+        rate_allowance = rate_allowance + SEEN_ALLOWANCE * length(seen)
         limits = (
             self.config.stiffness,
             MAX_OUTPUT,
@@ -189,7 +190,7 @@ class SpringVerlet(Integrator):
         output = self._evaluate(stepper, now, VELOCITY_SCALE * velocity, DISTANCE_SCALE * away, pose, seen)
         spring = self.config.stiffness * torch.sigmoid(self.share) * away
         allowance = SPRING_ALLOWANCE * length(spring) + self.config.velocity_allowance * length(velocity)
-        allowance = allowance + rate_allowance + RATE_ALLOWANCE * length(seen)
+        allowance = allowance + rate_allowance + SEEN_ALLOWANCE * length(seen)
         learned = clip_norm(OUTPUT_SCALE * (output - at_rest), allowance)
         return forward + soft_clamp(spring + learned, self.config.max_latent_step)
 

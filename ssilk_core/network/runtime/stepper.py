@@ -30,6 +30,7 @@ from ..settings import (
     OUTPUT_SCALE,
     RATE_ALLOWANCE,
     RECOVERY_FRAMES,
+    SEEN_ALLOWANCE,
     SPRING_ALLOWANCE,
     VELOCITY_SCALE,
     ModelConfig,
@@ -228,7 +229,7 @@ class SpringStepper(NumpyStepper[SpringInputs]):
                 np.subtract(now, past, differences)
                 if cloth:
                     cloth.look()
-                    rate_limit += RATE_ALLOWANCE * sqrt(seen.dot(seen))
+                    rate_limit += SEEN_ALLOWANCE * sqrt(seen.dot(seen))
                 self._evaluate(buffers, state, pose_sum, own)
                 if not own.dot(own) < SAFE_SQUARED_NORM:
                     np.clip(own, -MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT, own)

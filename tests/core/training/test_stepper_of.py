@@ -15,13 +15,14 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.training.job import TrainJob
-from ssilk_core.training.parts import _keep_all_but_the_stepper
+from ssilk_core.training.parts import FIRST_WEIGHT, _take_over
 from ssilk_core.training.settings import TrainConfig
 
 
-def job(scene, base, motion) -> TrainJob:
+def job(scene, base, motion, **model) -> TrainJob:
+    config = ModelConfig(**{"latent": 99, "feedback_points": 5, **model})
     return TrainJob(
-        scene=scene, motions=[motion], held_out=[motion], model=ModelConfig(latent=99, feedback_points=5),
+        scene=scene, motions=[motion], held_out=[motion], model=config,
         train=TrainConfig(), fabric=FABRICS["silk"], output=Path("out.safetensors"), base=base,
     )  # fmt: skip
 
@@ -32,13 +33,39 @@ def test_initialiser_and_decoder_are_kept_and_the_stepper_alone_learns(scene, to
     assert asked.model == replace(base.config, feedback_points=5)
     assert asked.train.static_iterations == 0
     model = GarmentModel(scene, asked.model, base.joints, 7)
-    _keep_all_but_the_stepper(model, base)
+    assert _take_over(model, base)
     for name, parameter in model.named_parameters():
         learns = name.startswith(("stepper.", "integrator."))
         assert parameter.requires_grad == learns
         if not learns:
             assert torch.equal(parameter, torch.from_numpy(base.parameters[name]))
-    assert model.stepper[0].in_features == base.parameters["stepper.0.weight"].shape[1] + 15
+
+
+@pytest.mark.parametrize(("before", "after", "more"), [(0, 5, 15), (3, 5, 6), (5, 5, 0)])
+def test_the_stepper_goes_on_and_what_it_did_not_see_counts_nothing_yet(
+    scene, toy_model, toy_motion, before, after, more
+):
+    trained = toy_model(scene, feedback_points=before)
+    base = model_file(trained, FABRICS["silk"], {})
+    asked = job(scene, base, toy_motion(scene, 9), feedback_points=after)
+    model = GarmentModel(scene, asked.model, base.joints, 7)
+    assert _take_over(model, base)
+    old, new = torch.from_numpy(base.parameters[FIRST_WEIGHT]), model.stepper[0].weight.detach()
+    assert new.shape[1] == old.shape[1] + more
+    assert torch.equal(new[:, : old.shape[1]], old) and not new[:, old.shape[1] :].any()
+    assert torch.equal(model.integrator.beta, trained.integrator.beta)
+    # The points that S sees are the first of those that it sees now.
+    assert torch.equal(model.feedback.rows[:before], trained.feedback.rows)
+
+
+@pytest.mark.parametrize("model", [{"feedback_points": 2}, {"scheme": "verlet", "feedback_points": 5}])
+def test_a_stepper_that_sees_less_or_steps_otherwise_starts_anew(scene, toy_model, toy_motion, model):
+    base = model_file(toy_model(scene, feedback_points=5), FABRICS["silk"], {})
+    asked = job(scene, base, toy_motion(scene, 9), **model)
+    new = GarmentModel(scene, asked.model, base.joints, 7)
+    fresh = new.stepper[0].weight.detach().clone()
+    assert not _take_over(new, base)
+    assert torch.equal(new.stepper[0].weight, fresh)
 
 
 def test_a_model_of_another_garment_is_refused(scene, toy_model, toy_scene, toy_motion):
