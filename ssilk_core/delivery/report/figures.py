@@ -17,7 +17,7 @@ from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
 from ...training.step_errors import StepErrors
 from .page import Section, facts, flattened, table
-from .terms import SHARE, SHOWN
+from .terms import BARE, SHARE, SHOWN
 
 MISSED = "energy that steps miss"
 
@@ -118,6 +118,7 @@ def learning(document: Mapping[str, Any]) -> Section:
     found = [point["validation"].get("shown_skin") for point in points]
     if all(found):
         shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
+        shown[BARE] = ("%", [100 * each["bare"] for each in found])
     steps = [point["validation"].get("step_errors") for point in points]
     if all(steps):
         shown[MISSED] = ("mJ", [1000 * each["energy"] for each in steps])
