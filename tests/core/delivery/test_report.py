@@ -19,7 +19,7 @@ from ssilk_core.delivery.report.verdict import verdict
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.quality.charts import ChartPanel, svg_chart
-from ssilk_core.quality.evaluation.results import UNFINISHED
+from ssilk_core.quality.kept_rows import UNFINISHED
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
 
