@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ssilk_core.errors import fail
-from ssilk_core.quality.evaluation.results import UNFINISHED
+from ssilk_core.quality.kept_rows import UNFINISHED
 
 RESULTS = Path(__file__).parents[1] / "results"
 GARMENTS = {"cape": "cape", "fringe_skirt": "fringe skirt", "hooded_dress": "hooded dress"}
@@ -23,12 +23,12 @@ def document(name: str) -> Any:
     """Return a result file as it is.
 
     Raises:
-        SsilkError: 'ssilk evaluate' has not finished it.
+        SsilkError: 'ssilk evaluate' or 'ssilk trade' has not finished it.
     """
     path = RESULTS / f"{name}.json"
     found = json.loads(path.read_text())
     if UNFINISHED in found:
-        fail(path.name, "this evaluation is unfinished", "tables are made of finished ones", "finish it")
+        fail(path.name, "this measurement is unfinished", "tables are made of finished ones", "finish it")
     return found
 
 

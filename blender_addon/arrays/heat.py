@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 COLORS = np.array([[0.1, 0.2, 0.6], [0.1, 0.7, 0.8], [0.3, 0.8, 0.2], [1.0, 0.9, 0.1], [0.9, 0.1, 0.1]])  # sRGB
+UNCOVERED, BARE = -1.0, -2.0  # values of skin where no cloth is in the bind pose, and where none is near any more
 GREY = np.array([0.35, 0.35, 0.35])  # where there is nothing to see
 
 
@@ -63,14 +64,16 @@ def depths(
 
 
 def shown_depths(covered: np.ndarray, above: np.ndarray, beneath: np.ndarray) -> np.ndarray:
-    """Return how far beneath the skin the cloth is where skin shows; zero where it is covered, else -1; shape (V,).
+    """Return how far beneath the skin the cloth is where skin shows, and zero where cloth is above, shape (V,).
+
+    It is `BARE` where covered skin has no cloth near, and `UNCOVERED` where none covers it in the bind pose.
 
     Args:
         covered: whether cloth is above each vertex in the bind pose.
         above, beneath: distance of the cloth above and beneath it, infinity where none is within reach.
     """
-    shows = covered & np.isinf(above) & np.isfinite(beneath)
-    return np.where(shows, np.maximum(beneath, np.finfo(np.float32).tiny), np.where(covered, 0.0, -1.0))
+    near = np.where(np.isfinite(beneath), np.maximum(beneath, np.finfo(np.float32).tiny), BARE)
+    return np.where(covered, np.where(np.isfinite(above), 0.0, near), UNCOVERED)
 
 
 def _barycentric(places: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -53,12 +53,14 @@ def improvement(state: JobState, curve: Mapping[str, Any]) -> list[str]:
     if not (points := curve.get("points")):
         return []
     best = next((each for each in points if each.get("iteration") == state.checkpoint), points[-1])["validation"]
-    shown, first = ((score.get("shown_skin") or {}).get("mean") for score in (best, points[0]["validation"]))
+    skin = best.get("shown_skin") or {}
+    shown, first = (each.get("mean") for each in (skin, points[0]["validation"].get("shown_skin") or {}))
     if shown is None:
         said = compared(best["total"], curve["lbs"]["total"])[0]
     else:
         before = f", {first:.2%} at first" if first is not None and first != shown else ""
-        said = f"{shown:.2%} of the covered skin shows{before}"
+        bare = f"; {skin['bare']:.2%} is bare" if "bare" in skin else ""
+        said = f"{shown:.2%} of the covered skin shows{before}{bare}"
     if state.cancelled or not state.round:
         return [said]
     return [said, f"Gets better until you finish it: {rounded(state.spent)} so far"]

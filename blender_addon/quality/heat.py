@@ -55,7 +55,15 @@ class HeatMap:
         """What frames are compared by: the share of the covered skin that shows, or the largest value."""
         if self.kind != SKIN:
             return self.most
-        return float((self.values > 0).sum() / max(1, (self.values >= 0).sum()))
+        return self._share(self.values > 0)
+
+    @property
+    def bare(self) -> float:
+        """Share of the covered skin without cloth near; for SKIN."""
+        return self._share(self.values == heat.BARE)
+
+    def _share(self, chosen: np.ndarray) -> float:
+        return float(chosen.sum() / max(1, (self.values != heat.UNCOVERED).sum()))
 
     def summary(self) -> str:
         """Return the worst value in words."""
@@ -64,7 +72,8 @@ class HeatMap:
         if self.kind == PUSHED_OUT:
             return f"{int((self.values > 0).sum())} vertices were pushed out, {1000 * self.most:.1f} mm at most"
         if self.kind == SKIN:
-            return f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
+            shows = f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
+            return f"{shows}, {self.bare:.2%} is bare" if self.bare else shows
         inside = int((self.values > 0).sum())
         return f"{inside} vertices inside, {1000 * self.most:.1f} mm at most" if inside else "Nothing is inside"
 

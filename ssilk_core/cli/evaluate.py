@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
-from ..events import Message, Reporter, Result, Started
+from ..events import Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -116,7 +116,6 @@ def evaluated(
         exact: see `evaluation.methods.EvaluationScene`.
     """
     from ..devices import select_device
-    from ..quality.evaluation.results import GO_ON
     from ..quality.evaluation.run import evaluate
 
     device = select_device(options.device)
@@ -132,8 +131,7 @@ def evaluated(
             for row in evaluate(dressed, methods, playlist, asked, report, known[len(results.rows) :]):
                 results.add(paths.get(row.method), row)
         except KeyboardInterrupt:
-            if options.output and results.rows:
-                report(Message(f"{options.output}: {len(results.rows)} rows are kept; other {GO_ON}"))
+            results.kept.tell_kept(len(results.rows), report)
             raise
     results.finish()
     return results

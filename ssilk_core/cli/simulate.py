@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ..delivery.bake.result import ShotShapes
     from ..physics.simulate import SimulationOptions
     from ..physics.simulate.simulator import SimulatedFrame
+    from ..physics.skin.figures import ShownSkin
     from ..scene.assets import Floats, Motion, Scene
 
 
@@ -218,6 +219,7 @@ class _Caches:
         self.open: dict[int, tuple[ExitStack, PointCache]] = {}
         self.report = report
         self.fits: list[ShotShapes] = []
+        self.shown: list[ShownSkin] = []
 
     def write(self, shot: int, frame: int, points: Floats) -> None:
         """Write the garment's points (V, 3) [m] of one frame."""
@@ -232,15 +234,21 @@ class _Caches:
                 self._skin(shot)
 
     def figures(self) -> dict[str, object]:
-        """Return how far joints and blendshapes are from the points, at most, and what the points would take."""
+        """Return how far joints and blendshapes are from the points, at most, and what the points would take.
+
+        And how much covered skin shows, in the shot in which most does.
+        """
         if not self.fits:
             return {}
+        most = max(self.shown, key=lambda shown: shown.mean, default=None)
+        where = "" if len(self.shots) == 1 else "most in a shot: "
         return {
             "shapes of a shot, at most": max(fit.count for fit in self.fits),
             "joints lose, RMS [mm]": float(f"{max(fit.rms_mm for fit in self.fits):.4g}"),
             "joints lose, at most [mm]": float(f"{max(fit.largest_mm for fit in self.fits):.4g}"),
             "bytes": sum(shot.output.stat().st_size for shot in self.shots if shot.output.is_file()),
             "bytes of the points alone": sum(fit.point_bytes for fit in self.fits),
+            **{f"{where}{name}": value for name, value in (most.summary("time code") if most else {}).items()},
         }
 
     def _path(self, shot: int) -> Path:
@@ -278,6 +286,7 @@ class _Caches:
         else:
             assert result.shapes is not None
             self.fits.append(result.shapes)
+            self.shown += [result.shown_skin] if result.shown_skin else []
         path.unlink()
 
     def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:

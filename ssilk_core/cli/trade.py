@@ -7,9 +7,9 @@ compared: further models of a garment are measured whole and at their levels. Co
 the solver, memory, and the sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance
 of vertices and velocities from the whole model. All are measured on the same frames, the first ones of each clip,
 because the simulator takes seconds for each on a processor. A shot of a solver has the blendshapes that these frames
-need. Times are of this machine and of the first clip. --output
-writes each point when it is measured; an interrupted sweep continues from there. A variant that fails is told, and
-the exit code is 4 then.
+need. Times are of this machine and of the first clip. --output writes each row when it is measured, and says that it
+is unfinished until the last. The same command, given again, goes on from there. A file of other models, motions or
+settings is begun anew. A variant that fails is told, the file stays unfinished, and the exit code is 4 then.
 """
 
 from __future__ import annotations
@@ -85,6 +85,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             first = path in bench.first_of_garment
             tried = variants(size, fps, solved=not options.no_refine) if first else other_network(size, fps)
             failed += sweep(meter, tried, results, report)
+        if not failed:
+            results.finish()
+    except KeyboardInterrupt:
+        results.kept.tell_kept(len(results.points), report)
+        raise
     finally:  # an interrupted sweep shows what it has
         if results.points and options.output:
             panels = trade_panels(results.points, bench.frames)

@@ -57,8 +57,8 @@ def shortcomings(model: str, score: Score, done: int, asked: int, seconds: float
         found.append(f"its minutes sufficed for {done} of {asked} iterations")
     if shown and shown.is_seen:
         found.append(
-            f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame; above "
-            f"{MOST_MEAN:.2%}, or {MOST_WORST:.1%} in a frame, it meets the eye at once"
+            f"{shown.mean:.2%} of the covered skin shows, {shown.worst:.1%} in the worst frame, {shown.bare:.2%} is "
+            f"bare; what shows meets the eye at once above {MOST_MEAN:.2%}, or {MOST_WORST:.1%} in a frame"
         )
     if not found:
         return None

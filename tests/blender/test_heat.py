@@ -220,6 +220,11 @@ def test_skin_that_shows_is_coloured_on_the_body(bpy, dressed):
     np.testing.assert_allclose(found[deep], np.tile(RED, (deep.sum(), 1)), atol=0.15)
     assert (np.abs(found[high] - heat.GREY).max(axis=1) > 0.1).all()
     np.testing.assert_allclose(found[~high], np.tile(heat.GREY, ((~high).sum(), 1)), atol=2e-3)
+    for point in key.data:  # the upper half is out of reach
+        if point.co.z > 0.99:
+            point.co.x, point.co.y = 9 * point.co.x, 9 * point.co.y
+    assert bpy.ops.ssilk.show_heat(kind="SKIN", deepest=0.02) == {"FINISHED"}
+    assert dressed.ssilk.heat_told == f"No skin shows, {high.sum() / covered.sum():.2%} is bare"
     assert "SSILK Heat" not in dressed.data.color_attributes
     assert bpy.ops.ssilk.show_heat(kind="STRETCH") == {"FINISHED"}
     assert "SSILK Heat" not in pillar.data.color_attributes and "SSILK Heat" in dressed.data.color_attributes

@@ -65,15 +65,16 @@ def test_validations_say_what_is_learned():
 
 def test_what_a_training_has_reached_is_told_beside_where_it_began():
     points = [
-        {"iteration": done, "validation": {**SCORE, "shown_skin": {"mean": mean, "worst": 0.1}}}
+        {"iteration": done, "validation": {**SCORE, "shown_skin": {"mean": mean, "worst": 0.1, "bare": 0.14}}}
         for done, mean in ((5, 0.0231), (9, 0.0084), (12, 0.0099))
     ]
     state = JobState("running", checkpoint=9, round=2, spent=840)
     assert improvement(state, {**CURVE, "points": points}) == [
-        "0.84% of the covered skin shows, 2.31% at first", "Gets better until you finish it: 14 min so far",
+        "0.84% of the covered skin shows, 2.31% at first; 14.00% is bare",
+        "Gets better until you finish it: 14 min so far",
     ]  # fmt: skip
     assert improvement(JobState("running", checkpoint=5), {**CURVE, "points": points[:1]}) == [
-        "2.31% of the covered skin shows"
+        "2.31% of the covered skin shows; 14.00% is bare"
     ]
     assert improvement(JobState("running", checkpoint=5), CURVE) == ["40.0% less energy than linear blend skinning"]
     assert improvement(state, {}) == []

@@ -61,7 +61,7 @@ def test_an_unfinished_evaluation_makes_no_table(tables, tmp_path, monkeypatch):
     unfinished = {"unfinished": "rows are missing", **json.loads((RESULTS / "evaluate_cape.json").read_text())}
     (tmp_path / "evaluate_cape.json").write_text(json.dumps(unfinished))
     monkeypatch.setattr(sys.modules["documents.forms"], "RESULTS", tmp_path)
-    with pytest.raises(SsilkError, match=r"evaluate_cape.json: this evaluation is unfinished"):
+    with pytest.raises(SsilkError, match=r"evaluate_cape.json: this measurement is unfinished"):
         tables.TABLES["rest"]()
 
 

@@ -134,6 +134,20 @@ def test_a_file_of_other_inputs_is_begun_anew(world, stopped, capsys, change, ot
     assert "unfinished" not in json.loads((world / "figures.json").read_text())
 
 
+def test_rows_of_a_version_that_measured_less_are_begun_anew(world, stopped, capsys):
+    words, measured = stopped
+    document, count = json.loads((world / "figures.json").read_text()), len(measured)
+    for row in document["figures"]:
+        del row["figures"]["closed_loop"]
+    (world / "figures.json").write_text(json.dumps(document))
+    assert evaluated(words) == 0
+    what = "another version measured its figures ('figures.closed_loop' is missing)"
+    assert f"warning: figures.json: begun anew, {what}\n" in capsys.readouterr().err
+    written = json.loads((world / "figures.json").read_text())
+    assert "unfinished" not in written and all("closed_loop" in row["figures"] for row in written["figures"])
+    assert len(measured) > count + 2  # the known rows, too
+
+
 def test_a_file_of_something_else_stays(world, capsys):
     for text in ('{"points": []}', '{"figures": [{"garment": "Skirt"}]}', "[]", "{"):
         (world / "figures.json").write_text(text)

@@ -52,7 +52,7 @@ def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     assert points["2 blendshapes"]["shot_bytes"] < whole["shot_bytes"]
     assert (world / "trade.png").stat().st_size > 1000
     assert run(f"{TRADE} --clips long short --frames 12 --no-refine -o trade.json") == 0
-    assert f"{len(points)} variants were measured before" in capsys.readouterr().err
+    assert f"{len(points)} rows were measured before and are taken over; it is complete" in capsys.readouterr().err
     assert json.loads((world / "trade.json").read_text()) == document
 
 

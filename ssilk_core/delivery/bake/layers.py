@@ -26,7 +26,7 @@ from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
 from .shots import write_shot_stage
-from .shown_skin import ShownSkinMeter
+from .shown_skin import state_rollout_skin
 from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -268,7 +268,6 @@ def _write_layer(
 
     rollout = refined(solved(rollout, report), report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
-    meter = ShownSkinMeter(rollout)
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -286,18 +285,19 @@ def _write_layer(
             asset,
             rollout.deformer,
             rollout.motion,
-            meter.poses(),
+            rollout.poses(),
             **common,
             hidden=rollout.hidden,
             hidden_polygons=hidden,
-            provenance=shot_metadata(rollout, layout.animation, meter.stated),
+            provenance=shot_metadata(rollout, layout.animation),
             path=unverified,
             points=task.points,
         )
+        shown = state_rollout_skin(unverified, rollout)
         verification = verify_file(rollout, unverified, report) if task.verify else None
         digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file
     rollout.warn(report)
-    return result_of(meter, layout.animation, summary, verification, hidden), digests
+    return result_of(rollout, layout.animation, summary, shown, verification, hidden), digests
 
 
 def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:

@@ -12,8 +12,8 @@ from typing import NoReturn
 
 from ...errors import fail
 from ...files import replacing
+from ...scene.plain import from_plain
 from .inputs import InputContents, model_contents, stage_contents
-from .plain import from_plain
 from .record import RECORD, RecordedInput, TaskRecord, portable, read_record
 from .task import BakeTask
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import fail
-from .plain import from_plain
+from ...scene.plain import from_plain
 
 FIELDS = "{stem}, {prim}, {parent}, {parent2}, {parent3}, ... are names of its file, prim and folders"
 LONGEST = 100  # characters of a name; file systems take 255 bytes

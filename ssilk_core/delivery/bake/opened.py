@@ -43,3 +43,19 @@ def provenance_of(path: Path) -> Mapping[str, Any]:
     from ssilk_usd.reading.facts import read_provenance
 
     return read_provenance(path)
+
+
+def add_provenance(path: Path, facts: Mapping[str, object]) -> None:
+    """Let a written shot say more of itself.
+
+    Raises:
+        SsilkError: not a readable shot, or it cannot be written.
+    """
+    if path.suffix == GLB:
+        from ..gltf.shot import add_glb_provenance
+
+        add_glb_provenance(path, facts)
+    else:
+        from ssilk_usd.shots import shot
+
+        shot.add_provenance(path, facts)

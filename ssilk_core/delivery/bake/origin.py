@@ -16,12 +16,8 @@ from .request import BakeRequest
 from .rollout import BakeRollout
 
 
-def shot_metadata(rollout: BakeRollout, output: Path, shown_skin: Mapping[str, object]) -> dict[str, object]:
-    """Return what a shot says of its origin and quality; `recovered` and `shown_skin` fill while poses are written.
-
-    Args:
-        shown_skin: figures of the covered skin that shows.
-    """
+def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
+    """Return what a shot says of its origin and quality; `recovered` fills while poses are written."""
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
     solved = {"solved in latents": rollout.latents.summary.to_metadata()} if rollout.latents else {}
     request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
@@ -29,7 +25,6 @@ def shot_metadata(rollout: BakeRollout, output: Path, shown_skin: Mapping[str, o
         **rollout.provenance,
         "request": request,
         "recovered": rollout.recovered,
-        "shown_skin": shown_skin,
         **solved,
         **refined,
     }

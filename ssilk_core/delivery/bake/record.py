@@ -12,9 +12,9 @@ from pathlib import Path
 from ... import __version__, work_record
 from ...errors import SsilkError
 from ...files import relative_path, sha256
+from ...scene.plain import from_plain
 from ...work_record import Hash, WorkRecord, request_key
 from .inputs import InputHashes
-from .plain import from_plain
 from .request import INPUTS, BakeRequest
 from .result import BakeResult
 from .task import BakeTask

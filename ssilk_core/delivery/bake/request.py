@@ -12,8 +12,8 @@ from math import inf
 from ...errors import fail, fail_unknown
 from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MIN_FPS
+from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
-from .plain import from_plain
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")

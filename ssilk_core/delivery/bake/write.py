@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import need_not_input, need_writable, replacing
+from ...physics.skin.figures import ShownSkin
 from ..targets import GLB
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
@@ -18,7 +19,8 @@ from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
-from .shown_skin import ShownSkinMeter
+from .rollout import BakeRollout
+from .shown_skin import state_rollout_skin
 from .sizing import load_sized
 from .verification import verify_file
 
@@ -63,25 +65,24 @@ def bake(
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    meter = ShownSkinMeter(rollout)
-    summary, verification = _write_verified(meter, path, include_body, hidden, verify, report)
+    summary, shown, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
-    result = result_of(meter, path, summary, verification, hidden)
+    result = result_of(rollout, path, summary, shown, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
 
 
 def result_of(
-    meter: ShownSkinMeter,
+    rollout: BakeRollout,
     path: Path,
     summary: ShotSummary,
+    shown: ShownSkin | None,
     verification: Verification | None,
     hidden: HiddenPolygons | None,
 ) -> BakeResult:
     """Return the result of a rollout that was written."""
-    rollout = meter.rollout
     return BakeResult(
         path=path,
         frames=summary.frame_count,
@@ -96,7 +97,7 @@ def result_of(
         latent=rollout.latents.summary if rollout.latents else None,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
-        shown_skin=meter.shown(),
+        shown_skin=shown,
     )
 
 
@@ -114,46 +115,45 @@ def _check_output(request: BakeRequest, path: Path) -> None:
 
 
 def _write_verified(
-    meter: ShownSkinMeter,
+    rollout: BakeRollout,
     output: Path,
     include_body: bool,
     hidden: HiddenPolygons | None,
     verify: bool,
     report: Reporter,
-) -> tuple[ShotSummary, Verification | None]:
+) -> tuple[ShotSummary, ShownSkin | None, Verification | None]:
     """Write a file that appears once it is verified; return what it holds."""
     from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified) as layer:
-            summary = _write(layer, meter, output, include_body, hidden)
+            summary = _write(layer, rollout, output, include_body, hidden)
+            shown = state_rollout_skin(layer, rollout)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, verify_file(meter.rollout, unverified, report) if verify else None
+        return summary, shown, verify_file(rollout, unverified, report) if verify else None
 
 
 def _write(
-    layer: Path, meter: ShownSkinMeter, output: Path, include_body: bool, hidden: HiddenPolygons | None
+    layer: Path, rollout: BakeRollout, output: Path, include_body: bool, hidden: HiddenPolygons | None
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.shots.points import point_cache
     from ssilk_usd.shots.shot import write_shot
 
-    rollout = meter.rollout
     common: dict[str, Any] = {
         "start": rollout.start,
         "samples_per_frame": rollout.request.samples_per_frame,
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
-        "provenance": shot_metadata(rollout, output, meter.stated),
+        "provenance": shot_metadata(rollout, output),
     }
     if output.suffix == GLB:
-        return write_glb_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
+        return write_glb_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
     common |= {"units": rollout.units, "record": rollout.record}
     if not rollout.request.writes_points:
-        return write_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
-    meter.add_points()
+        return write_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
         for frame, points in enumerate(rollout.points()):
             cache.write(frame, points)

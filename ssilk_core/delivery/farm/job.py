@@ -14,9 +14,9 @@ from ... import __version__
 from ...errors import SsilkError, fail
 from ...events import Message, Reporter
 from ...files import replacing
+from ...scene.plain import from_plain
 from ..bake import BakeRequest, BakeTask
 from ..bake.inputs import InputContents, InputFiles, InputHashes
-from ..bake.plain import from_plain
 
 NAME = "job.json"
 

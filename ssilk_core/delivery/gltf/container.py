@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -90,17 +90,22 @@ class GlbBuilder:
         Raises:
             SsilkError: it would be larger than its format allows.
         """
-        document = {**self.document, "buffers": [{"byteLength": self._size}]}
-        text = json.dumps(document, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()
-        text += b" " * (-len(text) % 4)
-        total = HEADER.size + 2 * CHUNK.size + len(text) + self._size
-        if total > MAX_BYTES:
-            fail(str(path), f"{total:,} bytes", f"a glb has at most {MAX_BYTES:,}", "bake a shorter range")
-        with open(path, "wb") as stream:
-            stream.write(HEADER.pack(MAGIC, VERSION, total))
-            stream.write(CHUNK.pack(len(text), JSON) + text)
-            stream.write(CHUNK.pack(self._size, BINARY))
-            stream.writelines(self._parts)
+        _write(path, {**self.document, "buffers": [{"byteLength": self._size}]}, self._parts)
+
+
+def _write(path: str | Path, document: Document, parts: Sequence[bytes]) -> None:
+    """Write a document and the parts of its buffer."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = sum(map(len, parts))
+    total = HEADER.size + 2 * CHUNK.size + len(text) + size
+    if total > MAX_BYTES:
+        fail(str(path), f"{total:,} bytes", f"a glb has at most {MAX_BYTES:,}", "bake a shorter range")
+    with open(path, "wb") as stream:
+        stream.write(HEADER.pack(MAGIC, VERSION, total))
+        stream.write(CHUNK.pack(len(text), JSON) + text)
+        stream.write(CHUNK.pack(size, BINARY))
+        stream.writelines(parts)
 
 
 def _described(values: np.ndarray, kind: str) -> Document:
@@ -143,6 +148,14 @@ class GlbFile:
             self.document, self._buffer = _parts(data)
         except (struct.error, ValueError, RecursionError) as error:
             fail(str(path), f"not a whole glb ({error})", "a file of glTF 2.0 is needed", "bake it again")
+
+    def write(self, path: str | Path) -> None:
+        """Write the document as it is now, with the buffer that was read.
+
+        Raises:
+            SsilkError: it would be larger than its format allows.
+        """
+        _write(path, self.document, [self._buffer])
 
     def array(self, index: int) -> np.ndarray:
         """Return what an accessor holds, shape (N, width), in its own type.

@@ -20,7 +20,7 @@ from ...scene.kinematics import (
     quaternion_from_matrix,
     sorted_influences,
 )
-from .container import INDICES, VERTICES, GlbBuilder
+from .container import INDICES, VERTICES, GlbBuilder, GlbFile
 from .geometry import ShapeNormals, drawn_mesh
 
 SET = 4  # influences in one attribute
@@ -115,6 +115,15 @@ def write_glb(
     with replacing(path) as temporary:
         glb.write(temporary)
     return len(shapes)
+
+
+def add_glb_provenance(path: Path, facts: Mapping[str, object]) -> None:
+    """Add to what a glb of `write_glb` says of its origin; raise `SsilkError` where it cannot be read or written."""
+    file = GlbFile(path)
+    said = file.document["asset"]["extras"].setdefault("ssilk", {})
+    said.update(_plain(facts))
+    with replacing(path) as temporary:
+        file.write(temporary)
 
 
 def _sampled(

@@ -11,13 +11,13 @@ from typing import Any
 from ...errors import SsilkError, fail
 from ...physics.skin.figures import ShownSkin
 from ...quality.charts import ChartPanel, svg_chart
-from ...quality.evaluation.results import GO_ON, UNFINISHED
+from ...quality.kept_rows import GO_ON, UNFINISHED
 from ...quality.stress.outcome import HEADER, CaseOutcome
 from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
 from ...training.step_errors import StepErrors
 from .page import Section, facts, flattened, table
-from .terms import SHARE, SHOWN
+from .terms import BARE, SHARE, SHOWN
 
 MISSED = "energy that steps miss"
 
@@ -84,16 +84,20 @@ def trade(document: Mapping[str, Any]) -> Section:
     panels = trade_panels(points, document["asked"].get("frames", {}))
     chart = svg_chart("errors over costs", panels, size=(4.0, 3.4)) if points else ""
     judged = records(document.get("judging", ()))
-    return Section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]))
+    return _section("Trade", chart + records(document["points"]) + judged + facts(document["asked"]), document)
 
 
 def evaluation(document: Mapping[str, Any]) -> Section:
-    """Return the table of 'ssilk evaluate'; of an unfinished file, its title and its first words say so."""
+    """Return the table of 'ssilk evaluate'."""
     rest = facts({name: value for name, value in document.items() if name not in ("figures", "inputs", UNFINISHED)})
-    found = records(document["figures"]) + rest
+    return _section("Evaluation", records(document["figures"]) + rest, document)
+
+
+def _section(title: str, body: str, document: Mapping[str, Any]) -> Section:
+    """Return the section of a file; of an unfinished one, its title and its first words say so."""
     if UNFINISHED in document:
-        return Section("Evaluation, unfinished", f'<p class="note">Unfinished: {GO_ON}.</p>{found}')
-    return Section("Evaluation", found)
+        return Section(f"{title}, unfinished", f'<p class="note">Unfinished: {GO_ON}.</p>{body}')
+    return Section(title, body)
 
 
 def records(found: Sequence[Mapping[str, Any]]) -> str:
@@ -118,6 +122,7 @@ def learning(document: Mapping[str, Any]) -> Section:
     found = [point["validation"].get("shown_skin") for point in points]
     if all(found):
         shown[SHOWN] = ("%", [100 * each["mean"] for each in found])
+        shown[BARE] = ("%", [100 * each["bare"] for each in found])
     steps = [point["validation"].get("step_errors") for point in points]
     if all(steps):
         shown[MISSED] = ("mJ", [1000 * each["energy"] for each in steps])

@@ -95,7 +95,8 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     name = player.meshes[garment.index].name
 
     def shown_skin(frame: int) -> str:
-        return f", {values[SHOWN][frame]:.2f} % of the covered skin shows" if SHOWN in shown else ""
+        share, bare = values[SHOWN][frame], values[BARE][frame]
+        return f", {share:.2f} % of the covered skin shows, {bare:.1f} % is bare" if SHOWN in shown else ""
 
     pictures = "".join(
         figure(

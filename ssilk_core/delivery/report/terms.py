@@ -12,7 +12,8 @@ from ...physics.collision import PosedBody, signed_distance
 from ...physics.constants import GRAVITY
 from ...physics.energy import TERMS, GarmentEnergy
 from ...physics.energy.stretch import deformation_gradient_operator
-from ...physics.skin.covered_skin import CoveredPoints, ShownCounts, shown_skin
+from ...physics.skin.covered_points import CoveredPoints
+from ...physics.skin.covered_skin import ShownCounts, shown_skin
 from ...physics.skin.figures import ShownSkin
 from ...quality.evaluation.metrics import principal_stretches
 from ...scene.assets import Floats, Mesh
@@ -117,8 +118,7 @@ class TermsMeter:
         inside = 100 * float((distance[: len(x)] < 0).double().mean())
         found = {"collision": float(self.energy.collision_at(distance)), SHARE: inside, SHOWN: 0.0, BARE: 0.0}
         if self.covered:
-            vertices = self.covered.vertices
-            states = self.covered.states(x, at[vertices], towards[vertices])
+            states = self.covered.states(x, at[self.covered.vertices])
             self.counts.append(ShownCounts.of(states, [time]))
             found |= {SHOWN: 100 * float(self.counts[-1].shares), BARE: 100 * float(self.counts[-1].bare)}
         return found

@@ -16,8 +16,9 @@ from .terms import SHARE, SHOWN, STRETCH
 STRETCHED = 15.0  # stretch of 99 triangles in 100 beyond which the eye finds it at once [%]
 LEAST = 0.1  # below it a share has more digits [%]: one vertex is no 0.0 %
 COUNTED = (
-    "Covered skin is the skin that the cloth covers in the bind pose. Where other parts, such as hands, push through "
-    "the cloth, it counts as vertices inside the body."
+    "Covered skin is the skin that the cloth covers in the bind pose. It shows where cloth lies beneath it, and is "
+    "bare where no cloth is near: of a cape, which swings away, that is no fault. Where other parts, such as hands, "
+    "push through the cloth, it counts as vertices inside the body."
 )
 CLOCK = "Frames are time codes of the shot. Seconds count from its first frame."
 INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
@@ -47,8 +48,9 @@ def verdict(
             faults.append("skin shows through")
         where = f", most at {shown_skin.where}" if shown_skin.where else ""
         share = f"{shown.mean():.3f} % of the covered skin shows on average"
-        seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}."
-        words.append(seen if shown[worst] else "No covered skin shows.")
+        seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}"
+        bare = f"{100 * shown_skin.bare:.1f} % is bare, {100 * shown_skin.worst_bare:.1f} % at most."
+        words.append(f"{seen if shown[worst] else 'No covered skin shows'}; {bare}")
     else:
         words.append("Skin was not measured, because the garment covers none.")
     if len(lost) < len(frame_times):

@@ -3,7 +3,7 @@
 
 Contact pushes each sample of the cloth out of the part of the body that it can touch. Skin shows all the same where
 the body comes through between samples, where tight cloth lies in a part that is not beneath it at rest, and where few
-iterations were made. So covered points of the skin (`skin.covered_skin`) ask. Where the outermost cloth along
+iterations were made. So covered points of the skin (`skin.covered_points`) ask. Where the outermost cloth along
 the normal n lies beneath such a point p, the cloth moves by the u with
 
     min u' H u / 2   subject to   n . sum_k w_k (x_k + u_k) = n . p + HEIGHT,
@@ -28,7 +28,7 @@ from ..collision import PosedBody
 from ..collision.winding_number import ENCLOSED, winding_number
 from ..simulate.incremental_potential import IncrementalPotential, StepInputs
 from ..simulate.newton import State
-from ..skin.covered_skin import CoveredPoints
+from ..skin.covered_points import CoveredPoints
 
 POINTS = 30_001  # on the body, 7 mm apart on a person; others than those at which skin that shows is measured
 ROUNDS = 12  # at most; each finds anew where skin shows
@@ -105,7 +105,7 @@ class SkinClearing:
     def __init__(self, scene: Scene, potential: IncrementalPotential) -> None:
         device, mesh, body = potential.free.device, scene.garment.mesh, scene.character.merged_body().mesh
         self.potential = potential
-        self.points = CoveredPoints(body, mesh, count=POINTS, device=device)
+        self.points = CoveredPoints(body, mesh, count=POINTS, seed=None, smooth=True, device=device)
         self.faces, self.body_faces = (torch.as_tensor(np.array(each.faces), device=device) for each in (mesh, body))
         self.vertices = torch.as_tensor(self.points.vertices, device=device)
         pattern = potential.block_pattern

@@ -9,6 +9,7 @@ from math import nan
 from typing import Any
 
 from ...physics.skin.figures import ShownSkin
+from ...scene.plain import from_plain
 
 SECONDS = 10  # duration of the shots whose sizes are compared [s]
 
@@ -65,11 +66,9 @@ class TradePoint:
         """Return a point from its JSON document, whatever else that holds.
 
         Raises:
-            KeyError: a value is missing.
+            KeyError, TypeError: a value is missing, or of another type.
         """
-        values = {item.name: document[item.name] for item in fields(cls)}
-        shown = values["shown_skin"]
-        return cls(**{**values, "shown_skin": ShownSkin(**shown) if shown else None})
+        return from_plain(cls, {item.name: document[item.name] for item in fields(cls)}, figures=True)
 
     @property
     def making(self) -> float:

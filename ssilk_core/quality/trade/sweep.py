@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,7 +10,8 @@ from typing import Any
 
 from ...errors import SsilkError
 from ...events import Countdown, Message, Reporter, silent
-from ...files import replacing
+from ...scene.plain import from_plain
+from ..kept_rows import KeptRows
 from .collision_cost import CollisionCost
 from .measure import VariantMeter
 from .point import TradePoint
@@ -21,11 +21,11 @@ from .variants import Variant
 
 @dataclass
 class Results:
-    """Points of a sweep, which are written to a file after each measurement.
+    """Points of a sweep, each written when it is measured.
 
     Attributes:
         path: the file, or None.
-        asked: identifies the models, scene and settings; points of a file with another value are ignored.
+        asked: identifies the models, scene and settings; a file with other values is begun anew.
         collision_costs: costs of detecting collisions, for the first model.
     """
 
@@ -34,19 +34,25 @@ class Results:
     collision_costs: Sequence[CollisionCost] = ()
     points: list[TradePoint] = field(default_factory=list)
 
+    @property
+    def kept(self) -> KeptRows[TradePoint]:
+        """Where the points are kept."""
+        names = ("garment", "model", "swept", "variant")
+        at = {"inputs_at": "asked", "rows_at": "points"}
+        return KeptRows(path=self.path, verb="trade", kind=TradePoint, names=names, inputs=self.asked, **at)
+
     def resume(self, report: Reporter) -> None:
-        """Read the points that an earlier run of the same sweep measured."""
-        if self.path is None or not self.path.exists():
-            return
+        """Read the points that an earlier run of the same sweep measured, as `KeptRows.known` does.
+
+        Raises:
+            SsilkError: the file is none of a sweep.
+        """
+        self.points = self.kept.known(report)
+        costs = self.kept.told().get("judging", ()) if self.points else ()
         try:
-            document = json.loads(self.path.read_text())
-            points = [TradePoint.of(point) for point in document["points"]]
-            same = document["asked"] == json.loads(json.dumps(self.asked))
-        except (ValueError, TypeError, KeyError) as error:
-            raise SsilkError(f"{self.path}: not results of 'ssilk trade' ({error}); name another file.") from error
-        self.points = points if same else []
-        if self.points:
-            report(Message(f"{len(self.points)} variants were measured before and are reused"))
+            self.collision_costs = [from_plain(CollisionCost, each, figures=True) for each in costs]
+        except TypeError as error:
+            raise SsilkError(f"{self.path}: damaged figures of collisions ({error}); name another file.") from error
 
     def found(self, model: str, variant: Variant) -> bool:
         """Return whether a variant has been measured."""
@@ -54,17 +60,17 @@ class Results:
         return any((p.model, p.swept, p.variant, p.refine) == asked for p in self.points)
 
     def add(self, point: TradePoint) -> None:
-        """Add a point and write the file."""
+        """Add a point and write the file, which says that it is unfinished."""
         self.points.append(point)
-        if self.path is not None:
-            document = {
-                "units": "SI, times in ms",
-                "asked": self.asked,
-                "judging": [asdict(each) for each in self.collision_costs],
-                "points": [asdict(each) for each in self.points],
-            }
-            with replacing(self.path) as temporary:
-                temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
+        self._write(finished=False)
+
+    def finish(self) -> None:
+        """Write the file as a finished one."""
+        self._write(finished=True)
+
+    def _write(self, *, finished: bool) -> None:
+        told = {"units": "SI, times in ms", "judging": [asdict(each) for each in self.collision_costs]}
+        self.kept.write(told, [asdict(each) for each in self.points], finished=finished)
 
 
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> int:

@@ -19,7 +19,7 @@ from ssilk_core.delivery.report.verdict import verdict
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.quality.charts import ChartPanel, svg_chart
-from ssilk_core.quality.evaluation.results import UNFINISHED
+from ssilk_core.quality.kept_rows import UNFINISHED
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
 
@@ -76,8 +76,8 @@ def test_skin_that_shows_through_a_sheet_is_a_cap_of_the_ball(toy_grid):
     # A ray along the normal at an angle a from the axis meets the plane at d / cos(a) from the centre.
     first, second, third = 1 - 0.31 / 0.38, 1 - 0.28 / 0.3, 1 - 0.36 / 0.38
     assert found.covered == pytest.approx(8000 * first / 2, rel=0.02)
-    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.03), 0]
-    assert meter.values[BARE] == [0, 0, pytest.approx(100 * (1 - third / first), rel=0.03)]
+    assert meter.values[SHOWN] == [0, pytest.approx(100 * second / first, rel=0.05), 0]
+    assert meter.values[BARE] == [0, 0, pytest.approx(100 * (1 - third / first), rel=0.05)]
     assert (found.clip, found.frame, found.regions) == ("shot", 1001.5, {})
     assert 100 * found.worst == meter.values[SHOWN][1] and found.mean == found.worst / 3
     assert 100 * found.worst_bare == meter.values[BARE][2] and found.bare == found.worst_bare / 3
@@ -111,11 +111,12 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
 
 def test_a_verdict_tells_what_is_wrong_where_and_when():
     values = {SHOWN: np.array([0.0, 0.0, 0.8]), STRETCH: np.array([3.0, 21.0, 4.0]), SHARE: np.zeros(3)}
-    skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, bare=0.0, worst_bare=0.0, clip="c", frame=13,
+    skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, bare=0.12, worst_bare=0.2, clip="c", frame=13,
                      regions={"LeftArm": 1.0})  # fmt: skip
     body = verdict("Cape", values, skin, [11, 12, 13], 30.0).body
     assert "Look at Cape: skin shows through and the cloth stretches." in body
     assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
+    assert "; 12.0 % is bare, 20.0 % at most." in body
     assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "At most" not in body
     calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, [11, 12, 13], 30.0).body
     assert "Cape holds" in calm and "skin" not in calm
@@ -251,7 +252,7 @@ def test_a_learning_curve_marks_its_best(tmp_path):
         point["validation"]["shown_skin"] = shown
     path.write_text(json.dumps({"lbs": score, "points": points}))
     (section,) = learning_of(path)
-    assert section.body.count(">best</text>") == 3
+    assert section.body.count(">best</text>") == 4
     assert (
         "1.000% of the covered skin shows, 2.00% in the worst frame (walk, frame 3; most at Hips 100%)"
         in section.body

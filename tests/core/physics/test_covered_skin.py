@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import cKDTree
 
 from ssilk_core.physics.collision import RayCaster, ray_casting
-from ssilk_core.physics.skin.covered_skin import CoveredSkin, ShownCounts, SkinStates, spread_points
+from ssilk_core.physics.refine.clearing import POINTS
+from ssilk_core.physics.skin.covered_points import SEED, CoveredPoints, SkinStates, spread_points
+from ssilk_core.physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ssilk_core.scene.assets import Body, Garment, Mesh, ProxyRig, Scene, SkinWeights
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+CPU = torch.device("cpu")
 RADIUS, GAP, CAP = 0.2, 0.02, 0.6  # of a ball and the shell around it [m]; cosine of the angle of a cap of the shell
 
 
@@ -105,15 +109,69 @@ def test_points_move_with_the_skin(scene):
     assert not torch.equal(skin.states(posed(sunk), turn).shows, shows)
 
 
-def test_points_are_spread_evenly(scene):
+@pytest.mark.parametrize("seed", [None, SEED])
+def test_points_are_spread_evenly(scene, seed):
     ball = shell_of(scene).character.merged_body().mesh
-    faces, weights = spread_points(ball, 8000)
+    faces, weights = spread_points(ball, 8000, seed)
     assert (weights >= 0).all() and np.allclose(weights.sum(1), 1)
     points = (ball.points[ball.faces[faces]] * weights[..., None]).sum(1)
     directions = np.random.default_rng(0).normal(size=(50, 3))
     inside = points @ (directions / np.linalg.norm(directions, axis=1, keepdims=True)).T > CAP * RADIUS
     chance = np.sqrt((1 - CAP) / 2 * (1 + CAP) / 2 / 8000)
     assert np.std(inside.mean(axis=0) - (1 - CAP) / 2) < 0.5 * chance  # twice as even as points at random
+
+
+def test_skin_is_judged_at_other_points_than_refinement_lifts_cloth_at(scene):
+    """As near to those as points at random are: what lies between them counts as much as what lies on them."""
+    ball = shell_of(scene).character.merged_body().mesh
+
+    def places(*asked):
+        faces, weights = spread_points(ball, *asked)
+        return (ball.points[ball.faces[faces]] * weights[..., None]).sum(1)
+
+    lifted = places(POINTS)
+    near = cKDTree(lifted).query(places(8000, SEED))[0]
+    random = np.random.default_rng(2).normal(size=(8000, 3))
+    random *= RADIUS / np.linalg.norm(random, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        np.quantile(near, (0.1, 0.5, 0.9)), np.quantile(cKDTree(lifted).query(random)[0], (0.1, 0.5, 0.9)), rtol=0.06
+    )
+
+
+def test_rays_that_last_find_what_rays_anew_find(scene):
+    """Cloth that crosses the skin to and fro, then leaves it; and a frame that is lost between others."""
+    whole = shell_of(scene)
+    points = whole.garment.mesh.points
+    sway = np.random.default_rng(3).normal(0, 0.02, (6, 3))
+    x = torch.cat([posed(points * (1 - 0.03 * frame) + off) for frame, off in enumerate(sway)], -1).cpu()
+    x[..., 3] = torch.nan
+    body = torch.from_numpy(whole.character.merged_body().mesh.points.copy())
+    lasting, anew = (
+        CoveredPoints(whole.character.merged_body().mesh, whole.garment.mesh, device=CPU) for _ in range(2)
+    )
+    at = body[lasting.vertices][:, :, None]
+    together = lasting.states(x, at.expand(-1, -1, 6))
+    for frame in reversed(range(6)):
+        alone = anew.states(x[..., frame, None], at)
+        assert torch.equal(together.shows[:, frame, None], alone.shows)
+        assert torch.equal(together.bare[:, frame, None], alone.bare)
+    corners = at[torch.from_numpy(np.searchsorted(lasting.vertices, whole_faces(whole)[lasting.faces]))].float()
+    weights = torch.from_numpy(lasting.weights).float()[..., None, None]
+    start = (corners * weights).sum(1)
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], dim=1)
+    normal /= normal.norm(dim=1, keepdim=True)
+    caster = RayCaster(whole.garment.mesh, device=CPU)
+    finite = [0, 1, 2, 4, 5]
+    asked = (each.expand(-1, -1, 5) for each in (start, normal))
+    hits = caster.cast(*asked, x[..., finite].float(), above=0.08, beneath=0.03)
+    shows = together.shows[:, finite]
+    assert 0.02 < shows.double().mean() < 0.9
+    assert ((hits.beneath & ~hits.above) != shows).double().mean() < 1e-4  # but for rounding
+    assert together.shows[:, 3].all() and not together.bare[:, 3].any()
+
+
+def whole_faces(scene: Scene) -> np.ndarray:
+    return scene.character.merged_body().mesh.faces
 
 
 def test_a_garment_that_covers_nothing_has_no_figure(scene):

@@ -19,11 +19,11 @@ from ssilk_core.quality.evaluation.asked import EvaluationClips, EvaluationOptio
 from ssilk_core.quality.evaluation.closed_loop import closed_loop, spectral_radius, step_derivatives
 from ssilk_core.quality.evaluation.figures import ResultRow
 from ssilk_core.quality.evaluation.methods import EvaluatedMethod, EvaluationScene, Network, TakeSet, build_take_set
-from ssilk_core.quality.evaluation.results import restored
 from ssilk_core.quality.evaluation.run import evaluate
 from ssilk_core.quality.evaluation.tables import tables
 from ssilk_core.quality.evaluation.takes import takes_of
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.plain import from_plain
 
 pytestmark = pytest.mark.usefixtures("few_contacts")
 
@@ -144,7 +144,7 @@ def test_the_evaluation_tells_it_of_networks_in_every_split(scene, dressed, toy_
     assert 0 < loops["ssilk", "flips"].median_radius <= loops["ssilk", "flips"].max_radius < 2
     assert "spectral radius of a step, median" in tables(rows)
     # Of a split that is measured after others are known, the states are the same, in a smaller batch of takes.
-    kept = [restored(ResultRow, json.loads(json.dumps(finite(asdict(row))))) for row in rows[:3]]
+    kept = [from_plain(ResultRow, json.loads(json.dumps(finite(asdict(row)))), figures=True) for row in rows[:3]]
     again = list(evaluate(dressed, [method], played, options, known=kept))
     found, before = again[3].figures.closed_loop, loops["ssilk", "flips"]
     assert again[:3] == rows[:3] and found.states == before.states

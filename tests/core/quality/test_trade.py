@@ -22,6 +22,7 @@ from ssilk_core.quality.evaluation.methods import EvaluationScene, Network, buil
 from ssilk_core.quality.evaluation.record import recorded
 from ssilk_core.quality.evaluation.solver_errors import solver_errors
 from ssilk_core.quality.evaluation.takes import takes_of, within
+from ssilk_core.quality.kept_rows import GO_ON
 from ssilk_core.quality.reduction import ModelSize, Reducer
 from ssilk_core.quality.trade.collision_cost import measure_collisions
 from ssilk_core.quality.trade.measure import VariantMeter
@@ -257,14 +258,24 @@ def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
     assert [p["variant"] for p in json.loads(path.read_text())["points"]] == measured == ["as trained", "int16"]
     said, again = [], Results(path, asked)
     again.resume(said.append)
-    assert "2 variants were measured before" in said[0].text
+    assert "2 rows were measured before and are taken over; the others are measured" in said[0].text
+    assert json.loads(path.read_text())["unfinished"] == GO_ON
     measured.clear()
     sweep(meter, tried, again)
     assert measured == ["float16"]
     assert len(again.points) == 3 and again.points[0] == points["as trained"]
+    again.finish()
+    assert "unfinished" not in json.loads(path.read_text())
     other = Results(path, {"clips": ["b"]})
     other.resume(said.append)
-    assert not other.points
+    assert not other.points and said[-1].text == f"{path}: begun anew, its figures are of other clips"
+    document = json.loads(path.read_text())
+    del document["points"][1]["shown_skin"]["bare"]
+    path.write_text(json.dumps(document))
+    older = Results(path, asked)
+    older.resume(said.append)
+    what = "another version measured its figures ('shown_skin.bare' is missing)"
+    assert not older.points and said[-1].text == f"{path}: begun anew, {what}" and said[-1].level == "warning"
 
 
 def test_a_variant_that_fails_is_told_and_the_others_are_measured(meter, points, monkeypatch):
@@ -307,7 +318,7 @@ def test_each_solver_tells_its_frames_after_the_quick_variants(meter, points, mo
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
 def test_files_that_hold_something_else_are_refused(tmp_path, text):
     (tmp_path / "other.json").write_text(text)
-    with pytest.raises(SsilkError, match=r"other.json: not results of 'ssilk trade'"):
+    with pytest.raises(SsilkError, match=r"other.json: not figures of 'ssilk trade'"):
         Results(tmp_path / "other.json", {}).resume(lambda event: None)
 
 

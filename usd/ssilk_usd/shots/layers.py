@@ -35,6 +35,7 @@ from ..writing.author import Asset, define_asset, define_blendshapes, extent_arr
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import new_stage, save
 from .layers_facts import AssetFacts, asset_facts
+from .play import Shot
 from .samples import PATH_OP, Samples, kept_joints, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 
@@ -302,6 +303,20 @@ def write_points(
         save(layer, layout.points)
         del layer  # the file is closed before it is renamed
         return sha256(temporary)
+
+
+def with_points(path: str | Path) -> Shot:
+    """Open a shot, with its point cache in place of joints where it offers both; the file stays as it is.
+
+    Raises:
+        SsilkError: not a readable shot.
+    """
+    stage = open_stage(path)
+    variants = stage.GetDefaultPrim().GetVariantSet(DEFORMATION)
+    if "points" in variants.GetVariantNames():
+        with Usd.EditContext(stage, stage.GetSessionLayer()):
+            variants.SetVariantSelection("points")
+    return Shot(stage)
 
 
 @dataclass(frozen=True)

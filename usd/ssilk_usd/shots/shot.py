@@ -18,7 +18,7 @@ from ..opening.garment_api import GarmentRecord
 from ..units import StageUnits
 from ..writing.author import define_asset
 from ..writing.body_faces import HiddenPolygons
-from ..writing.export import need_layer_suffix
+from ..writing.export import need_layer_suffix, save
 from .samples import Samples
 
 # A save lets go of the samples (less than 1 kB a frame remains, for the tables of their times), but leaves each
@@ -110,6 +110,19 @@ def write_samples(
             samples.save(path)
     samples.layer.customLayerData = {"ssilk": _metadata(provenance or {})}
     samples.save(path)
+
+
+def add_provenance(path: str | Path, facts: Mapping[str, object]) -> None:
+    """Add to what a written shot says of its origin.
+
+    Raises:
+        SsilkError: the file cannot be written.
+    """
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    said = dict(layer.customLayerData)
+    said["ssilk"] = {**said.get("ssilk", {}), **{name: _metadata(value) for name, value in facts.items()}}
+    layer.customLayerData = said
+    save(layer, path)
 
 
 @dataclass(frozen=True)
