@@ -21,7 +21,7 @@ from ..delivery.bake.request import (
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..files import need_not_input, need_writable
+from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
@@ -245,8 +245,6 @@ def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) 
 
 def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     """Return a request for each model over each motion, as the options of `add_bake` say."""
-    from ssilk_usd.opening.stage import split_location
-
     shots: list[tuple[str | None, naming.ListedShot]]
     if options.shots:
         if options.shot_name:
@@ -305,7 +303,7 @@ def is_folder(output: Path) -> bool:
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
     """Return the file that holds the garment, and the prim that was asked for."""
-    from ssilk_usd.opening.stage import USD_SUFFIXES, split_location
+    from ssilk_usd.opening.stage import USD_SUFFIXES
 
     file, prim = split_location(options.garment) if options.garment else ("", None)
     return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)

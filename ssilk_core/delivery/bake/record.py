@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ... import __version__, work_record
 from ...errors import SsilkError
-from ...files import relative_path, sha256
+from ...files import relative_path, sha256, split_location
 from ...work_record import Hash, WorkRecord, request_key
 from .inputs import InputHashes
 from .plain import from_plain
@@ -83,8 +83,6 @@ def portable(location: str, folder: Path) -> str:
     Where the two share nothing but the root, a hash tells the file from others of its name, and nothing tells where a
     studio keeps it.
     """
-    from ssilk_usd.opening.stage import split_location
-
     file, prim = split_location(location)
     path = relative_path(file, folder)
     if path is None:

@@ -13,12 +13,12 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
 from ..opening.garment_api import GarmentRecord, apply_garment_api
-from ..opening.stage import split_location
 from ..reading.mesh import display_colour
 from ..reading.skin import leaf
 from ..units import StageUnits

@@ -17,9 +17,10 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Ints, Mesh
 
-from ..opening.stage import EARLIEST, PRIMS, location, open_stage, split_location
+from ..opening.stage import EARLIEST, PRIMS, location, open_stage
 from ..reading.mesh import is_garment, kept_faces, polygons
 from .body_faces import face_kind
 

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
@@ -23,7 +24,6 @@ from ..opening.stage import (
     inherited,
     location,
     open_stage,
-    split_location,
     value,
 )
 from ..reading.carried import carried_by
