@@ -28,7 +28,7 @@ from ..opening.stage import (
 )
 from ..reading.carried import carried_by
 from ..reading.garment import fitted_skeleton, garment_place
-from ..reading.mesh import is_garment, winds_backwards
+from ..reading.mesh import is_garment
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
@@ -113,15 +113,10 @@ def _place_garment(
         moved = garment.mesh.points - apply(place.to_core, np.array(value(old, "points"), dtype=np.float64))
     if moved is not None:
         offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(place.to_core[:3, :3]).T)
-    backwards = winds_backwards(old)
     if carried_by(old, own):
         old = _let_go(stage, skel, old)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
-    if winds_backwards(old) != backwards:  # under other xforms, which mirror it, or no longer
-        tokens = UsdGeom.Tokens
-        turned = tokens.rightHanded if value(old, "orientation") == tokens.leftHanded else tokens.leftHanded
-        UsdGeom.Mesh(old).CreateOrientationAttr(turned)
     return UsdGeom.Mesh(old), to_bind
 
 
