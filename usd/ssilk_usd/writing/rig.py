@@ -29,6 +29,7 @@ from ..opening.stage import (
 from ..reading.carried import carried_by
 from ..reading.garment import fitted_skeleton, garment_place
 from ..reading.mesh import is_garment
+from ..reading.shapes import shape_offsets
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
@@ -39,6 +40,8 @@ from .export import export, need_layer_suffix
 from .look import copy_looks
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
+
+SAME_SHAPE = 1e-7  # of a garment's size, by which its points may differ and are left as they are
 
 
 def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> None:
@@ -62,10 +65,12 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene, moved, out)
+    mesh, to_bind, wanted = _place_garment(stage, skel, source, scene, moved, out)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
+    if wanted is not None:
+        _shape_garment(mesh, skel, wanted)
     export(layer, out)
 
 
@@ -94,30 +99,46 @@ def _prim_path(where: str) -> str:
 
 def _place_garment(
     stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None, out: str | Path
-) -> tuple[UsdGeom.Mesh, Floats]:
-    """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
+) -> tuple[UsdGeom.Mesh, Floats, Floats | None]:
+    """Return the garment's mesh beneath the SkelRoot, its own space to bind space, and its shape in its own space.
 
-    A mesh of the stage keeps its points but for what `moved`, and is moved if it stands elsewhere; one from its own
-    file is copied.
+    A mesh of the stage is moved if it stands elsewhere; one from its own file is copied.
+
+    Returns:
+        The mesh; a transform (4, 4); and where its points are to be once it is bound, with the blendshapes that are
+        on then, shape (V, 3): None where they stay as they are.
     """
     garment, skeleton = scene.garment, scene.character.skeleton
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
     if not (same and old and old.IsA(UsdGeom.Mesh)):
-        return _copy_garment(stage, skel, garment, out), np.eye(4)
+        return _copy_garment(stage, skel, garment, out), np.eye(4), None
     own = fitted_skeleton(old, str(skel.prim.GetPath())) or skel
     place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
     to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
+    shaped, wanted = shape_offsets(old, own), None
     if place.moves is not None:  # to its bind pose, which another skeleton has otherwise
-        moved = garment.mesh.points - apply(place.to_core, np.array(value(old, "points"), dtype=np.float64))
-    if moved is not None:
-        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(place.to_core[:3, :3]).T)
+        wanted = apply(np.linalg.inv(place.to_core), garment.mesh.points)
+    elif moved is not None or shaped is not None:
+        wanted = np.array(value(old, "points"), dtype=np.float64) + (0 if shaped is None else shaped)
+        wanted += 0 if moved is None else moved @ np.linalg.inv(place.to_core[:3, :3]).T
     if carried_by(old, own):
         old = _let_go(stage, skel, old)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
-    return UsdGeom.Mesh(old), to_bind
+    return UsdGeom.Mesh(old), to_bind, wanted
+
+
+def _shape_garment(mesh: UsdGeom.Mesh, skel: SkelSource, wanted: Floats) -> None:
+    """Move the points of a bound garment so that they are where they are `wanted`, (V, 3), in its own space.
+
+    Blendshapes that its new skeleton has on add to them; those that only its old one had on no longer do.
+    """
+    on = shape_offsets(mesh.GetPrim(), skel)
+    offsets = wanted - np.array(value(mesh.GetPrim(), "points"), dtype=np.float64) - (0 if on is None else on)
+    if np.abs(offsets).max() > SAME_SHAPE * np.ptp(wanted, axis=0).max():
+        offset_points(mesh, offsets)
 
 
 def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Floats | None) -> None:
