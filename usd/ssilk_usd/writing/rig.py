@@ -44,7 +44,7 @@ from .surface import reads_as, shield_surface, write_surface
 SAME_SHAPE = 1e-7  # of a garment's size, by which its points may differ and are left as they are
 
 
-def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> None:
+def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> str:
     """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
@@ -58,6 +58,9 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         out: the file to write: .usdc, .usd or .usda.
         moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
 
+    Returns:
+        What a garment from a file of its own loses of its look, for messages; empty where nothing.
+
     Raises:
         SsilkError: the output cannot be written.
     """
@@ -65,13 +68,19 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind, wanted = _place_garment(stage, skel, source, scene, moved, out)
+    old, left_out, wanted = _in_stage(stage, source, scene.garment), "", None
+    if old:
+        mesh, to_bind, wanted = _place_garment(stage, skel, old, scene, moved)
+    else:
+        mesh, left_out = _copy_garment(stage, skel, scene.garment, out)
+        to_bind = np.eye(4)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
     if wanted is not None:
         _shape_garment(mesh, skel, wanted)
     export(layer, out)
+    return left_out
 
 
 def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
@@ -97,23 +106,24 @@ def _prim_path(where: str) -> str:
     return split_location(where)[1] or where
 
 
-def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None, out: str | Path
-) -> tuple[UsdGeom.Mesh, Floats, Floats | None]:
-    """Return the garment's mesh beneath the SkelRoot, its own space to bind space, and its shape in its own space.
-
-    A mesh of the stage is moved if it stands elsewhere; one from its own file is copied.
-
-    Returns:
-        The mesh; a transform (4, 4); and where its points are to be once it is bound, with the blendshapes that are
-        on then, shape (V, 3): None where they stay as they are.
-    """
-    garment, skeleton = scene.garment, scene.character.skeleton
+def _in_stage(stage: Usd.Stage, source: str | Path, garment: Garment) -> Usd.Prim | None:
+    """Return the mesh of a garment that was read from the character's stage; None for one from its own file."""
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
-    if not (same and old and old.IsA(UsdGeom.Mesh)):
-        return _copy_garment(stage, skel, garment, out), np.eye(4), None
+    return old if same and old and old.IsA(UsdGeom.Mesh) else None
+
+
+def _place_garment(
+    stage: Usd.Stage, skel: SkelSource, old: Usd.Prim, scene: Scene, moved: Floats | None
+) -> tuple[UsdGeom.Mesh, Floats, Floats | None]:
+    """Bring a garment's mesh beneath the SkelRoot, where it stands elsewhere.
+
+    Returns:
+        The mesh; its own space to bind space, shape (4, 4); and where its points are to be once it is bound, with
+        the blendshapes that are on then, shape (V, 3): None where they stay as they are.
+    """
+    garment, skeleton = scene.garment, scene.character.skeleton
     own = fitted_skeleton(old, str(skel.prim.GetPath())) or skel
     place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
     to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
@@ -179,8 +189,13 @@ def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
     return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
-def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path) -> UsdGeom.Mesh:
-    """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
+def _copy_garment(
+    stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path
+) -> tuple[UsdGeom.Mesh, str]:
+    """Define the garment below the SkelRoot in the stage's bind space, and say what its look loses.
+
+    An older copy is replaced.
+    """
     name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
@@ -188,8 +203,8 @@ def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str
     points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
     path, file = _free_path(skel, name), split_location(garment.mesh.path)[0]
     mesh = define_mesh(stage, path, replace(garment.mesh, points=points), StageUnits())
-    copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
-    return mesh
+    left = copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
+    return mesh, str(left)
 
 
 def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
