@@ -133,6 +133,36 @@ def test_variants_switch_what_deforms_the_garment(copy):
     assert np.abs(full - full.mean(axis=1, keepdims=True) - centred).max() > 1e-3
 
 
+def test_shots_of_one_model_are_value_clips_of_its_asset(copy, toy):
+    """UsdClipsAPI plays samples alone: whatever is constant has to be the asset's, and alike in all shots."""
+    bend = Usd.Stage.Open(str(toy.write_clip(copy / "bend.usda", frames=10)))
+    rotations = UsdSkel.Animation(bend.GetPrimAtPath("/Clip")).GetRotationsAttr()
+    for frame in range(10):  # another joint than in the other shots
+        turned = Gf.Quatf(float(np.cos(frame / 20)), float(np.sin(frame / 20)), 0, 0)
+        rotations.Set([rotations.Get(frame)[0], turned, *rotations.Get(frame)[2:]], frame)
+    bend.Save()
+    del bend, rotations
+    assert bake("--motion bend.usda -o layers") == 0
+    shots, starts = ("walk", "bend"), (0.0, 20.0)
+    stage = Usd.Stage.CreateNew("edit.usda")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    prim = stage.DefinePrim("/World/Cape")
+    prim.GetReferences().AddReference("layers/assets/skirt/asset.usda")
+    clips = Usd.ClipsAPI(prim)
+    clips.SetClipAssetPaths([Sdf.AssetPath(str(anim(shot))) for shot in shots])
+    clips.SetClipPrimPath("/skirt")
+    clips.SetClipActive([(start, number) for number, start in enumerate(starts)])
+    clips.SetClipTimes([(start + time, time) for start in starts for time in (0.0, 15.0)])
+    stage.SetTimeCodesPerSecond(30.0)
+    stage.Save()
+    for shot, start in zip(shots, starts):
+        expected = garment_points(anim(shot))
+        found = garment_points(stage, [start + time for time in range(len(expected))])
+        assert np.abs(found - expected).max() < 1e-5, shot
+    assert len(garment_points(anim("bend"))) == 10 and np.ptp(garment_points(anim("bend")), axis=0).max() > 0.05
+
+
 @pytest.mark.parametrize("choice", ["skel", "rest", "points"])
 def test_each_variant_is_valid(copy, choice):
     stage = Usd.Stage.Open(str(anim()))

@@ -251,7 +251,12 @@ def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report:
     from ssilk_usd.shots import layers
 
     written = layers.write_asset(
-        layout, garment.deformer, garment.units, include_body=task.include_body, record=garment.record
+        layout,
+        garment.deformer,
+        garment.units,
+        include_body=task.include_body,
+        record=garment.record,
+        lean=task.request.receiver.lean,
     )
     for change in written.changes:
         report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))

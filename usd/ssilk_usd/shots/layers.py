@@ -35,7 +35,7 @@ from ..writing.author import Asset, define_asset, define_blendshapes, extent_arr
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import new_stage, save
 from .layers_facts import AssetFacts, asset_facts
-from .samples import PATH_OP, Samples, kept_joints, root_path
+from .samples import PATH_OP, Samples, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 
 DEFORMATION, QUALITY = "deformation", "quality"
@@ -93,8 +93,15 @@ def write_asset(
     *,
     include_body: bool = True,
     record: GarmentRecord | None = None,
+    lean: bool = True,
 ) -> WrittenAsset:
     """Write a garment's asset; files that hold the same already are left alone.
+
+    Args:
+        include_body: with the body meshes.
+        record: how the garment was made, kept on its mesh.
+        lean: with the translation of the SkelRoot by which lean shots move it (see `samples.Samples`), so that they
+            are value clips of the asset alone.
 
     Raises:
         SsilkError: as `author.define_asset` does, or a file cannot be written.
@@ -114,6 +121,8 @@ def write_asset(
     with replacing(layout.asset, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
         _define_component(stage, asset, layout, box)
+        if lean:
+            _define_path(stage.GetDefaultPrim()).Set(Gf.Vec3d(0))
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.asset)
         del stage
@@ -201,11 +210,11 @@ def write_animation(
     with replacing(path or layout.animation) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
-        _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
+        _define_animation(stage, asset, layout, deformer)
         asset = _define_own_shapes(stage, asset, deformer, units)
         set_metadata(stage, span, units)
         if lean:
-            UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
+            _define_path(stage.GetPrimAtPath(asset.root))
         set_visibility(stage, asset.root, span, hidden)
         if hidden_polygons and asset.bodies:
             meshes = [body.mesh for body in asset.bodies]
@@ -220,13 +229,15 @@ def write_animation(
     return summary(layout.animation, deformer, motion, span, len(asset.shapes))
 
 
-def kept_names(deformer: Deformer, motion: Motion, lean: bool) -> list[str]:
-    """Return the joints that a shot animates."""
-    return [deformer.scene.joint_names[joint] for joint in kept_joints(deformer, motion, lean)]
+def _define_path(root: Usd.Prim) -> Usd.Attribute:
+    """Make the path of the character's root the translation of a SkelRoot."""
+    UsdGeom.Xformable(root).CreateXformOpOrderAttr([PATH_OP])
+    return root.CreateAttribute(PATH_OP, Sdf.ValueTypeNames.Double3, False)
 
 
-def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, joints: list[str]) -> None:
-    """Reference the asset, and override its SkelAnimation with the joints that this shot moves."""
+def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, deformer: Deformer) -> None:
+    """Reference the asset, and override its SkelAnimation with the joints that the deformer has now."""
+    joints = deformer.scene.joint_names
     root = stage.DefinePrim(asset.root)
     stage.SetDefaultPrim(root)
     root.GetReferences().AddReference(os.path.relpath(layout.asset, layout.animation.parent))
