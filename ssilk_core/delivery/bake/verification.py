@@ -132,8 +132,8 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     found = compare_points(shot, expected, samples_per_frame=samples)
     if not found.passed:
         todo = "bake it again, closer to the origin if it is many kilometres away"
-        if isinstance(shot, GlbShot) and shot.is_quantized:
-            todo = "another program stored its vertices as integers, which rounds them: verify it before that"
+        if isinstance(shot, GlbShot) and shot.rewritten:
+            todo = f"{shot.rewritten}: verify it before that"
         raise VerificationError(
             f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
             f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; {todo}."

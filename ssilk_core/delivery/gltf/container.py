@@ -16,6 +16,7 @@ from ...errors import fail
 
 Document = dict[str, Any]
 
+GENERATOR = "ssilk"  # begins what the file says of who wrote it
 MAGIC, VERSION, JSON, BINARY = b"glTF", 2, b"JSON", b"BIN\0"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAX_BYTES = 2**32 - 1  # a length is stored in four bytes
@@ -37,7 +38,7 @@ class GlbBuilder:
     """
 
     def __init__(self) -> None:
-        self.document: Document = {"asset": {"version": "2.0", "generator": f"ssilk {__version__}"}}
+        self.document: Document = {"asset": {"version": "2.0", "generator": f"{GENERATOR} {__version__}"}}
         self._parts: list[bytes] = []
         self._size = 0
 

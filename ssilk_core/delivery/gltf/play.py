@@ -14,6 +14,7 @@ import numpy as np
 from ...errors import fail
 from ...scene.assets import Floats, Ints
 from .channel import NodeChannel
+from .container import GENERATOR
 from .file import GlbFile, understood
 from .nodes import node_transform
 from .shot import GARMENT
@@ -50,7 +51,7 @@ class GlbShot:
         fps: frames per second.
         frame_times: time code of each frame.
         meshes: every mesh of the file, in its order.
-        is_quantized: vertices are stored as integers, which rounds them.
+        rewritten: what another program may have done to the file since it was baked; empty where none wrote it.
     """
 
     is_skinned = True
@@ -62,9 +63,9 @@ class GlbShot:
             SsilkError: not a readable file, or not one that `write_glb` wrote.
         """
         self.name, self._file = str(path), GlbFile(path)
-        self.is_quantized = self._file.is_quantized
         with self._understood():
             document = self._file.document
+            self.rewritten = _rewritten(self._file)
             timing = document["asset"].get("extras", {})
             if "timeCodesPerSecond" not in timing:
                 fail(self.name, "no times of a shot in its asset.extras", WRITTEN, "keep extras when you rewrite it")
@@ -129,6 +130,16 @@ class GlbShot:
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document of another shape than `write_glb` writes."""
         return understood(self.name, "another or a damaged glb", WRITTEN, "bake it again")
+
+
+def _rewritten(file: GlbFile) -> str:
+    generator = str(file.document["asset"].get("generator", "another program"))
+    if generator.startswith(GENERATOR):
+        return ""
+    did = "reordered vertices or dropped keys"
+    if file.is_quantized:
+        did = "stored vertices as integers, which rounds them"
+    return f"{generator[:60]} wrote it anew, and may have {did}"
 
 
 @dataclass(frozen=True, eq=False)
