@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from ..writing.author import extent_array
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
 from .shot import ShotSummary, write_shot
+from .velocities import cut_frames, with_velocities
 
 FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
 
@@ -43,6 +44,7 @@ class PointCache:
         self.layer = Sdf.Layer.FindOrOpen(str(path))
         stage = Usd.Stage.Open(self.layer, None)
         self.garment, self.root = _unbind(stage), stage.GetDefaultPrim().GetPath()
+        UsdGeom.Mesh(stage.GetPrimAtPath(self.garment)).CreateVelocitiesAttr()
 
     def write(self, frame: int, points: Floats) -> None:
         """Write the garment's points [m], y up, shape (V, 3), of one frame of the shot.
@@ -73,6 +75,20 @@ class PointCache:
     def _set(self, name: str, time: float, value: object) -> None:
         self.layer.SetTimeSample(self.garment.AppendProperty(name), time, value)
 
+    def add_velocities(self, cuts: Container[int]) -> None:
+        """Write the velocities of the points once all frames are there; none leads across `cuts`.
+
+        See `velocities`: frames may have come in any order.
+        """
+        points = self.garment.AppendProperty("points")
+        times = self.shot.start + self.step * np.arange(self.frame_count)
+        read = (np.array(self.layer.QueryTimeSample(points, float(time)), dtype=np.float64) for time in times)
+        for time, (_, moving) in zip(times, with_velocities(read, self.shot.fps / self.step, cuts)):
+            self._set("velocities", float(time), Vt.Vec3fArray.FromNumpy(moving.astype(np.float32)))
+            self.unsaved_count += 1
+            if self.unsaved_count >= FRAMES_PER_SAVE:
+                self.save()
+
     def save(self) -> None:
         """Write pending changes to the file."""
         save(self.layer, self.path)
@@ -95,6 +111,8 @@ def point_cache(
     record: GarmentRecord | None = None,
 ) -> Iterator[PointCache]:
     """Yield a cache that takes the garment's points frame by frame; the file appears once all are in it.
+
+    Their velocities are added then, for motion blur.
 
     Character, body and time codes are those of a shot by `write_shot`; the garment is bound to nothing.
 
@@ -129,6 +147,7 @@ def point_cache(
         missing = int((~cache.written).sum())
         if missing:
             fail(str(path), f"{missing} of {motion.frame_count} frames have no points", "every frame needs points")
+        cache.add_velocities(cut_frames(motion, scene.character.skeleton))
         cache.save()
         del cache  # the file is closed before it is renamed
 
