@@ -176,13 +176,20 @@ def add_range(verb: argparse.ArgumentParser, what: str, default: str) -> None:
 
 
 def _add_names(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say how garments and shots are named in a folder."""
-    names = verb.add_argument_group("names in a folder of layers", f"In a pattern, {naming.FIELDS}.")
+    """Add the options that say how garments and shots are named in a folder, and what assets say of themselves."""
+    about = f"Names are those in a folder of layers. In a pattern, {naming.FIELDS}."
+    names = verb.add_argument_group("names and versions", about)
     names.add_argument("--shot-name", metavar="PATTERN",
                        help="such as s010 for one motion, or '{parent2}_{stem}' (default: the file's, and the prim's "
                             "where one is named)")  # fmt: skip
     names.add_argument("--garment-name", metavar="PATTERN",
                        help="such as cape, or '{parent}' (default: the model's, with ROOT in front)")  # fmt: skip
+    names.add_argument("--asset-version", metavar="PATTERN",
+                       help="of the garment, in the assetInfo of what is written, such as v012, or '{parent}' "
+                            "(default: a hash of the model)")  # fmt: skip
+    names.add_argument("--asset-identifier", metavar="PATTERN",
+                       help="likewise, such as 'studio:/cloth/{stem}' (default: the asset's own layer; none in a "
+                            "file)")  # fmt: skip
     names.add_argument("--replace", action="store_true",
                        help="bake even where a name was used for another input before")  # fmt: skip
 
@@ -253,7 +260,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     else:
         listed = map(naming.ListedShot, options.motion)
         shots = [(_name(options.shot_name, shot.motion, "--shot-name"), shot) for shot in listed]
-    worn = [(split_location(model), _name(options.garment_name, model, "--garment-name")) for model in options.model]
+    worn = [
+        (model, split_location(model), _name(options.garment_name, model, "--garment-name"))
+        for model in options.model
+    ]
     return [
         BakeRequest(
             model=model,
@@ -276,8 +286,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             device=options.device,
             garment=garment,
             shot=name,
+            asset_version=_name(options.asset_version, whole, "--asset-version"),
+            asset_identifier=_name(options.asset_identifier, whole, "--asset-identifier"),
         )
-        for (model, root), garment in worn
+        for whole, (model, root), garment in worn
         for name, shot in shots
     ]
 

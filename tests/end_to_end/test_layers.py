@@ -284,6 +284,26 @@ def test_a_model_of_more_influences_than_layers_of_a_target_share_is_refused_bef
     assert main(shlex.split(words)) == 0
 
 
+def test_assets_say_who_they_are_and_of_which_version(copy, capsys):
+    model = sha256("skirt.safetensors")
+    stage = Usd.Stage.Open(str(anim()))
+    info = Usd.ModelAPI(stage.GetDefaultPrim())
+    assert (info.GetAssetName(), info.GetAssetVersion()) == ("skirt", model[:12])
+    found = Path(info.GetAssetIdentifier().resolvedPath)  # of the asset, through the reference of the shot
+    assert found == copy / "layers/assets/skirt/asset.usda"
+    named = "--motion walk.usda --asset-version v012 --asset-identifier 'studio:/cloth/{stem}'"
+    assert bake(f"{named} -o layers") == 0 and bake(f"{named} -o new.usdc") == 0
+    for path, name in ((Path("layers/shots/walk/shot.usda"), "skirt"), (Path("new.usdc"), "Hero")):
+        stage = Usd.Stage.Open(str(path))
+        prim = stage.GetPrimAtPath("/Shot/skirt") or stage.GetDefaultPrim()
+        info = Usd.ModelAPI(prim)
+        assert (info.GetAssetName(), info.GetAssetVersion()) == (name, "v012")
+        assert info.GetAssetIdentifier().path == "studio:/cloth/skirt"
+    capsys.readouterr()
+    assert bake("--motion walk.usda --asset-version 'v\x1b[1m' -o odd.usdc") == 2
+    assert "1 to 1000 printable characters are allowed" in capsys.readouterr().err
+
+
 def test_a_package_is_what_arkit_takes(copy, capsys):
     capsys.readouterr()
     assert bake("--motion walk.usda --target arkit -o new.usdc") == 2

@@ -256,6 +256,7 @@ def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report:
         garment.units,
         include_body=task.include_body,
         record=garment.record,
+        info=garment.info,
         lean=task.request.receiver.lean,
     )
     for change in written.changes:

@@ -148,7 +148,7 @@ def _write(
     }
     if output.suffix == GLB:
         return write_glb_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
-    common |= {"units": rollout.units, "record": rollout.record}
+    common |= {"units": rollout.units, "record": rollout.record, "info": rollout.info}
     if not rollout.request.writes_points:
         return write_shot(layer, rollout.deformer, rollout.motion, meter.poses(), **common)
     meter.add_points()

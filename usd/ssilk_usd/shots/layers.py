@@ -31,6 +31,7 @@ from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
 from ..reading.mesh import is_garment
 from ..units import StageUnits
+from ..writing.asset_info import AssetInfo, author_asset_info
 from ..writing.author import Asset, define_asset, define_blendshapes, extent_array
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import new_stage, save
@@ -94,6 +95,7 @@ def write_asset(
     *,
     include_body: bool = True,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
     lean: bool = True,
 ) -> WrittenAsset:
     """Write a garment's asset; files that hold the same already are left alone.
@@ -101,6 +103,7 @@ def write_asset(
     Args:
         include_body: with the body meshes.
         record: how the garment was made, kept on its mesh.
+        info: of the asset; its identifier is the asset's own layer where none is given.
         lean: with the translation of the SkelRoot by which lean shots move it (see `samples.Samples`), so that they
             are value clips of the asset alone.
 
@@ -121,7 +124,7 @@ def write_asset(
         geometry = sha256(temporary)
     with replacing(layout.asset, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
-        _define_component(stage, asset, layout, box)
+        _define_component(stage, asset, layout, box, info or AssetInfo())
         if lean:
             _define_path(stage.GetDefaultPrim()).Set(Gf.Vec3d(0))
         free_when_closed(stage.GetUsedLayers())
@@ -149,13 +152,15 @@ def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
     return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
 
 
-def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray) -> None:
+def _define_component(
+    stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray, info: AssetInfo
+) -> None:
     """Define the SkelRoot over its payload, with bounds that need no payload, and the variants."""
     root = UsdSkel.Root.Define(stage, asset.root).GetPrim()
     stage.SetDefaultPrim(root)
-    model = Usd.ModelAPI(root)
-    model.SetKind(Kind.Tokens.component)
-    model.SetAssetName(layout.garment)
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    identifier = info.identifier or f"./{layout.asset.name}"
+    author_asset_info(root, layout.garment, replace(info, identifier=identifier))
     UsdGeom.Boundable(root).CreateExtentAttr(box)
     root.GetPayloads().AddPayload(f"./{layout.geometry.name}", asset.root)
     with _variant(root, DEFORMATION, "rest"):

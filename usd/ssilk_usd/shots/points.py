@@ -19,6 +19,7 @@ from ..opening.garment_api import GarmentRecord
 from ..opening.stage import PRIMS
 from ..reading.mesh import is_garment
 from ..units import StageUnits
+from ..writing.asset_info import AssetInfo
 from ..writing.author import extent_array
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
@@ -109,6 +110,7 @@ def point_cache(
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
 ) -> Iterator[PointCache]:
     """Yield a cache that takes the garment's points frame by frame; the file appears once all are in it.
 
@@ -120,8 +122,8 @@ def point_cache(
         path: the file to write: .usdc, .usd, or .usda for people.
         motion: the character's motion at the samples of the shot, whose rate becomes the shot's.
         start: time code of the first frame, by default the motion's own.
-        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record: as `write_shot` takes
-            them.
+        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record, info: as `write_shot`
+            takes them.
 
     Raises:
         SsilkError: frames are missing at the end, or the file cannot be written.
@@ -141,6 +143,7 @@ def point_cache(
             hidden_polygons=hidden_polygons,
             provenance=provenance,
             record=record,
+            info=info,
         )
         cache = PointCache(temporary, shot, scene.garment.mesh.vertex_count, units, samples_per_frame)
         yield cache
