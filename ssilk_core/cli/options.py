@@ -184,6 +184,8 @@ def _add_names(verb: argparse.ArgumentParser) -> None:
                             "where one is named)")  # fmt: skip
     names.add_argument("--garment-name", metavar="PATTERN",
                        help="such as cape, or '{parent}' (default: the model's, with ROOT in front)")  # fmt: skip
+    names.add_argument("--level-of", metavar="GARMENT",
+                       help="these are levels of quality of a garment of the shot: variants of its prim")  # fmt: skip
     names.add_argument("--asset-version", metavar="PATTERN",
                        help="of the garment, in the assetInfo of what is written, such as v012, or '{parent}' "
                             "(default: a hash of the model)")  # fmt: skip
@@ -286,6 +288,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             device=options.device,
             garment=garment,
             shot=name,
+            level_of=options.level_of,
             asset_version=_name(options.asset_version, whole, "--asset-version"),
             asset_identifier=_name(options.asset_identifier, whole, "--asset-identifier"),
         )

@@ -58,6 +58,7 @@ class BakeRequest:
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.
+        level_of: name of a garment of the shot that this is a level of quality of; None for a garment of its own.
         asset_version: of the garment, in the `assetInfo` of what is written; None for a hash of the model.
         asset_identifier: likewise; None for the asset's own layer, and for none in a file.
 
@@ -86,6 +87,7 @@ class BakeRequest:
     device: str = "cpu"
     garment: str | None = None
     shot: str | None = None
+    level_of: str | None = None
     asset_version: str | None = None
     asset_identifier: str | None = None
 

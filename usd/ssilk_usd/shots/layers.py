@@ -40,7 +40,8 @@ from .samples import PATH_OP, Samples, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 from .velocities import cut_frames, with_velocities
 
-DEFORMATION, QUALITY = "deformation", "quality"
+DEFORMATION, QUALITY, LEVEL = "deformation", "quality", "level"
+OWN_LEVEL = "default"  # the level that a garment with others is itself
 FRAMES_PER_SAVE = 64  # of points and velocities: 5 MB in memory for a garment of 3,000 vertices
 
 
@@ -339,13 +340,20 @@ class WrittenStage:
     bodies: Mapping[str, str]
 
 
-def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = frozenset()) -> WrittenStage:
+def write_stage(
+    garments: Mapping[Layout, Hashable],
+    needed: Container[str] = frozenset(),
+    levels: Mapping[str, str] | None = None,
+) -> WrittenStage:
     """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
+
+    A garment with levels of quality is one prim, of which each is a variant of `LEVEL`.
 
     Args:
         garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
             its garments that has one. If none can be read, no stage is written.
         needed: names of garments that have to be in it; others are left out where they cannot be read.
+        levels: names of garments that are levels of another one, by their own.
 
     Raises:
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
@@ -368,18 +376,42 @@ def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = fr
             stage.SetMetadata(name, first.pseudoRoot.GetInfo(name))
         stage.SetStartTimeCode(min(start for start, _ in spans))
         stage.SetEndTimeCode(max(end for _, end in spans))
-        for garment, opened in stages.items():
-            prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
-            prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
-            bodies = _body_names(opened)
-            if bodies and shown.setdefault(garments[garment], garment.garment) != garment.garment:
-                others[garment.garment] = shown[garments[garment]]
-                for name in bodies:
-                    stage.OverridePrim(prim.GetPath().AppendChild(name)).SetActive(False)
+        grouped: dict[str, list[Layout]] = {}
+        for garment in stages:
+            grouped.setdefault((levels or {}).get(garment.garment, garment.garment), []).append(garment)
+        for name, group in grouped.items():
+            prim = stage.DefinePrim(shot.GetPath().AppendChild(name))
+            _reference_levels(prim, name, group)
+            for garment in group:
+                bodies = _body_names(stages[garment])
+                if bodies and shown.setdefault(garments[garment], name) != name:
+                    others[garment.garment] = shown[garments[garment]]
+                    for body in bodies:
+                        stage.OverridePrim(prim.GetPath().AppendChild(body)).SetActive(False)
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.stage)
         del stage, shot, prim
     return WrittenStage(unreadable, others)
+
+
+def _reference_levels(prim: Usd.Prim, name: str, group: Sequence[Layout]) -> None:
+    """Reference a garment, or each of its levels in a variant; the garment that gave the name is selected."""
+    if [garment.garment for garment in group] == [name]:
+        prim.GetReferences().AddReference(_from_stage(group[0]))
+        return
+    for garment in sorted(group, key=lambda each: each.garment == name):  # what is added last is selected
+        with _variant(prim, LEVEL, level_name(garment.garment, name)):
+            prim.GetReferences().AddReference(_from_stage(garment))
+
+
+def level_name(garment: str, base: str) -> str:
+    """Return the variant that a garment is as a level of another one: `cape_game` is the level `game` of `cape`."""
+    own = garment.removeprefix(f"{base}_")
+    return OWN_LEVEL if garment == base else garment if own in ("", OWN_LEVEL) else own
+
+
+def _from_stage(layout: Layout) -> str:
+    return os.path.relpath(layout.animation, layout.stage.parent)
 
 
 def _opened(garments: Iterable[Layout], needed: Container[str]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:
