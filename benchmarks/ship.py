@@ -31,12 +31,12 @@ from precision import (
     means,
     packed_subject,
 )
-from ssilk_usd.opening.stage import split_location
 
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import need_trained_on, shipped_path
 from ssilk_core.errors import SsilkError, fail
+from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import ModelFile, save_model
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.scene.assets import Motion, Scene

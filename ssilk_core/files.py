@@ -141,6 +141,13 @@ def is_usd(path: Path) -> bool:
     return path.suffix in USD_NAMES or begins.startswith(USD_BEGINNINGS)
 
 
+def split_location(text: str) -> tuple[str, str | None]:
+    """Split "file[:/Prim/Path]" into file and prim path (None without one)."""
+    file, colon, prim = text.rpartition(":/")
+    # "C:/file.usd" is a file: the part before a prim path must have a suffix.
+    return (file, f"/{prim}") if colon and Path(file).suffix else (text, None)
+
+
 def need_writable(target: str | Path) -> None:
     """Check before a long task that `target` can be written; leave no file behind.
 

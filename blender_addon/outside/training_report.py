@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from math import isfinite
 from typing import Any
 
-from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS
+from ssilk_core.training.verdict import ADVICE, NO_DYNAMICS, percent, share_below
 
 from .jobs import JobState
 
@@ -98,8 +98,8 @@ def compared(total: float | None, lbs: float | None) -> tuple[str, bool]:
     """Return how the energy of a validation [J] compares with that of linear blend skinning."""
     if total is None or lbs is None or not isfinite(total - lbs):
         return ("The energy of the validation is not finite", True)
-    share = 1 - total / lbs if lbs else 0.0
-    return (f"{abs(share):.1%} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0)
+    share = share_below(total, lbs)
+    return (f"{percent(share)} {'less' if share >= 0 else 'more'} energy than linear blend skinning", share < 0)
 
 
 def dynamics(moved: float) -> tuple[str, bool]:

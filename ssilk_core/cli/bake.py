@@ -57,6 +57,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if len(requests) != 1 or options.points:
         found, allowed = "one file", "it holds one garment in one shot and no point cache"
         fail(str(options.output), found, allowed, "name a folder")
+    if options.level_of:
+        fail("--level-of", "one file", "levels are variants of a shot in a folder of layers", "name a folder")
     library.bake(
         requests[0],
         options.output,

@@ -9,6 +9,7 @@ host needs a GPU. Both commands take the size of chunks as the job's parameters:
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -67,12 +68,12 @@ def _absolute(task: BakeTask) -> BakeTask:
 def _write(job: FarmJob, options: argparse.Namespace, report: Reporter) -> int:
     fixed = BundleOptions(memory=options.memory, timeout=options.timeout)
     write_bundle(options.bundle, job, options.output, fixed)
-    output = f" -p Output={options.output.absolute()}" if options.output else ""
+    output = ["-p", f"Output={options.output.absolute()}"] if options.output else []
     detail = {
         "bundle": str(options.bundle),
         "tasks": len(job.tasks),
-        "on this machine": f"openjd run {options.bundle / TEMPLATE}{output}",
-        "on Deadline Cloud": f"deadline bundle submit {options.bundle}",
+        "on this machine": shlex.join(["openjd", "run", str(options.bundle / TEMPLATE), *output]),
+        "on Deadline Cloud": shlex.join(["deadline", "bundle", "submit", str(options.bundle)]),
     }
     report(Result("farm", detail))
     return EXIT_OK

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import did_you_mean, fail
+from ..files import split_location
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,7 @@ def need_input(named: str, kind: Kind) -> None:
 
     Names that USD resolves in its own way, such as a file in a package, are left to it.
     """
-    file, colon, _ = named.rpartition(":/")
-    # "C:/file.usd" is a file: what stands before a prim has a suffix.
-    path = Path(file if colon and Path(file).suffix else named)
+    path = Path(split_location(named)[0])
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
     found, near = f"there is no such {kind.name}", ""

@@ -21,7 +21,7 @@ from ..delivery.bake.request import (
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..files import need_not_input, need_writable
+from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
@@ -176,13 +176,22 @@ def add_range(verb: argparse.ArgumentParser, what: str, default: str) -> None:
 
 
 def _add_names(verb: argparse.ArgumentParser) -> None:
-    """Add the options that say how garments and shots are named in a folder."""
-    names = verb.add_argument_group("names in a folder of layers", f"In a pattern, {naming.FIELDS}.")
+    """Add the options that say how garments and shots are named in a folder, and what assets say of themselves."""
+    about = f"Names are those in a folder of layers. In a pattern, {naming.FIELDS}."
+    names = verb.add_argument_group("names and versions", about)
     names.add_argument("--shot-name", metavar="PATTERN",
                        help="such as s010 for one motion, or '{parent2}_{stem}' (default: the file's, and the prim's "
                             "where one is named)")  # fmt: skip
     names.add_argument("--garment-name", metavar="PATTERN",
                        help="such as cape, or '{parent}' (default: the model's, with ROOT in front)")  # fmt: skip
+    names.add_argument("--level-of", metavar="GARMENT",
+                       help="these are levels of quality of a garment of the shot: variants of its prim")  # fmt: skip
+    names.add_argument("--asset-version", metavar="PATTERN",
+                       help="of the garment, in the assetInfo of what is written, such as v012, or '{parent}' "
+                            "(default: a hash of the model)")  # fmt: skip
+    names.add_argument("--asset-identifier", metavar="PATTERN",
+                       help="likewise, such as 'studio:/cloth/{stem}' (default: the asset's own layer; none in a "
+                            "file)")  # fmt: skip
     names.add_argument("--replace", action="store_true",
                        help="bake even where a name was used for another input before")  # fmt: skip
 
@@ -245,8 +254,6 @@ def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) 
 
 def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     """Return a request for each model over each motion, as the options of `add_bake` say."""
-    from ssilk_usd.opening.stage import split_location
-
     shots: list[tuple[str | None, naming.ListedShot]]
     if options.shots:
         if options.shot_name:
@@ -255,7 +262,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
     else:
         listed = map(naming.ListedShot, options.motion)
         shots = [(_name(options.shot_name, shot.motion, "--shot-name"), shot) for shot in listed]
-    worn = [(split_location(model), _name(options.garment_name, model, "--garment-name")) for model in options.model]
+    worn = [
+        (model, split_location(model), _name(options.garment_name, model, "--garment-name"))
+        for model in options.model
+    ]
     return [
         BakeRequest(
             model=model,
@@ -278,8 +288,11 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             device=options.device,
             garment=garment,
             shot=name,
+            level_of=options.level_of,
+            asset_version=_name(options.asset_version, whole, "--asset-version"),
+            asset_identifier=_name(options.asset_identifier, whole, "--asset-identifier"),
         )
-        for (model, root), garment in worn
+        for whole, (model, root), garment in worn
         for name, shot in shots
     ]
 
@@ -305,7 +318,7 @@ def is_folder(output: Path) -> bool:
 
 def wardrobe(options: argparse.Namespace) -> tuple[Path, str | None]:
     """Return the file that holds the garment, and the prim that was asked for."""
-    from ssilk_usd.opening.stage import USD_SUFFIXES, split_location
+    from ssilk_usd.opening.stage import USD_SUFFIXES
 
     file, prim = split_location(options.garment) if options.garment else ("", None)
     return (Path(file), prim) if Path(file).suffix in USD_SUFFIXES else (options.stage, options.garment)

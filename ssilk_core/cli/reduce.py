@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
+from ..files import split_location
 from ..quality.levels import SizeReduction, size_at, spend
 from . import options as shared
 
@@ -66,7 +67,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _motions(file: ModelFile, options: argparse.Namespace) -> list[Motion]:
     """Read the motions that were named, or those of the training whose files are still there."""
-    from ssilk_usd.opening.stage import split_location
     from ssilk_usd.reading.motion import read_motions
 
     known = file.provenance.get("motions", {})

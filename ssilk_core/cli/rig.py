@@ -70,7 +70,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report=report,
     )
     moved = settled.mesh.points - garment.mesh.points if settled else None
-    write_rigged_stage(options.stage, scene, options.output, moved=moved)
+    left_out = write_rigged_stage(options.stage, scene, options.output, moved=moved)
+    if left_out:
+        report(Message(f"{options.output}: {left_out}", "warning"))
     counts = np.bincount(scene.classes, minlength=3)
     report(
         Result(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 from ..delivery.targets import TARGETS
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
+from ..files import split_location
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Fit, write and verify."""
-    from ssilk_usd.opening.stage import open_stage, split_location
+    from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
     from ssilk_usd.reading.visibility import read_hidden
     from ssilk_usd.shots.trajectories import MeshTrajectories

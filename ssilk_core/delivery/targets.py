@@ -20,8 +20,8 @@ class Target:
     Attributes:
         influences: largest number of joints per vertex; None for no limit.
         meters_per_unit, up_axis: units [m] and up axis of the file; None for those of the character's stage.
-        lean: omit joints at rest from the animation, and store the root's path as a translation of the SkelRoot.
-            The layer is smaller, and exact far from the origin. The receiver must compose transforms as USD does.
+        lean: store the root's path as a translation of the SkelRoot. The layer is smaller, and exact far from the
+            origin. The receiver must compose transforms as USD does.
         variants: it selects variants, so that a single file keeps hidden faces of bodies as one. For others these
             faces are left out of it. Layers keep them for all, because whoever reads layers composes them.
         name_bytes: it finds joints by the last part of their paths, cut to so many bytes: no two may be alike. None

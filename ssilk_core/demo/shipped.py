@@ -75,7 +75,8 @@ def origin(file: ModelFile) -> str:
     alone = f", then {' and '.join(later)} of the stepper alone," if later else ""
     return (
         f"{made['iteration']:,} iterations{alone} on {len(made['motions'])} motions, seed {made['seed']}, "
-        f"{made['device']}, ssilk {made['ssilk']}, {shipped['date']}; on {shipped['held-out clips']} held-out motions "
+        f"{made['device']}, ssilk {made['ssilk']}, {shipped['date']}; "
+        f"on {shipped['held-out clips']} held-out motions "
         f"{shipped['energy [J]']:.3g} J, linear blend skinning {shipped['linear blend skinning [J]']:.3g} J, "
         f"{shipped['inside the body']:.2%} of its vertices inside the body; stored to 16 bits"
     )

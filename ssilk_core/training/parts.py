@@ -143,7 +143,7 @@ def _take_over(model: GarmentModel, base: ModelFile) -> bool:
     # Proxies come after points.
     goes_on = alike and (more_points == 0 or (more_points > 0 and not own.feedback_proxies))
     if goes_on and FIRST_WEIGHT in kept:
-        more = model.stepper[0].in_features - kept[FIRST_WEIGHT].shape[1]
+        more = model.get_parameter(FIRST_WEIGHT).shape[1] - kept[FIRST_WEIGHT].shape[1]
         kept[FIRST_WEIGHT] = nn.functional.pad(kept[FIRST_WEIGHT], (0, more))
     model.load_state_dict(
         {name: value for name, value in kept.items() if goes_on or not name.startswith(learns)}, strict=False

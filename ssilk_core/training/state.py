@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..errors import SsilkError, fail
-from ..files import replacing
+from ..files import replacing, split_location
 from ..network.tensors import pack_tensors, read_tensors
 from ..scene.assets import Scene
 from .curve import CurvePoint
@@ -276,8 +276,8 @@ def _located(identity: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
         left.pop(chosen, None)
 
     def located(location: str) -> str:
-        file, mark, prim = location.partition(":/")
-        return os.path.normpath(places.get(os.path.normpath(file), file)) + mark + prim
+        file, prim = split_location(location)
+        return os.path.normpath(places.get(os.path.normpath(file), file)) + (f":{prim}" if prim else "")
 
     parts = {name: identity[name] for name in ("inputs", "motions", "held out") if name in identity}
     moved: dict[str, Any] = {

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..files import split_location
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
 from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
@@ -94,7 +95,7 @@ class Validator:
         self.names = [f"clip {number + 1}" for number in range(len(self.clips))]
         self.first = [0] * len(self.clips)  # frames from time zero on, at the model's rate
         if spans is not None:
-            self.names = [PurePath(span.path.rpartition(":/")[0] or span.path).stem for span in spans]
+            self.names = [PurePath(split_location(span.path)[0]).stem for span in spans]
             self.first = [round(span.start * fps / span.fps) for span in spans]
         self.down = torch.tensor([0.0, -1.0, 0.0], device=rest.device)
 

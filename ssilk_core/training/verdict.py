@@ -22,7 +22,15 @@ ADVICE = "nothing dynamic is being learned: train longer, or check that the moti
 
 def lower_by(score: Score, lbs: Score) -> float:
     """Return how much lower a total is than linear blend skinning's, as a share of it; negative if higher."""
-    return 1 - score.total / lbs.total if lbs.total else 0.0
+    return share_below(score.total, lbs.total)
+
+
+def share_below(total: float, lbs: float) -> float:
+    """Return how much lower an energy [J] is than linear blend skinning's, as a share of its size.
+
+    Both may be below zero, since gravity's part is measured from a height.
+    """
+    return (lbs - total) / abs(lbs) if lbs else 0.0
 
 
 def percent(share: float) -> str:

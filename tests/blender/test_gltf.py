@@ -14,7 +14,7 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 from blender_addon.operators.gltf_export import proposed
 from blender_addon.playback import gltf
 from blender_addon.playback.gltf import SETTINGS, largest_loss
-from ssilk_core.delivery.gltf.container import GlbFile
+from ssilk_core.delivery.gltf.file import GlbFile
 from ssilk_core.delivery.gltf.skinned import SkinnedGlb
 from ssilk_core.errors import SsilkError
 

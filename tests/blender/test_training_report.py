@@ -10,7 +10,7 @@ import pytest
 
 from blender_addon.arrays.curves import COLORS, GROUND, picture, series
 from blender_addon.outside.jobs import JobState
-from blender_addon.outside.training_report import findings, improvement, progress
+from blender_addon.outside.training_report import compared, findings, improvement, progress
 
 SCORE = {"total": 0.6, "collisions": 0.0123, "dynamics": 0.023}
 CURVE = {"lbs": {"total": 1.0}, "points": [{"iteration": 5, "validation": SCORE}]}
@@ -113,3 +113,15 @@ def test_a_line_begins_where_its_term_does():
     image = picture([early, late], 65)
     columns = np.flatnonzero(np.isclose(image[..., :3], COLORS[1]).all(-1).any(axis=0))
     assert (columns[0], columns[-1]) == (32, 64)
+
+
+@pytest.mark.parametrize(
+    ("total", "lbs", "told", "worse"),
+    [
+        (-0.007, 1.0, "over 100% less energy than linear blend skinning", False),
+        (-2.0, -1.0, "100.0% less energy than linear blend skinning", False),
+        (-1.0, -2.0, "50.0% more energy than linear blend skinning", True),
+    ],
+)
+def test_energies_below_zero_are_no_more_than_all_lower(total, lbs, told, worse):
+    assert compared(total, lbs) == (told, worse)

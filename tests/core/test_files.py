@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from ssilk_core import files
+from ssilk_core.delivery.bake import naming, origin
 from ssilk_core.errors import SsilkError, VerificationError
 from ssilk_core.files import need_writable, remove_unfinished, remove_unfinished_in, replacing, sha256
 
@@ -147,3 +148,20 @@ def test_errors_name_the_target_however_deep_they_come_from(tmp_path):
         raise VerificationError(f"{inner}: vertex 3 is off, and {inner}:/Hero too.")
     assert str(caught.value) == f"{target}: vertex 3 is off, and {target}:/Hero too."
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("walk.usdc", ("walk.usdc", None)),
+        ("walk.usdc:/Clip", ("walk.usdc", "/Clip")),
+        ("C:/clips/walk.usdc", ("C:/clips/walk.usdc", None)),
+        ("C:/clips/walk.usdc:/World/Clip", ("C:/clips/walk.usdc", "/World/Clip")),
+    ],
+)
+def test_a_location_is_split_alike_by_all_who_read_one(text, parts):
+    """Drives are no files with a prim, in names of shots and bundles of farms too."""
+    assert files.split_location(text) == parts
+    assert naming.location_stem(text) == "walk" + ("_Clip" if parts[1] else "")
+    assert naming.pattern_name("{stem}", text, "--shot-name") == "walk"
+    assert origin._name(text) == "walk.usdc" + (f":{parts[1]}" if parts[1] else "")

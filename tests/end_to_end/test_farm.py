@@ -97,6 +97,15 @@ def test_a_bundle_runs_unchanged_with_openjd(farm):
     }  # fmt: skip
 
 
+def test_commands_that_are_told_can_be_pasted_into_a_shell(farm, capsys):
+    capsys.readouterr()
+    assert run(f"{WORDS} --bundle 'my job' -o 'my layers' --json") == 0
+    detail = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]
+    here, cloud = (shlex.split(detail[name]) for name in ("on this machine", "on Deadline Cloud"))
+    assert here == ["openjd", "run", "my job/template.json", "-p", f"Output={farm / 'my layers'}"]
+    assert cloud == ["deadline", "bundle", "submit", "my job"]
+
+
 def test_a_bad_shot_ends_no_session_and_fails_the_last_step(farm):
     """The first chunk fails, those behind it are baked, and the last step says which shot is missing."""
     whole = Path("a.usda").read_bytes()

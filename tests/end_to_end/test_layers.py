@@ -133,6 +133,36 @@ def test_variants_switch_what_deforms_the_garment(copy):
     assert np.abs(full - full.mean(axis=1, keepdims=True) - centred).max() > 1e-3
 
 
+def test_shots_of_one_model_are_value_clips_of_its_asset(copy, toy):
+    """UsdClipsAPI plays samples alone: whatever is constant has to be the asset's, and alike in all shots."""
+    bend = Usd.Stage.Open(str(toy.write_clip(copy / "bend.usda", frames=10)))
+    rotations = UsdSkel.Animation(bend.GetPrimAtPath("/Clip")).GetRotationsAttr()
+    for frame in range(10):  # another joint than in the other shots
+        turned = Gf.Quatf(float(np.cos(frame / 20)), float(np.sin(frame / 20)), 0, 0)
+        rotations.Set([rotations.Get(frame)[0], turned, *rotations.Get(frame)[2:]], frame)
+    bend.Save()
+    del bend, rotations
+    assert bake("--motion bend.usda -o layers") == 0
+    shots, starts = ("walk", "bend"), (0.0, 20.0)
+    stage = Usd.Stage.CreateNew("edit.usda")
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    prim = stage.DefinePrim("/World/Cape")
+    prim.GetReferences().AddReference("layers/assets/skirt/asset.usda")
+    clips = Usd.ClipsAPI(prim)
+    clips.SetClipAssetPaths([Sdf.AssetPath(str(anim(shot))) for shot in shots])
+    clips.SetClipPrimPath("/skirt")
+    clips.SetClipActive([(start, number) for number, start in enumerate(starts)])
+    clips.SetClipTimes([(start + time, time) for start in starts for time in (0.0, 15.0)])
+    stage.SetTimeCodesPerSecond(30.0)
+    stage.Save()
+    for shot, start in zip(shots, starts):
+        expected = garment_points(anim(shot))
+        found = garment_points(stage, [start + time for time in range(len(expected))])
+        assert np.abs(found - expected).max() < 1e-5, shot
+    assert len(garment_points(anim("bend"))) == 10 and np.ptp(garment_points(anim("bend")), axis=0).max() > 0.05
+
+
 @pytest.mark.parametrize("choice", ["skel", "rest", "points"])
 def test_each_variant_is_valid(copy, choice):
     stage = Usd.Stage.Open(str(anim()))
@@ -252,6 +282,26 @@ def test_a_model_of_more_influences_than_layers_of_a_target_share_is_refused_bef
     assert main(shlex.split("reduce skirt.safetensors --influences 4 --motions walk.usda -o few.safetensors")) == 0
     words = "bake few.safetensors --stage rigged.usda --motion walk.usda --target game4 -o new"
     assert main(shlex.split(words)) == 0
+
+
+def test_assets_say_who_they_are_and_of_which_version(copy, capsys):
+    model = sha256("skirt.safetensors")
+    stage = Usd.Stage.Open(str(anim()))
+    info = Usd.ModelAPI(stage.GetDefaultPrim())
+    assert (info.GetAssetName(), info.GetAssetVersion()) == ("skirt", model[:12])
+    found = Path(info.GetAssetIdentifier().resolvedPath)  # of the asset, through the reference of the shot
+    assert found == copy / "layers/assets/skirt/asset.usda"
+    named = "--motion walk.usda --asset-version v012 --asset-identifier 'studio:/cloth/{stem}'"
+    assert bake(f"{named} -o layers") == 0 and bake(f"{named} -o new.usdc") == 0
+    for path, name in ((Path("layers/shots/walk/shot.usda"), "skirt"), (Path("new.usdc"), "Hero")):
+        stage = Usd.Stage.Open(str(path))
+        prim = stage.GetPrimAtPath("/Shot/skirt") or stage.GetDefaultPrim()
+        info = Usd.ModelAPI(prim)
+        assert (info.GetAssetName(), info.GetAssetVersion()) == (name, "v012")
+        assert info.GetAssetIdentifier().path == "studio:/cloth/skirt"
+    capsys.readouterr()
+    assert bake("--motion walk.usda --asset-version 'v\x1b[1m' -o odd.usdc") == 2
+    assert "1 to 1000 printable characters are allowed" in capsys.readouterr().err
 
 
 def test_a_package_is_what_arkit_takes(copy, capsys):

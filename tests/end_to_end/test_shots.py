@@ -10,8 +10,9 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from pxr import Usd
+from pxr import Usd, UsdGeom
 from ssilk_usd.shots import layers as layers_of_usd
 from ssilk_usd.shots.play import Shot
 
@@ -66,15 +67,51 @@ def test_a_second_bake_joins_the_first_and_the_character_keeps_one_body(copy):
     assert Path("layers/shots/walk/shot.usda").read_bytes() == together  # in any order
 
 
+def test_levels_of_quality_are_variants_of_one_garment(copy, capsys):
+    words = "--motion walk.usda --level-of overalls -o layers"
+    assert bake("shirt.safetensors", f"--lbs --garment-name overalls_crowd {words}") == 0
+    assert bake("overalls.safetensors", f"--refine 1 --garment-name hero {words}") == 0
+    stage = Usd.Stage.CreateInMemory()
+    stage.GetRootLayer().subLayerPaths.append(str(copy / "layers/shots/walk/shot.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    stage.SetTimeCodesPerSecond(30.0)
+    prim = stage.GetPrimAtPath("/Shot/overalls")
+    assert garments() == ["overalls"] and stage.GetPrimAtPath("/Shot/overalls/Skirt")
+    levels = prim.GetVariantSet("level")
+    assert sorted(levels.GetVariantNames()) == ["crowd", "default", "hero"]
+    assert levels.GetVariantSelection() == "default"
+    for level, garment in (("default", "overalls"), ("crowd", "overalls_crowd"), ("hero", "hero")):
+        assert levels.SetVariantSelection(level)
+        shown, own = Shot(stage), Shot(f"layers/shots/walk/{garment}/anim.usdc")
+        assert [mesh.name for mesh in shown.meshes] == ["Skirt", "Body"]
+        for time in own.frame_times:
+            np.testing.assert_allclose(shown.garment_points(time), own.garment_points(time), atol=1e-7)
+    del stage, prim, levels, shown
+    assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0  # whose body is hidden in no level
+    assert [mesh.path for mesh in Shot("layers/shots/walk/shot.usda").meshes] == [
+        "/Shot/overalls/Skirt", "/Shot/overalls/Body", "/Shot/shirt/Skirt",
+    ]  # fmt: skip
+    for name in ("hero", "overalls_crowd", "shirt"):
+        assert main(["remove", "layers", f"walk/{name}"]) == 0
+    alone = Usd.Stage.Open("layers/shots/walk/shot.usda")
+    assert not alone.GetPrimAtPath("/Shot/overalls").GetVariantSets().HasVariantSet("level")
+    capsys.readouterr()
+    assert bake("overalls.safetensors", words) == 2
+    assert "a level of 'overalls', and of the same name" in capsys.readouterr().err
+    assert bake("overalls.safetensors", "--motion walk.usda --level-of shirt -o new.usdc") == 2
+    assert "levels are variants of a shot in a folder of layers" in capsys.readouterr().err
+
+
 def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy, monkeypatch):
     """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
     write, other = layers_of_usd.write_stage, []
 
-    def late(garments, needed=()):
+    def late(garments, needed=(), levels=None):
         if not other:
             other.append(garments)
             assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
-        return write(garments, needed)
+        return write(garments, needed, levels)
 
     monkeypatch.setattr(layers_of_usd, "write_stage", late)
     gathering.write_shot_stage(Path("layers"), "walk")

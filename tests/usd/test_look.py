@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -257,3 +258,36 @@ def test_a_package_holds_its_textures(hero, tmp_path):
     stage = Usd.Stage.Open(str(tmp_path / "shot.usdz"))
     assert look(stage, "/Hero/Cape")["material of trim"] == ("Cape_trim", "linen.png]")
     assert not UsdUtils.ComputeAllDependencies(str(tmp_path / "shot.usdz"))[2]
+
+
+@pytest.mark.parametrize("tiles", [("linen.png",), ("linen.1001.png", "linen.1002.png")])
+def test_a_package_holds_textures_that_came_in_another_package(hero, tmp_path, tiles):
+    for tile in tiles:
+        (hero.parent / "textures" / tile).write_bytes(tile.encode())
+    if len(tiles) > 1:
+        stage = Usd.Stage.Open(str(hero))
+        for prim in [each for each in stage.Traverse() if each.GetName() == "Texture"]:
+            UsdShade.Shader(prim).GetInput("file").Set(Sdf.AssetPath("./textures/linen.<UDIM>.png"))
+        stage.Save()
+        del stage
+    source = tmp_path / "hero.usdz"
+    assert UsdUtils.CreateNewUsdzPackage(str(hero), str(source))
+    with packaged(tmp_path / "shot.usdz") as layer:
+        shoot(worn(source), layer)
+    source.unlink()
+    with zipfile.ZipFile(tmp_path / "shot.usdz") as package:
+        held = {Path(name).name: package.read(name) for name in package.namelist()[1:]}
+    assert held == {tile: tile.encode() for tile in tiles}
+    assert not UsdUtils.ComputeAllDependencies(str(tmp_path / "shot.usdz"))[2]
+
+
+def test_a_rig_says_what_a_garment_from_its_own_file_loses(hero, tmp_path):
+    garment = tmp_path / "assets" / "cape.usda"
+    stage = Usd.Stage.CreateNew(str(garment))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    dressed(stage, "/Wardrobe/Cloak", 0.2).CreateNormalsAttr([Gf.Vec3f(0, 0, 1)] * 20)
+    stage.Save()
+    character, read, _ = read_scene(str(hero), garment=str(garment))
+    assert write_rigged_stage(hero, scene_of(character, read), tmp_path / "rigged.usda") == "Cloak loses normals"
+    assert write_rigged_stage(hero, worn(hero).scene, tmp_path / "other.usda") == ""

@@ -74,7 +74,9 @@ def test_a_garment_is_the_one_that_is_rendered(stage):
 
 @pytest.mark.parametrize("target", ["usd", "game4"])
 def test_a_shot_has_body_and_cage_with_their_purposes(stage, tmp_path, target):
-    character, garment, _ = read_scene(stage)
+    UsdGeom.Imageable(stage.GetPrimAtPath("/Hero/Geo")).CreateProxyPrimRel().SetTargets(["/Hero/Cage"])
+    stage.Save()
+    character, garment, _ = read_scene(str(tmp_path / "hero.usda"))
     assert garment.skin is not None
     worn = Garment(garment.mesh, garment.skin, np.ones(4, dtype=int))
     rig = ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
@@ -88,3 +90,6 @@ def test_a_shot_has_body_and_cage_with_their_purposes(stage, tmp_path, target):
              if prim.IsA(UsdGeom.Mesh)}  # fmt: skip
     assert found == {"Cape": "default", "Body": "render", "Cage": "proxy"}
     assert [mesh.name for mesh in Shot(path).meshes] == ["Cape", "Body"]
+    stand_in, rendered = UsdGeom.Imageable(shot.GetPrimAtPath("/Hero/Body")).ComputeProxyPrim()
+    assert (stand_in.GetName(), rendered.GetName()) == ("Cage", "Body")
+    assert not UsdGeom.Imageable(shot.GetPrimAtPath("/Hero/Cape")).ComputeProxyPrim()

@@ -911,12 +911,14 @@ def test_a_negative_scale_turns_no_face_inside_out(scale, left_handed):
     UsdGeom.Xform.Define(stage, "/Set")
     mesh = box_in(stage, "/Set/Cape", scale, left_handed)
     assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
-    indices, weights = mesh.GetPrim(), UsdSkel.BindingAPI.Apply(mesh.GetPrim())
-    weights.CreateSkeletonRel().SetTargets(["/Hero/Rig"])  # skinned, its xforms still say how it is drawn
-    weights.CreateJointIndicesPrimvar(True, 1).Set([0])
-    weights.CreateJointWeightsPrimvar(True, 1).Set([1.0])
-    weights.CreateGeomBindTransformAttr(UsdGeom.XformCache().GetLocalToWorldTransform(indices))
-    assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
+    bound, placed = UsdSkel.BindingAPI.Apply(mesh.GetPrim()), UsdGeom.Xformable(mesh.GetPrim().GetParent())
+    bound.CreateSkeletonRel().SetTargets(["/Hero/Rig"])
+    bound.CreateJointIndicesPrimvar(True, 1).Set([0])
+    bound.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    bound.CreateGeomBindTransformAttr(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()))
+    for ignored in (scale, (1, 1, 1), (1, 1, -1)):  # skinned, it is where its geomBindTransform puts it
+        placed.GetOrderedXformOps()[0].Set(Gf.Vec3f(*ignored))
+        assert volume(read_garment(stage, SKELETON, garment="Cape").mesh) == pytest.approx(0.3**3 / 6)
 
 
 def test_a_joint_that_is_listed_twice_is_refused_by_name():

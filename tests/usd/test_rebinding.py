@@ -184,6 +184,33 @@ def test_a_rigged_garment_is_shown_where_its_own_skeleton_showed_it(tmp_path, ca
     np.testing.assert_allclose(read_scene(out)[1].mesh.points, CLOTH, atol=2e-6)  # which finds the character again
 
 
+@pytest.mark.parametrize("by", ["its own skeleton", "both skeletons"])
+@pytest.mark.parametrize("case", ["geomBindTransform", "another pose"])
+def test_a_shape_that_is_on_is_in_a_rigged_garment_once(tmp_path, case, by):
+    path, out = outfit(tmp_path, case), tmp_path / "rigged.usda"
+    stage = Usd.Stage.Open(str(path))
+    cape, shape = cape_of(path), np.array([[0, 0, 0.05], [0.02, 0, 0], [0, 0.01, 0], [0.03, 0, 0.01]])
+    target = UsdSkel.BlendShape.Define(stage, f"{cape}/Full")
+    target.CreateOffsetsAttr(Vt.Vec3fArray.FromNumpy(shape.astype("f4")))
+    target.CreatePointIndicesAttr([0, 1, 3, 5])
+    binding = UsdSkel.BindingAPI(stage.GetPrimAtPath(cape))
+    binding.CreateBlendShapesAttr(["Full"])
+    binding.CreateBlendShapeTargetsRel().SetTargets([target.GetPath()])
+    every = [UsdSkel.Skeleton(prim) for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton)]
+    for prim in every if by == "both skeletons" else [each for each in every if "Outfit" in str(each.GetPath())]:
+        look = UsdSkel.Animation.Define(stage, prim.GetPath().AppendChild("Look"))
+        look.CreateBlendShapesAttr(["Full"])
+        look.CreateBlendShapeWeightsAttr([0.5])
+        UsdSkel.BindingAPI.Apply(prim.GetPrim()).CreateAnimationSourceRel().SetTargets([look.GetPath()])
+    stage.Save()
+    del stage, target, binding, every, prim, look
+    found, garment, _ = read_scene(path, garment="Cape")
+    assert np.abs(garment.mesh.points - CLOTH).max() > 0.01
+    none = ProxyRig(garment.mesh.path, (), np.zeros(0, int), np.zeros((0, 4, 4)), garment.skin)
+    write_rigged_stage(path, Scene(found, Garment(garment.mesh, garment.skin, np.full(len(CLOTH), 1)), none), out)
+    np.testing.assert_allclose(read_scene(out)[1].mesh.points, garment.mesh.points, atol=2e-6)
+
+
 def test_a_garment_in_its_own_file_goes_from_its_bind_pose_to_the_characters(tmp_path):
     hero, own = tmp_path / "hero.usda", tmp_path / "cape.usda"
     stage = Usd.Stage.CreateNew(str(hero))

@@ -16,10 +16,13 @@ from ssilk_usd.reading.garment import read_garment
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.polygons import triangulate
 from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.shots.layers import Layout, write_asset, write_points
 from ssilk_usd.shots.play import Shot
+from ssilk_usd.shots.points import point_cache
 from ssilk_usd.shots.read import read_baked
 from ssilk_usd.shots.shot import write_shot
 from ssilk_usd.shots.skinned import SkinnedGarment
+from ssilk_usd.shots.velocities import with_velocities
 from ssilk_usd.units import StageUnits
 from ssilk_usd.writing.author import prim_names
 from ssilk_usd.writing.files import write_scene
@@ -258,7 +261,7 @@ def test_joints_that_stay_put_cost_one_sample(tmp_path):
     write_shot(path, deformer, still, poses, units=CENTIMETRES_Z)
     stage = Usd.Stage.Open(str(path))
     animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Animation"))
-    assert animation.GetTranslationsAttr().GetNumTimeSamples() == 0
+    assert animation.GetTranslationsAttr().GetNumTimeSamples() == 1
     assert animation.GetRotationsAttr().GetNumTimeSamples() == FRAMES
     assert check_shot(path) == []
     assert compare_points(Shot(path), np.concatenate([deform(deformer, still, pose) for pose in poses])).worst < 2e-6
@@ -735,3 +738,71 @@ def test_a_captured_motion_on_a_real_character(tmp_path, units):
     write_shot(path, deformer, motion, [pose], units=units, start=1.0)
     assert check_shot(path) == []
     assert compare_points(Shot(path), deform(deformer, motion, pose)).worst < 3e-6
+
+
+# Velocities of point caches
+
+
+def course(mesh: Mesh, seconds: np.ndarray, jump: int | None = None) -> np.ndarray:
+    """Points in free fall, each at a speed of its own, shape (F, V, 3); from frame `jump` on 90 m further."""
+    t = seconds[:, None, None]
+    path = mesh.points + t * np.sin(mesh.points[:, [1, 2, 0]] * 5) + 0.5 * t**2 * np.array([0.0, -9.81, 0.0])
+    if jump is not None:
+        path[jump:] += [90.0, 0, 0]
+    return path
+
+
+def steady(fps: float, jump: int | None = None) -> Motion:
+    motion = make_motion(np.random.default_rng(1), fps=fps)
+    translations = np.tile(motion.translations.mean(axis=0), (FRAMES, 1, 1))
+    translations[:, 0] += np.arange(FRAMES)[:, None] / fps * [1.3, 0, 0]
+    if jump is not None:
+        translations[jump:, 0] += [90.0, 0, 0]
+    return replace(motion, translations=translations)
+
+
+@pytest.mark.parametrize("samples", [1, 2])
+@pytest.mark.parametrize("units", [METRES_Y, CENTIMETRES_Z])
+def test_velocities_of_a_cache_carry_its_points_to_the_shutter(tmp_path, units, samples):
+    """`points + velocities * dt / timeCodesPerSecond`, by UsdGeom itself; the error is what acceleration leaves."""
+    scene, path, fps = make_scene(np.random.default_rng(3), 2), tmp_path / "cache.usdc", 30.0 * samples
+    motion, seconds = steady(fps), np.arange(FRAMES) / fps
+    exact = course(scene.garment.mesh, seconds)
+    with point_cache(path, scene, motion, units=units, start=7.0, samples_per_frame=samples) as cache:
+        for frame in np.random.default_rng(0).permutation(FRAMES).tolist():
+            cache.write(frame, exact[frame])
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh(next(prim for prim in stage.Traverse() if prim.HasAttribute("primvars:ssilk:class")))
+    assert mesh.GetVelocitiesAttr().GetTimeSamples() == mesh.GetPointsAttr().GetTimeSamples()
+    assert stage.GetTimeCodesPerSecond() == 30.0
+    for frame in (1, 6, FRAMES - 2):
+        time = 7.0 + frame / samples
+        found = np.array(mesh.GetVelocitiesAttr().Get(time)) * units.meters_per_unit
+        central = (exact[frame + 1] - exact[frame - 1]) / 2 * fps
+        np.testing.assert_allclose(found, units.points_from_core(central) * units.meters_per_unit, atol=1e-3)
+        for part in (0.25, 0.4):  # of the way to the next sample, which falls by half of g t^2 more
+            away = part / fps
+            shutter = np.array(mesh.ComputePointsAtTime(time + part / samples, time))
+            moved = course(scene.garment.mesh, seconds + away)[frame]
+            off = np.abs(shutter - units.points_from_core(moved)).max() * units.meters_per_unit
+            assert off < 0.51 * 9.81 * away**2
+    ends = [np.array(mesh.GetVelocitiesAttr().Get(7.0 + frame / samples)) for frame in (0, FRAMES - 1)]
+    for found, (a, b) in zip(ends, ((0, 1), (-2, -1))):
+        expected = units.points_from_core((exact[b] - exact[a]) * fps)
+        np.testing.assert_allclose(found, expected, atol=2e-3 / units.meters_per_unit)
+
+
+def test_no_velocity_leads_across_a_cut(tmp_path):
+    rng = np.random.default_rng(3)
+    deformer, motion, layout = make_deformer(rng), steady(30.0, jump=8), Layout(tmp_path, "cape", "walk")
+    exact = course(deformer.scene.garment.mesh, np.arange(FRAMES) / 30, jump=8)
+    asset = write_asset(layout, deformer, CENTIMETRES_Z).asset
+    write_points(layout, asset, exact, deformer, motion, units=CENTIMETRES_Z)
+    stage = Usd.Stage.Open(str(layout.points))
+    read = [np.array(stage.GetAttributeAtPath(f"{asset.garment}.velocities").Get(frame)) for frame in range(FRAMES)]
+    local = exact - (motion.translations[:, :1] - motion.translations[:1, :1])  # a path is a transform of its own
+    for frame, (a, b) in {6: (5, 7), 7: (6, 7), 8: (8, 9), 9: (8, 10), 0: (0, 1), 19: (18, 19)}.items():
+        expected = CENTIMETRES_Z.points_from_core(local[b] - local[a]) * 30 / (b - a)
+        np.testing.assert_allclose(read[frame], expected, atol=0.5)  # of some 600 cm/s
+    single = list(with_velocities([exact[0], exact[1]], 30.0, {1}))
+    np.testing.assert_array_equal([moving for _, moving in single], 0)

@@ -11,6 +11,7 @@ PROXIES = "ssilk:proxyJoints"
 JOINTS = "skel:joints"
 # Indices, weights and, where the mesh names its joints, their order.
 SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights", JOINTS)
+GEOM_BIND = "primvars:skel:geomBindTransform"
 LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from ...errors import SsilkError, fail
-from ...files import FileHashes, relative_path, sha256
+from ...files import FileHashes, relative_path, sha256, split_location
 from .request import INPUTS, BakeRequest
 
 T = TypeVar("T")
@@ -77,7 +77,7 @@ def stage_contents(location: str, hashed: Callable[[str], str] = sha256) -> Inpu
     Raises:
         SsilkError: it cannot be read.
     """
-    from ssilk_usd.opening.stage import split_location, used_files
+    from ssilk_usd.opening.stage import used_files
 
     return _hashed(used_files(split_location(location)[0]), hashed)
 

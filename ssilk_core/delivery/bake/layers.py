@@ -182,7 +182,10 @@ class LayerFolder:
         asset = self._asset(task, garment, layout, report)
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
-        write_record(home, TaskRecord(key=key, files=written, result=result, inputs=inputs, root=request.root))
+        record = TaskRecord(
+            key=key, files=written, result=result, inputs=inputs, root=request.root, level_of=task.level_of
+        )
+        write_record(home, record)
         return result
 
     def _home(self, task: BakeTask) -> Path:
@@ -251,7 +254,13 @@ def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report:
     from ssilk_usd.shots import layers
 
     written = layers.write_asset(
-        layout, garment.deformer, garment.units, include_body=task.include_body, record=garment.record
+        layout,
+        garment.deformer,
+        garment.units,
+        include_body=task.include_body,
+        record=garment.record,
+        info=garment.info,
+        lean=task.request.receiver.lean,
     )
     for change in written.changes:
         report(Message(f"{layout.asset}: {change}; check the layers that override it", "warning"))

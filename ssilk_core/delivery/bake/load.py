@@ -27,9 +27,11 @@ if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
     from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
+    from ssilk_usd.writing.asset_info import AssetInfo
 
     from ...network.model.network import GarmentModel
 
+VERSION_DIGITS = 12  # of a model's hash, which are its garment's version where none is given
 LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
 
 
@@ -58,6 +60,7 @@ class LoadedGarment:
         model_held, stage_held: what model and stage held while they were read.
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
+        info: of the garment as an asset.
     """
 
     request: BakeRequest
@@ -70,6 +73,7 @@ class LoadedGarment:
     stage_held: InputContents
     provenance: dict[str, object]
     record: GarmentRecord
+    info: AssetInfo
 
     def over(self, motion: str, *, range: str | None = None, handles: int = 0) -> BakeRollout:
         """Return the garment over a motion, "file[:/Prim/Path]"; range and handles are those of a request.
@@ -101,6 +105,7 @@ class LoadedGarment:
             inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
             record=self.record,
+            info=self.info,
             names=self.names,
             fabric=self.file.fabric,
             reduction=reduction,
@@ -169,6 +174,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         stage_held=stage_held,
         provenance={"model_sha256": model_held.digest, "training": file.provenance.get("ssilk", "")},
         record=_record(file, model_held.digest),
+        info=_info(request, model_held.digest),
     )
 
 
@@ -229,6 +235,13 @@ def _units(stage: Usd.Stage, target: Target) -> StageUnits:
 
     own = StageUnits.of(stage)
     return StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis)
+
+
+def _info(request: BakeRequest, model_hash: str) -> AssetInfo:
+    from ssilk_usd.writing.asset_info import AssetInfo
+
+    version = request.asset_version or model_hash[:VERSION_DIGITS]
+    return AssetInfo(version=version, identifier=request.asset_identifier or "")
 
 
 def _record(file: ModelFile, model_hash: str) -> GarmentRecord:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from ...errors import fail
-from ...files import replacing
+from ...files import replacing, split_location
 from ...scene.plain import from_plain
 from .inputs import InputContents, model_contents, stage_contents
 from .record import RECORD, RecordedInput, TaskRecord, portable, read_record
@@ -154,8 +154,6 @@ class UsedNames:
 
     def _same(self, before: RecordedInput, location: str, contents: Callable[[str], InputContents]) -> bool:
         """Return whether an input is the one that a record names."""
-        from ssilk_usd.opening.stage import split_location
-
         if before.path == portable(location, self.folder):
             return True
         then, now = split_location(before.path), split_location(location)

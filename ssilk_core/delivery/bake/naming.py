@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import fail
+from ...files import split_location
 from ...scene.plain import from_plain
 
 FIELDS = "{stem}, {prim}, {parent}, {parent2}, {parent3}, ... are names of its file, prim and folders"
@@ -30,9 +31,9 @@ def pattern_name(pattern: str, location: str, option: str) -> str:
     Raises:
         SsilkError: a field that does not exist, or that this path lacks.
     """
-    file, _, prim = location.partition(":/")
+    file, prim = split_location(location)
     path = Path(os.path.abspath(file))
-    fields = {"stem": path.stem, "prim": prim.rpartition("/")[2]}
+    fields = {"stem": path.stem, "prim": (prim or "").rpartition("/")[2]}
     fields |= {f"parent{'' if up == 1 else up}": folder.name for up, folder in enumerate(path.parents, start=1)}
 
     def value(match: re.Match[str]) -> str:
@@ -45,7 +46,7 @@ def pattern_name(pattern: str, location: str, option: str) -> str:
 
 def location_stem(location: str) -> str:
     """Return the name of "file[:/Prim]" where none is given: the file's stem, and the prim's name."""
-    file, _, prim = location.partition(":/")
+    file, prim = split_location(location)
     return Path(file).stem + (f"_{prim_leaf(prim)}" if prim else "")
 
 

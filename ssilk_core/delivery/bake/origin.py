@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...errors import fail
-from ...files import relative_path, sha256
+from ...files import relative_path, sha256, split_location
 from .opened import provenance_of
 from .record import RECORD
 from .request import BakeRequest
@@ -40,8 +40,8 @@ def _from_folder(location: str, folder: Path) -> str:
 
 def _name(location: str) -> str:
     """Return the name of a location's file, with the prim that it names."""
-    file, mark, prim = location.partition(":/")
-    return Path(file).name + mark + prim
+    file, prim = split_location(location)
+    return Path(file).name + (f":{prim}" if prim else "")
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,6 @@ def _existing(shot: Path, name: str, near: str, held: object) -> Path:
 
 def _file(place: Path) -> Path:
     """Return the file of a place, which may name a prim in it."""
-    from ssilk_usd.opening.stage import split_location
-
     return Path(split_location(str(place))[0])
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ... import __version__, work_record
 from ...errors import SsilkError
-from ...files import relative_path, sha256
+from ...files import relative_path, sha256, split_location
 from ...scene.plain import from_plain
 from ...work_record import Hash, WorkRecord, request_key
 from .inputs import InputHashes
@@ -40,6 +40,7 @@ class TaskRecord:
         result: of its bake.
         inputs: what was in each of the request's `INPUTS`, and where it was.
         root: SkelRoot of the character, where one was named.
+        level_of: the garment of its shot that it is a level of, where it is one.
     """
 
     key: str
@@ -47,6 +48,7 @@ class TaskRecord:
     result: BakeResult
     inputs: Mapping[str, RecordedInput]
     root: str | None
+    level_of: str | None = None
 
     @property
     def wearer(self) -> tuple[str, str | None]:
@@ -83,8 +85,6 @@ def portable(location: str, folder: Path) -> str:
     Where the two share nothing but the root, a hash tells the file from others of its name, and nothing tells where a
     studio keeps it.
     """
-    from ssilk_usd.opening.stage import split_location
-
     file, prim = split_location(location)
     path = relative_path(file, folder)
     if path is None:
@@ -96,6 +96,7 @@ def write_record(folder: Path, record: TaskRecord) -> None:
     """Write a record into the folder of its files, last of all."""
     inputs = {name: asdict(each) for name, each in record.inputs.items()}
     detail = {**_portable(record.result), "inputs": inputs, "root": record.root}
+    detail |= {"level_of": record.level_of} if record.level_of else {}
     written = WorkRecord(key=record.key, files=dict(record.files), detail=detail)
     work_record.write_record(folder / RECORD, written)
 
@@ -112,10 +113,12 @@ def read_record(folder: Path) -> TaskRecord | None:
         if found is None:
             return None
         detail = {**found.detail, "path": folder / found.detail["path"]}
-        told, root = detail.pop("inputs"), detail.pop("root")
+        told, root, level_of = detail.pop("inputs"), detail.pop("root"), detail.pop("level_of", None)
         inputs = {name: from_plain(RecordedInput, told[name]) for name in INPUTS}
         result = from_plain(BakeResult, detail)
-        return TaskRecord(key=found.key, files=found.files, result=result, inputs=inputs, root=root)
+        return TaskRecord(
+            key=found.key, files=found.files, result=result, inputs=inputs, root=root, level_of=level_of
+        )
     except (SsilkError, ValueError, TypeError, KeyError, AttributeError):
         return None
 

@@ -23,6 +23,7 @@ MAX_PRE_ROLL = 600.0  # [s]
 MAX_REFINE = 10_000
 ALLOWED_FPS = f"a positive rate from {MIN_FPS:g} to {MAX_FPS} is needed"
 MAX_HANDLES = 10_000
+LONGEST_TEXT = 1000  # characters of an entry of assetInfo
 _NUMBER = r"-?[0-9]{1,9}(?:\.[0-9]{1,9})?"
 
 
@@ -57,6 +58,9 @@ class BakeRequest:
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.
+        level_of: name of a garment of the shot that this is a level of quality of; None for a garment of its own.
+        asset_version: of the garment, in the `assetInfo` of what is written; None for a hash of the model.
+        asset_identifier: likewise; None for the asset's own layer, and for none in a file.
 
     Raises:
         SsilkError: an unknown target or refined output, or a number out of range.
@@ -83,6 +87,9 @@ class BakeRequest:
     device: str = "cpu"
     garment: str | None = None
     shot: str | None = None
+    level_of: str | None = None
+    asset_version: str | None = None
+    asset_identifier: str | None = None
 
     def __post_init__(self) -> None:
         for name in INPUTS:  # a pathlib.Path is as good, but USD's metadata stores text
@@ -115,6 +122,9 @@ class BakeRequest:
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail_unknown("--refined-output", f"'{self.refined_output}'", self.refined_output, REFINED_OUTPUTS)
+        for name, text in (("--asset-version", self.asset_version), ("--asset-identifier", self.asset_identifier)):
+            if text is not None and not (text.isprintable() and 0 < len(text) <= LONGEST_TEXT):
+                fail(name, f"{text[:40]!r}", f"1 to {LONGEST_TEXT} printable characters are allowed")
         if self.lbs and self.keep:
             fail("--lbs", "linear blend skinning with a size to keep", "only the network has one", "leave keep out")
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
     from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
+    from ssilk_usd.writing.asset_info import AssetInfo
 
     from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
@@ -69,6 +70,7 @@ class BakeRollout:
         inputs: what the request's inputs held while they were read.
         provenance: where all of this comes from, as a shot stores it.
         record: how the garment's model was made.
+        info: of the garment as an asset.
         names: the joints as the shot's target finds them.
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
@@ -88,6 +90,7 @@ class BakeRollout:
     inputs: InputHashes
     provenance: dict[str, object]
     record: GarmentRecord
+    info: AssetInfo
     names: JointNames
     fabric: Fabric
     lead: int = 0

@@ -47,7 +47,8 @@ def write_shot_stage(
     while True:
         found = _finished(folder, shot)
         layouts = {Layout(folder, name, shot): wearer for name, wearer in _wearers(found).items()}
-        written = write_stage(layouts, needed)
+        levels = {name: record.level_of for name, record in found.items() if record and record.level_of}
+        written = write_stage(layouts, needed, levels)
         if not layouts:
             Layout(folder, "", shot).stage.unlink(missing_ok=True)
         if _finished(folder, shot) == found:

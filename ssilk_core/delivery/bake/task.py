@@ -30,6 +30,7 @@ class BakeTask:
         verify: re-skin the written layer and compare it.
         pinned: what its inputs have to hold, as they did when its job was submitted; None for whatever they hold.
         replace: bake even where one of the names was used for another input.
+        level_of: name of the garment of its shot that it is a level of quality of; None for one of its own.
     """
 
     garment: str
@@ -40,6 +41,7 @@ class BakeTask:
     verify: bool = True
     pinned: InputHashes | None = None
     replace: bool = False
+    level_of: str | None = None
 
     @property
     def name(self) -> str:
@@ -74,14 +76,19 @@ def plan_layers(
         BakeTask(
             garment=_garment_name(request),
             shot=_shot_name(request),
-            request=replace(request, garment=None, shot=None),
+            request=replace(request, garment=None, shot=None, level_of=None),
             include_body=include_body,
             points=points or request.writes_points,
             verify=verify,
             replace=replace_names,
+            level_of=prim_name(request.level_of) if request.level_of else None,
         )
         for request in requests
     ]
+    for task in tasks:
+        if task.level_of == task.garment:
+            found, allowed = f"a level of '{task.garment}', and of the same name", "each level has a name of its own"
+            fail(task.request.model, found, allowed, "name it with --garment-name")
     need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
     need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
     order = list(dict.fromkeys(task.garment for task in tasks))

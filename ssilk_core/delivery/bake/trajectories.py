@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import fail
 from ...events import Message, Reporter, silent
-from ...files import relative_path, replacing, sha256
+from ...files import relative_path, replacing, sha256, split_location
 from ...scene.assets import Deformer, Floats, Motion, Scene, Skeleton
 from ...scene.kinematics import held_at_cuts, sample_motion
 from ..targets import GLB
@@ -152,8 +152,6 @@ def skin_trajectories(
 
 def cache_origin(cache: str, mesh: str, output: Path) -> dict[str, object]:
     """Return what a shot says of the cache that it was made from, so that it is found again."""
-    from ssilk_usd.opening.stage import split_location
-
     file = split_location(cache)[0]
     return {
         "cache": relative_path(file, output.absolute().parent) or Path(file).name,

@@ -16,6 +16,7 @@ from ...errors import VerificationError, fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import sha256
 from ...scene.assets import Floats
+from ..gltf.play import GlbShot
 from ..targets import GLB
 from .load import load_rollout
 from .opened import open_shot, provenance_of
@@ -130,10 +131,12 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
     found = compare_points(shot, expected, samples_per_frame=samples)
     if not found.passed:
+        todo = "bake it again, closer to the origin if it is many kilometres away"
+        if isinstance(shot, GlbShot) and shot.rewritten:
+            todo = f"{shot.rewritten}: verify it before that"
         raise VerificationError(
             f"{path}: vertex {found.vertex} at time code {found.time:g} is {found.worst:.3g} m from where the "
-            f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; bake it again, closer to the "
-            "origin if it is many kilometres away."
+            f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; {todo}."
         )
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import fail
 from ...events import Message, Reporter, Result, Started, silent
-from ...files import need_not_input, need_writable, replacing
+from ...files import need_not_input, need_writable, replacing, split_location
 from ...physics.skin.figures import ShownSkin
 from ..targets import GLB
 from .glb import warn_of_sets, write_glb_shot
@@ -103,8 +103,6 @@ def result_of(
 
 def _check_output(request: BakeRequest, path: Path) -> None:
     """Raise `SsilkError` where the target does not take the file, or it cannot be written."""
-    from ssilk_usd.opening.stage import split_location
-
     suffixes = request.receiver.suffixes
     if path.suffix not in suffixes:
         fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
@@ -151,7 +149,7 @@ def _write(
     }
     if output.suffix == GLB:
         return write_glb_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
-    common |= {"units": rollout.units, "record": rollout.record}
+    common |= {"units": rollout.units, "record": rollout.record, "info": rollout.info}
     if not rollout.request.writes_points:
         return write_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The container of glTF 2.0 [Khronos 2021]: one JSON document, and one buffer that its accessors view."""
+"""Write the container of glTF 2.0 [Khronos 2021]: one JSON document, and one buffer that its accessors view."""
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,18 +16,17 @@ from ...errors import fail
 
 Document = dict[str, Any]
 
+GENERATOR = "ssilk"  # begins what the file says of who wrote it
 MAGIC, VERSION, JSON, BINARY = b"glTF", 2, b"JSON", b"BIN\0"
 HEADER, CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 MAX_BYTES = 2**32 - 1  # a length is stored in four bytes
-MAX_READ = 1 << 28  # bytes that one accessor may take in memory
 VERTICES, INDICES = 34962, 34963  # what a buffer view is bound as
-COMPONENTS: dict[int, np.dtype[Any]] = {
-    5121: np.dtype("u1"),
-    5123: np.dtype("<u2"),
-    5125: np.dtype("<u4"),
-    5126: np.dtype("<f4"),
+_CODES: dict[np.dtype[Any], int] = {
+    np.dtype("u1"): 5121,
+    np.dtype("<u2"): 5123,
+    np.dtype("<u4"): 5125,
+    np.dtype("<f4"): 5126,
 }
-_CODES = {kind: code for code, kind in COMPONENTS.items()}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
@@ -40,7 +38,7 @@ class GlbBuilder:
     """
 
     def __init__(self) -> None:
-        self.document: Document = {"asset": {"version": "2.0", "generator": f"ssilk {__version__}"}}
+        self.document: Document = {"asset": {"version": "2.0", "generator": f"{GENERATOR} {__version__}"}}
         self._parts: list[bytes] = []
         self._size = 0
 
@@ -90,11 +88,11 @@ class GlbBuilder:
         Raises:
             SsilkError: it would be larger than its format allows.
         """
-        _write(path, {**self.document, "buffers": [{"byteLength": self._size}]}, self._parts)
+        write_chunks(path, {**self.document, "buffers": [{"byteLength": self._size}]}, self._parts)
 
 
-def _write(path: str | Path, document: Document, parts: Sequence[bytes]) -> None:
-    """Write a document and the parts of its buffer."""
+def write_chunks(path: str | Path, document: Document, parts: Sequence[bytes]) -> None:
+    """Write a document and the parts of its buffer; raise `SsilkError` where it would be larger than glb allows."""
     text = json.dumps(document, separators=(",", ":"), allow_nan=False, ensure_ascii=False).encode()
     text += b" " * (-len(text) % 4)
     size = sum(map(len, parts))
@@ -115,89 +113,3 @@ def _described(values: np.ndarray, kind: str) -> Document:
 def _bounds(values: np.ndarray) -> Document:
     columns = values.reshape(len(values), -1)
     return {"min": columns.min(axis=0).tolist(), "max": columns.max(axis=0).tolist()}
-
-
-@contextmanager
-def understood(name: str, found: str, allowed: str, todo: str) -> Iterator[None]:
-    """Raise `SsilkError` with these words where a document is of another shape than its reader takes it for."""
-    try:
-        yield
-    except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-        fail(name, f"{found} ({type(error).__name__}: {error})", allowed, todo)
-
-
-class GlbFile:
-    """A glb that was read.
-
-    Attributes:
-        document: its JSON document.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        """Read a file.
-
-        Raises:
-            SsilkError: it cannot be read, or is not a glb of version 2 with one buffer.
-        """
-        self.path = Path(path)
-        try:
-            data = self.path.read_bytes()
-        except OSError as error:
-            fail(str(path), f"it cannot be read ({error.strerror or error})", "a .glb file is needed")
-        try:
-            self.document, self._buffer = _parts(data)
-        except (struct.error, ValueError, RecursionError) as error:
-            fail(str(path), f"not a whole glb ({error})", "a file of glTF 2.0 is needed", "bake it again")
-
-    def write(self, path: str | Path) -> None:
-        """Write the document as it is now, with the buffer that was read.
-
-        Raises:
-            SsilkError: it would be larger than its format allows.
-        """
-        _write(path, self.document, [self._buffer])
-
-    def array(self, index: int) -> np.ndarray:
-        """Return what an accessor holds, shape (N, width), in its own type.
-
-        Raises:
-            KeyError, IndexError, TypeError, ValueError: the document is malformed.
-        """
-        item = self.document["accessors"][index]
-        count, width, kind = item["count"], WIDTHS[item["type"]], COMPONENTS[item["componentType"]]
-        if not (isinstance(count, int) and 0 <= count * width * kind.itemsize <= MAX_READ):
-            raise ValueError(f"an accessor of {count} values")
-        if "bufferView" in item:
-            start = item.get("byteOffset", 0)
-            values = self._viewed(item["bufferView"], start, count * width, kind).reshape(count, width)
-        else:
-            values = np.zeros((count, width), dtype=kind)
-        if sparse := item.get("sparse"):
-            few, of = sparse["count"], sparse["indices"]
-            rows = self._viewed(of["bufferView"], of.get("byteOffset", 0), few, COMPONENTS[of["componentType"]])
-            new = self._viewed(
-                sparse["values"]["bufferView"], sparse["values"].get("byteOffset", 0), few * width, kind
-            )
-            values = values.copy()
-            values[rows] = new.reshape(few, width)
-        return values
-
-    def _viewed(self, view: int, start: int, count: int, kind: np.dtype) -> np.ndarray:
-        item = self.document["bufferViews"][view]
-        if item.get("byteStride") not in (None, kind.itemsize) or start + count * kind.itemsize > item["byteLength"]:
-            raise ValueError(f"buffer view {view}")
-        return np.frombuffer(self._buffer, kind, count, item.get("byteOffset", 0) + start)
-
-
-def _parts(data: bytes) -> tuple[Document, bytes]:
-    magic, version, total = HEADER.unpack_from(data)
-    if magic != MAGIC or version != VERSION or total != len(data):
-        raise ValueError("another header or length")
-    length, kind = CHUNK.unpack_from(data, HEADER.size)
-    start = HEADER.size + CHUNK.size
-    document = json.loads(data[start : start + length])
-    second, of = CHUNK.unpack_from(data, start + length)
-    if not (kind == JSON and of == BINARY and isinstance(document, dict)):
-        raise ValueError("other chunks")
-    begin = start + length + CHUNK.size
-    return document, data[begin : begin + second]

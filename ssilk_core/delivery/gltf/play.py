@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +13,14 @@ import numpy as np
 
 from ...errors import fail
 from ...scene.assets import Floats, Ints
-from ...scene.kinematics import slerp
-from .container import GlbFile, understood
+from .channel import NodeChannel
+from .container import GENERATOR
+from .file import GlbFile, understood
 from .nodes import node_transform
-from .shot import ARMATURE, GARMENT
+from .shot import GARMENT
 
 WRITTEN = "a .glb that 'ssilk bake' wrote is needed"
+TRIANGLES = 4  # the mode of primitives that are such
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +43,15 @@ class GlbMesh:
 class GlbShot:
     """Meshes over time, in metres and y up. Points that seams doubled are left out.
 
-    Joints count as seen where the file hides them by their scale.
+    Joints count as seen where the file hides them by their scale. Other programs may have written the file anew: node
+    order, accessors and keys are theirs, as long as vertices keep their order and `extras` stay.
 
     Attributes:
         name: path of the file.
         fps: frames per second.
         frame_times: time code of each frame.
         meshes: every mesh of the file, in its order.
+        rewritten: what another program may have done to the file since it was baked; empty where none wrote it.
     """
 
     is_skinned = True
@@ -61,28 +65,28 @@ class GlbShot:
         self.name, self._file = str(path), GlbFile(path)
         with self._understood():
             document = self._file.document
-            timing = document["asset"]["extras"]
+            self.rewritten = _rewritten(self._file)
+            timing = document["asset"].get("extras", {})
+            if "timeCodesPerSecond" not in timing:
+                fail(self.name, "no times of a shot in its asset.extras", WRITTEN, "keep extras when you rewrite it")
             self.fps, self._start = float(timing["timeCodesPerSecond"]), float(timing["startTimeCode"])
             self._per_frame = int(timing["samplesPerFrame"])
             if not (0 < self.fps < np.inf and self._per_frame > 0 and np.isfinite(self._start)):
                 raise ValueError("times")
             self.provenance: Mapping[str, Any] = dict(timing.get("ssilk", {}))
             self._nodes = document["nodes"]
-            (animation,), (skin,) = document["animations"], document["skins"]
-            self._channels = [
-                _Channel.of(self._file, animation["samplers"][item["sampler"]], item["target"], self._rate)
-                for item in animation["channels"]
-                if item["target"]["node"] != ARMATURE
-            ]
-            self._joints = list(skin["joints"])
-            binds = self._file.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4)
-            self._binds = binds.swapaxes(1, 2).astype(np.float64)
+            self._skins = [_Skin.of(self._file, item) for item in document["skins"]]
+            (animation,) = document["animations"]
+            joints = {joint for skin in self._skins for joint in skin.joints}
+            channels = [NodeChannel.of(self._file, animation, item) for item in animation["channels"]]
+            # What scales nodes above all joints hides them.
+            self._channels = [each for each in channels if each.path != "scale" or each.node in joints]
             self._parents = {
                 child: node for node, item in enumerate(self._nodes) for child in item.get("children", ())
             }
             drawn = [node for node, item in enumerate(self._nodes) if "mesh" in item]
-            self._surfaces = [_SkinnedSurface(self._file, self._nodes[node]["mesh"], node) for node in drawn]
-            (self._count,) = {len(channel.values) for channel in self._channels}
+            self._surfaces = [_SkinnedSurface(self._file, self._nodes[node], node) for node in drawn]
+            self._count = round(max(float(each.times[-1]) for each in channels) * self._rate) + 1
         self.meshes = tuple(surface.mesh for surface in self._surfaces)
         self.frame_times = self.sample_times()
 
@@ -97,7 +101,7 @@ class GlbShot:
 
     def points(self, time: float) -> list[Floats]:
         """Return the points of each mesh in world space [m], float64, shape (V, 3), at a time code."""
-        return [self._posed(surface, time) for surface in self._surfaces]
+        return self._posed(self._surfaces, time)
 
     def garment_points(self, time: float) -> Floats:
         """Return the points of the one garment [m], shape (V, 3).
@@ -108,61 +112,59 @@ class GlbShot:
         found = [surface for surface in self._surfaces if surface.mesh.is_garment]
         if len(found) != 1:
             fail(self.name, f"{len(found)} meshes are marked as garments", "one is needed")
-        return self._posed(found[0], time)
+        return self._posed(found, time)[0]
 
-    def _posed(self, surface: _SkinnedSurface, time: float) -> Floats:
+    def _posed(self, surfaces: Sequence[_SkinnedSurface], time: float) -> list[Floats]:
         with self._understood():
-            position = (time - self._start) * self._per_frame
-            values = {(channel.node, channel.path): channel.at(position) for channel in self._channels}
+            seconds = (time - self._start) / self.fps
+            values = {(channel.node, channel.path): channel.at(seconds) for channel in self._channels}
             world: dict[int, Floats] = {}
-            placed = [node_transform(joint, self._nodes, self._parents, values, world) for joint in self._joints]
-            matrices = np.stack(placed) @ self._binds
-            weights = values.get((surface.node, "weights"), surface.weights)
-            return surface.posed(weights, matrices)
+            found = []
+            for surface in surfaces:
+                skin = self._skins[surface.skin]
+                placed = [node_transform(joint, self._nodes, self._parents, values, world) for joint in skin.joints]
+                weights = values.get((surface.node, "weights"), surface.weights)
+                found.append(surface.posed(weights, np.stack(placed) @ skin.binds))
+            return found
 
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document of another shape than `write_glb` writes."""
         return understood(self.name, "another or a damaged glb", WRITTEN, "bake it again")
 
 
-@dataclass(frozen=True, eq=False)
-class _Channel:
-    """What an animation does to one property of a node: `values` of its samples, shape (F, width)."""
+def _rewritten(file: GlbFile) -> str:
+    generator = str(file.document["asset"].get("generator", "another program"))
+    if generator.startswith(GENERATOR):
+        return ""
+    did = "reordered vertices or dropped keys"
+    if file.is_quantized:
+        did = "stored vertices as integers, which rounds them"
+    return f"{generator[:60]} wrote it anew, and may have {did}"
 
-    node: int
-    path: str
-    values: Floats
+
+@dataclass(frozen=True, eq=False)
+class _Skin:
+    """Nodes that are joints; their inverse bind matrices as column vectors, shape (J, 4, 4)."""
+
+    joints: tuple[int, ...]
+    binds: Floats
 
     @classmethod
-    def of(cls, file: GlbFile, sampler: Mapping[str, Any], target: Mapping[str, Any], rate: float) -> _Channel:
-        """Return the channel; its keys must be the shot's samples, `rate` in a second."""
-        times = file.array(sampler["input"])[:, 0]
-        due = np.arange(len(times)) / rate
-        if sampler["interpolation"] != "LINEAR" or not (np.abs(times - due) <= 1e-6 * (due + 1 / rate)).all():
-            raise ValueError(f"other keys of {target['path']} than the samples")
-        values = file.array(sampler["output"]).astype(np.float64).reshape(len(times), -1)
-        return cls(target["node"], target["path"], values)
-
-    def at(self, position: float) -> Floats:
-        """Return the value at a fractional sample, shape (width,)."""
-        position = float(np.clip(position, 0, len(self.values) - 1))
-        near = round(position)
-        if abs(position - near) < 1e-6:
-            return self.values[near]
-        before, share = int(position), position - int(position)
-        if self.path == "rotation":
-            return slerp(self.values[before], self.values[before + 1], np.asarray(share))
-        return (1 - share) * self.values[before] + share * self.values[before + 1]
+    def of(cls, file: GlbFile, item: Mapping[str, Any]) -> _Skin:
+        binds = file.array(item["inverseBindMatrices"]).reshape(-1, 4, 4)
+        return cls(tuple(item["joints"]), binds.swapaxes(1, 2).astype(np.float64))
 
 
 class _SkinnedSurface:
     """A mesh with its morph targets and skinning weights."""
 
-    def __init__(self, file: GlbFile, index: int, node: int) -> None:
-        item = file.document["meshes"][index]
+    def __init__(self, file: GlbFile, holder: Mapping[str, Any], node: int) -> None:
+        item = file.document["meshes"][holder["mesh"]]
         (primitive,) = item["primitives"]
         attributes, count = primitive["attributes"], int(item["extras"]["points"])
-        self.node = node
+        if primitive.get("mode", TRIANGLES) != TRIANGLES:
+            raise ValueError(f"primitives of mode {primitive['mode']}")
+        self.node, self.skin = node, int(holder["skin"])
         rest = file.array(attributes["POSITION"])[:count].astype(np.float64)
         targets = [file.array(target["POSITION"])[:count] for target in primitive.get("targets", ())]
         self.offsets = np.array(targets, dtype=np.float64).reshape(len(targets), *rest.shape)
@@ -182,6 +184,8 @@ class _SkinnedSurface:
         if len(every) == count:
             return faces
         where = {place.tobytes(): point for point, place in reversed(list(enumerate(every[:count])))}
+        if missing := [place for place in every[count:] if place.tobytes() not in where]:
+            raise ValueError(f"{len(missing)} vertices that double none of the first {count}: others' order")
         doubles = [where[place.tobytes()] for place in every[count:]]
         return np.concatenate([np.arange(count), doubles])[faces]
 

@@ -20,7 +20,8 @@ from ...scene.kinematics import (
     quaternion_from_matrix,
     sorted_influences,
 )
-from .container import INDICES, VERTICES, GlbBuilder, GlbFile
+from .container import INDICES, VERTICES, GlbBuilder
+from .file import GlbFile
 from .geometry import ShapeNormals, drawn_mesh
 
 SET = 4  # influences in one attribute

@@ -12,8 +12,8 @@ import numpy as np
 
 from ...errors import fail
 from ...scene.assets import Floats
-from ...scene.kinematics import slerp
-from .container import GlbFile, understood
+from .channel import NodeChannel
+from .file import GlbFile, understood
 from .nodes import node_transform
 
 
@@ -48,9 +48,9 @@ class SkinnedGlb:
                     self.name, f"{len(found)} skinned nodes '{node}' and {len(animations)} animations", "one of each"
                 )
             self._node = found[0]
-            self._channels = [self._channel(animations[0], item) for item in animations[0]["channels"]]
-            self.start = min(float(times[0]) for _, times, *_ in self._channels)
-            self.end = max(float(times[-1]) for _, times, *_ in self._channels)
+            self._channels = [NodeChannel.of(self._file, animations[0], item) for item in animations[0]["channels"]]
+            self.start = min(float(channel.times[0]) for channel in self._channels)
+            self.end = max(float(channel.times[-1]) for channel in self._channels)
             self._read_mesh(document)
 
     def _read_mesh(self, document: Mapping[str, Any]) -> None:
@@ -76,25 +76,10 @@ class SkinnedGlb:
     def _joined(self, accessors: Iterator[int]) -> Floats:
         return np.concatenate([self._file.array(each) for each in accessors]).astype(np.float64)
 
-    def _channel(
-        self, animation: Mapping[str, Any], item: Mapping[str, Any]
-    ) -> tuple[tuple[int, str], Floats, Floats, bool]:
-        """Return what a channel moves, its times (K,), its values (K, width), and whether it steps."""
-        sampler, target = animation["samplers"][item["sampler"]], item["target"]
-        kind = sampler.get("interpolation", "LINEAR")
-        if kind not in ("LINEAR", "STEP"):
-            raise ValueError(f"interpolation {kind}")
-        times = self._file.array(sampler["input"])[:, 0].astype(np.float64)
-        values = self._file.array(sampler["output"]).astype(np.float64).reshape(len(times), -1)
-        return (target["node"], target["path"]), times, values, kind == "STEP"
-
     def vertices(self, time: float) -> Floats:
         """Return the vertices in the world of the file, y up, at a time [s], shape (V, 3)."""
         with self._understood():
-            moved = {
-                what: _at(time, times, values, steps, turns=what[1] == "rotation")
-                for what, times, values, steps in self._channels
-            }
+            moved = {(channel.node, channel.path): channel.at(time) for channel in self._channels}
             world: dict[int, Floats] = {}
             placed = [node_transform(joint, self._nodes, self._parents, moved, world) for joint in self._skin]
             matrices = np.stack(placed) @ self._binds
@@ -109,17 +94,3 @@ class SkinnedGlb:
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document that is not what the specification says."""
         return understood(self.name, "a damaged glb", "a skinned mesh is needed", "export again")
-
-
-def _at(time: float, times: Floats, values: Floats, steps: bool, *, turns: bool) -> Floats:
-    """Return a channel's value at a time; before and after its keys it stays as they are."""
-    after = int(np.clip(np.searchsorted(times, time, side="right"), 1, max(len(times) - 1, 1)))
-    before, last = after - 1, len(times) - 1
-    after = min(after, last)
-    length = times[after] - times[before]
-    share = float(np.clip((time - times[before]) / length, 0, 1)) if length > 0 else 0.0
-    if steps:
-        return values[after if share >= 1 else before]
-    if turns:
-        return slerp(values[before], values[after], np.asarray(share))
-    return (1 - share) * values[before] + share * values[after]

@@ -19,7 +19,7 @@ CHANGED = BakeRequest(
     **INPUTS, root="/Hero", fps=24.0, samples_per_frame=2, pre_roll=0.5, target="game8", refine=3, feedback=True,
     latent_iterations=2, latent_elements="few", refined_output="points", hide_covered=True,
     keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk",
-    range="1001-1100", handles=8,
+    range="1001-1100", handles=8, level_of="coat", asset_version="v012", asset_identifier="studio:/cape",
 )  # fmt: skip
 
 
@@ -58,6 +58,8 @@ def test_what_is_no_request_is_not_read(document):
         ({"target": "abacus"}, "--target: 'abacus'; it is one of usd, "),
         ({"samples_per_frame": 0}, "--samples-per-frame: 0 samples in each frame; 1 to 64 are allowed"),
         ({"pre_roll": float("nan")}, "--pre-roll: nan seconds; 0 to 600 are allowed"),
+        ({"asset_version": "v\n1"}, "--asset-version: 'v.*'; 1 to 1000 printable characters are allowed"),
+        ({"asset_identifier": ""}, "--asset-identifier: ''; 1 to 1000 printable characters are allowed"),
         ({"refined_output": "voxels"}, "--refined-output: 'voxels'; it is one of joints, points"),
         ({"lbs": True, "keep": ModelSize(shapes=1, joints=1, influences=1)}, "leave keep out"),
     ],

@@ -52,7 +52,7 @@ from ssilk_core.training.state import (
 )
 from ssilk_core.training.step import EAGER_STEPS, Stepper, learning_rate
 from ssilk_core.training.validation import Score, Validator
-from ssilk_core.training.verdict import is_worse, percent, shortcomings, worse_message
+from ssilk_core.training.verdict import is_worse, percent, share_below, shortcomings, worse_message
 from ssilk_core.training.windows import WindowSampler
 
 pytestmark = pytest.mark.usefixtures("few_contacts")
@@ -860,3 +860,8 @@ def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job
 @pytest.mark.parametrize(("share", "text"), [(0.0345, "3.5%"), (-0.2, "20.0%"), (1.0, "100.0%"), (1.01, "over 100%")])
 def test_a_total_below_zero_is_lower_by_no_more_than_all(share, text):
     assert percent(share) == text
+
+
+@pytest.mark.parametrize(("total", "lbs", "share"), [(0.5, 1, 0.5), (-2, -1, 1), (-1, -2, -0.5), (1, 0, 0)])
+def test_a_total_that_is_lower_counts_as_such_below_zero_too(total, lbs, share):
+    assert share_below(total, lbs) == share

@@ -160,10 +160,10 @@ def check_animation(prim: Usd.Prim, joints: Sequence[str], frames: Sequence[floa
 
 
 def check_samples(attribute: Usd.Attribute, length: int, frames: Sequence[float]) -> Iterator[ShotFinding]:
-    """Check that an array has a value at each frame, or one default value, and the same length at all samples."""
+    """Check that an array has a value at each frame, or one for all, and the same length at all samples."""
     prim, name, times = attribute.GetPrim(), attribute.GetName(), attribute.GetTimeSamples()
     yield from error_unless(attribute.HasAuthoredValue(), prim, f"{name} has no value")
-    missing = np.setdiff1d(frames, times) if times else ()
+    missing = np.setdiff1d(frames, times) if len(times) > 1 else ()
     yield from error_unless(not len(missing), prim, f"{name} has no sample at {len(missing)} of {len(frames)} frames")
     wrong = [time for time, value in _samples(attribute) if len(value) != length]
     yield from error_unless(

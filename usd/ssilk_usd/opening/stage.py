@@ -146,20 +146,13 @@ def _clips(stage: Usd.Stage) -> Iterator[str]:
 
 
 def location(prim: Usd.Prim) -> str:
-    """Return "file:/Prim/Path", for messages and for `split_location`."""
+    """Return "file:/Prim/Path", for messages and for `ssilk_core.files.split_location`."""
     return f"{stage_name(prim.GetStage())}:{prim.GetPath()}"
 
 
 def stage_name(stage: Usd.Stage) -> str:
     """Return the path of a stage's root layer as the user gave it."""
     return stage.GetRootLayer().identifier
-
-
-def split_location(text: str) -> tuple[str, str | None]:
-    """Split "file[:/Prim/Path]" into file and prim path (None without one)."""
-    file, colon, prim = text.rpartition(":/")
-    # "C:/file.usd" is a file: the part before a prim path must have a suffix.
-    return (file, f"/{prim}") if colon and Path(file).suffix else (text, None)
 
 
 def named(prims: list[Usd.Prim], name: str) -> list[Usd.Prim]:

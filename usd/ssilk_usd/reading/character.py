@@ -11,7 +11,7 @@ from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.scene.assets import Body, Character, Floats, SkinWeights
 
-from ..names import SKEL
+from ..names import GEOM_BIND, SKEL
 from ..opening.stage import (
     PRIMS,
     StageLike,
@@ -30,7 +30,6 @@ from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin
 from .spaces import SkelSource
 
-GEOM_BIND = "primvars:skel:geomBindTransform"
 SKINNING_METHOD = "primvars:skel:skinningMethod"
 
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
 
-from ..opening.stage import StageLike, open_stage, split_location, stage_name
+from ..opening.stage import StageLike, open_stage, stage_name
 from ..units import StageUnits
 from .skin import match_joints
 

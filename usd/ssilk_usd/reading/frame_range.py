@@ -9,9 +9,10 @@ import numpy as np
 from pxr import Usd
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Motion, Skeleton
 
-from ..opening.stage import needs_whole_files, open_stage, split_location
+from ..opening.stage import needs_whole_files, open_stage
 from .motion import find_animation, frame_rate, read_motion, sampled_span
 
 _TOLERANCE = 1e-3  # of a frame

@@ -4,13 +4,24 @@
 from __future__ import annotations
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Mesh
 
-from ..names import CLASS, GARMENT, PROXIES
-from ..opening.stage import EARLIEST, PRIMS, apply, has_value, location, value, world_matrix
+from ..names import CLASS, GARMENT, GEOM_BIND, PROXIES, SKEL
+from ..opening.stage import (
+    EARLIEST,
+    PRIMS,
+    apply,
+    column_matrix,
+    has_value,
+    inherited,
+    inherited_target,
+    location,
+    value,
+    world_matrix,
+)
 from .polygons import triangulate
 
 
@@ -113,12 +124,23 @@ def kept_faces(prim: Usd.Prim, counts: Ints) -> tuple[Ints, Ints, Ints]:
 
 
 def winds_backwards(prim: Usd.Prim) -> bool:
-    """Return whether a mesh's faces, as they are seen, run clockwise from outside.
+    """Return whether a mesh's faces run clockwise from outside, where it is placed.
 
-    Left-handed ones do, and a negative scale of the xforms turns either kind into the other.
+    Left-handed ones do, and what places the mesh turns either kind into the other where it mirrors: its xforms, or
+    the geomBindTransform of a skinned mesh, whose xforms UsdSkel ignores.
     """
     left_handed = value(prim, "orientation") == UsdGeom.Tokens.leftHanded
-    return bool(left_handed != (np.linalg.det(world_matrix(prim)[:3, :3]) < 0))
+    return bool(left_handed != (np.linalg.det(_placement(prim)[:3, :3]) < 0))
+
+
+def _placement(prim: Usd.Prim) -> Floats:
+    """Return what places a mesh's points: to bind space where it is skinned, else to the world, shape (4, 4)."""
+    bound = inherited_target(prim, "skel:skeleton")
+    if not (bound and bound.IsA(UsdSkel.Skeleton) and inherited(prim, SKEL[0])):
+        return world_matrix(prim)
+    bind = inherited(prim, GEOM_BIND)
+    matrix = None if bind is None else bind.Get()
+    return np.eye(4) if matrix is None else column_matrix(matrix)
 
 
 def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:

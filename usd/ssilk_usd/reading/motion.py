@@ -10,6 +10,7 @@ import numpy as np
 from pxr import Usd, UsdSkel
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Ints, Motion, Skeleton
 from ssilk_core.scene.kinematics import MAX_FPS, MIN_FPS, matrix_from_quaternion, quaternion_from_matrix, rigid
 
@@ -22,7 +23,6 @@ from ..opening.stage import (
     named,
     needs_whole_files,
     open_stage,
-    split_location,
     world_matrix,
 )
 from ..opening.times import change_times, xform_attributes

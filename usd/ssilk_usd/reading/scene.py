@@ -10,6 +10,7 @@ from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Character, Garment, ProxyRig, Skeleton
 
 from ..names import PROXIES
@@ -19,7 +20,6 @@ from ..opening.stage import (
     StageLike,
     needs_whole_files,
     open_stage,
-    split_location,
     stage_name,
     value,
 )

@@ -14,9 +14,10 @@ import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.events import Message, Reporter
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage, split_location, value
+from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage, value
 from .motion import find_animation
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource

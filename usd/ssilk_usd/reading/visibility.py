@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from pxr import Usd, UsdGeom
 
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Motion
 
-from ..opening.stage import needs_whole_files, open_stage, split_location
+from ..opening.stage import needs_whole_files, open_stage
 from .motion import find_animation
 
 

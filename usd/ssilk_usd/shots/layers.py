@@ -31,16 +31,19 @@ from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
 from ..reading.mesh import is_garment
 from ..units import StageUnits
+from ..writing.asset_info import AssetInfo, author_asset_info
 from ..writing.author import Asset, define_asset, define_blendshapes, extent_array
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import new_stage, save
 from .layers_facts import AssetFacts, asset_facts
 from .play import Shot
-from .samples import PATH_OP, Samples, kept_joints, root_path
+from .samples import PATH_OP, Samples, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
+from .velocities import cut_frames, with_velocities
 
-DEFORMATION, QUALITY = "deformation", "quality"
-FRAMES_PER_SAVE = 128  # of points: 5 MB in memory for a garment of 3,000 vertices
+DEFORMATION, QUALITY, LEVEL = "deformation", "quality", "level"
+OWN_LEVEL = "default"  # the level that a garment with others is itself
+FRAMES_PER_SAVE = 64  # of points and velocities: 5 MB in memory for a garment of 3,000 vertices
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,17 @@ def write_asset(
     *,
     include_body: bool = True,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
+    lean: bool = True,
 ) -> WrittenAsset:
     """Write a garment's asset; files that hold the same already are left alone.
+
+    Args:
+        include_body: with the body meshes.
+        record: how the garment was made, kept on its mesh.
+        info: of the asset; its identifier is the asset's own layer where none is given.
+        lean: with the translation of the SkelRoot by which lean shots move it (see `samples.Samples`), so that they
+            are value clips of the asset alone.
 
     Raises:
         SsilkError: as `author.define_asset` does, or a file cannot be written.
@@ -114,7 +126,9 @@ def write_asset(
         geometry = sha256(temporary)
     with replacing(layout.asset, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
-        _define_component(stage, asset, layout, box)
+        _define_component(stage, asset, layout, box, info or AssetInfo())
+        if lean:
+            _define_path(stage.GetDefaultPrim()).Set(Gf.Vec3d(0))
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.asset)
         del stage
@@ -140,13 +154,15 @@ def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
     return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
 
 
-def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray) -> None:
+def _define_component(
+    stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray, info: AssetInfo
+) -> None:
     """Define the SkelRoot over its payload, with bounds that need no payload, and the variants."""
     root = UsdSkel.Root.Define(stage, asset.root).GetPrim()
     stage.SetDefaultPrim(root)
-    model = Usd.ModelAPI(root)
-    model.SetKind(Kind.Tokens.component)
-    model.SetAssetName(layout.garment)
+    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
+    identifier = info.identifier or f"./{layout.asset.name}"
+    author_asset_info(root, layout.garment, replace(info, identifier=identifier))
     UsdGeom.Boundable(root).CreateExtentAttr(box)
     root.GetPayloads().AddPayload(f"./{layout.geometry.name}", asset.root)
     with _variant(root, DEFORMATION, "rest"):
@@ -202,11 +218,11 @@ def write_animation(
     with replacing(path or layout.animation) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
-        _define_animation(stage, asset, layout, kept_names(deformer, motion, lean))
+        _define_animation(stage, asset, layout, deformer)
         asset = _define_own_shapes(stage, asset, deformer, units)
         set_metadata(stage, span, units)
         if lean:
-            UsdGeom.Xformable(stage.GetPrimAtPath(asset.root)).AddTranslateOp(opSuffix=PATH_OP.rpartition(":")[2])
+            _define_path(stage.GetPrimAtPath(asset.root))
         set_visibility(stage, asset.root, span, hidden)
         if hidden_polygons and asset.bodies:
             meshes = [body.mesh for body in asset.bodies]
@@ -221,13 +237,15 @@ def write_animation(
     return summary(layout.animation, deformer, motion, span, len(asset.shapes))
 
 
-def kept_names(deformer: Deformer, motion: Motion, lean: bool) -> list[str]:
-    """Return the joints that a shot animates."""
-    return [deformer.scene.joint_names[joint] for joint in kept_joints(deformer, motion, lean)]
+def _define_path(root: Usd.Prim) -> Usd.Attribute:
+    """Make the path of the character's root the translation of a SkelRoot."""
+    UsdGeom.Xformable(root).CreateXformOpOrderAttr([PATH_OP])
+    return root.CreateAttribute(PATH_OP, Sdf.ValueTypeNames.Double3, False)
 
 
-def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, joints: list[str]) -> None:
-    """Reference the asset, and override its SkelAnimation with the joints that this shot moves."""
+def _define_animation(stage: Usd.Stage, asset: Asset, layout: Layout, deformer: Deformer) -> None:
+    """Reference the asset, and override its SkelAnimation with the joints that the deformer has now."""
+    joints = deformer.scene.joint_names
     root = stage.DefinePrim(asset.root)
     stage.SetDefaultPrim(root)
     root.GetReferences().AddReference(os.path.relpath(layout.asset, layout.animation.parent))
@@ -281,6 +299,8 @@ def write_points(
 ) -> str:
     """Write the garment's points at each sample of a shot, [m] in world space, shape (V, 3), as a point cache.
 
+    Velocities are those of the points beneath the SkelRoot, whose own path is a transform beside them.
+
     Returns:
         SHA-256 of the file.
     """
@@ -290,12 +310,19 @@ def write_points(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
-        attributes = [mesh.CreatePointsAttr().GetPath(), mesh.CreateExtentAttr().GetPath()]
+        made = mesh.CreatePointsAttr(), mesh.CreateVelocitiesAttr(), mesh.CreateExtentAttr()
+        attributes = [attribute.GetPath() for attribute in made]
         set_metadata(stage, span, units)
-        del stage
-        for frame, (points, path) in enumerate(zip(vertices, paths, strict=True)):
-            placed = np.ascontiguousarray(units.points_from_core(points - path), dtype=np.float32)
-            values = Vt.Vec3fArray.FromNumpy(placed), extent_array(placed.min(axis=0), placed.max(axis=0))
+        del stage, made
+        local = (units.points_from_core(points - path) for points, path in zip(vertices, paths, strict=True))
+        cuts = cut_frames(motion, deformer.scene.character.skeleton)
+        for frame, rows in enumerate(with_velocities(local, motion.fps, cuts)):
+            placed, moving = (np.ascontiguousarray(each, dtype=np.float32) for each in rows)
+            values = (
+                Vt.Vec3fArray.FromNumpy(placed),
+                Vt.Vec3fArray.FromNumpy(moving),
+                extent_array(placed.min(axis=0), placed.max(axis=0)),
+            )
             for attribute, value in zip(attributes, values):
                 layer.SetTimeSample(attribute, start + span.step * frame, value)
             if frame % FRAMES_PER_SAVE == FRAMES_PER_SAVE - 1:
@@ -328,13 +355,20 @@ class WrittenStage:
     bodies: Mapping[str, str]
 
 
-def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = frozenset()) -> WrittenStage:
+def write_stage(
+    garments: Mapping[Layout, Hashable],
+    needed: Container[str] = frozenset(),
+    levels: Mapping[str, str] | None = None,
+) -> WrittenStage:
     """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
+
+    A garment with levels of quality is one prim, of which each is a variant of `LEVEL`.
 
     Args:
         garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
             its garments that has one. If none can be read, no stage is written.
         needed: names of garments that have to be in it; others are left out where they cannot be read.
+        levels: names of garments that are levels of another one, by their own.
 
     Raises:
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
@@ -357,18 +391,42 @@ def write_stage(garments: Mapping[Layout, Hashable], needed: Container[str] = fr
             stage.SetMetadata(name, first.pseudoRoot.GetInfo(name))
         stage.SetStartTimeCode(min(start for start, _ in spans))
         stage.SetEndTimeCode(max(end for _, end in spans))
-        for garment, opened in stages.items():
-            prim = stage.DefinePrim(shot.GetPath().AppendChild(garment.garment))
-            prim.GetReferences().AddReference(os.path.relpath(garment.animation, layout.stage.parent))
-            bodies = _body_names(opened)
-            if bodies and shown.setdefault(garments[garment], garment.garment) != garment.garment:
-                others[garment.garment] = shown[garments[garment]]
-                for name in bodies:
-                    stage.OverridePrim(prim.GetPath().AppendChild(name)).SetActive(False)
+        grouped: dict[str, list[Layout]] = {}
+        for garment in stages:
+            grouped.setdefault((levels or {}).get(garment.garment, garment.garment), []).append(garment)
+        for name, group in grouped.items():
+            prim = stage.DefinePrim(shot.GetPath().AppendChild(name))
+            _reference_levels(prim, name, group)
+            for garment in group:
+                bodies = _body_names(stages[garment])
+                if bodies and shown.setdefault(garments[garment], name) != name:
+                    others[garment.garment] = shown[garments[garment]]
+                    for body in bodies:
+                        stage.OverridePrim(prim.GetPath().AppendChild(body)).SetActive(False)
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.stage)
         del stage, shot, prim
     return WrittenStage(unreadable, others)
+
+
+def _reference_levels(prim: Usd.Prim, name: str, group: Sequence[Layout]) -> None:
+    """Reference a garment, or each of its levels in a variant; the garment that gave the name is selected."""
+    if [garment.garment for garment in group] == [name]:
+        prim.GetReferences().AddReference(_from_stage(group[0]))
+        return
+    for garment in sorted(group, key=lambda each: each.garment == name):  # what is added last is selected
+        with _variant(prim, LEVEL, level_name(garment.garment, name)):
+            prim.GetReferences().AddReference(_from_stage(garment))
+
+
+def level_name(garment: str, base: str) -> str:
+    """Return the variant that a garment is as a level of another one: `cape_game` is the level `game` of `cape`."""
+    own = garment.removeprefix(f"{base}_")
+    return OWN_LEVEL if garment == base else garment if own in ("", OWN_LEVEL) else own
+
+
+def _from_stage(layout: Layout) -> str:
+    return os.path.relpath(layout.animation, layout.stage.parent)
 
 
 def _opened(garments: Iterable[Layout], needed: Container[str]) -> tuple[dict[Layout, Usd.Stage], dict[str, str]]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,10 +19,12 @@ from ..opening.garment_api import GarmentRecord
 from ..opening.stage import PRIMS
 from ..reading.mesh import is_garment
 from ..units import StageUnits
+from ..writing.asset_info import AssetInfo
 from ..writing.author import extent_array
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
 from .shot import ShotSummary, write_shot
+from .velocities import cut_frames, with_velocities
 
 FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
 
@@ -43,6 +45,7 @@ class PointCache:
         self.layer = Sdf.Layer.FindOrOpen(str(path))
         stage = Usd.Stage.Open(self.layer, None)
         self.garment, self.root = _unbind(stage), stage.GetDefaultPrim().GetPath()
+        UsdGeom.Mesh(stage.GetPrimAtPath(self.garment)).CreateVelocitiesAttr()
 
     def write(self, frame: int, points: Floats) -> None:
         """Write the garment's points [m], y up, shape (V, 3), of one frame of the shot.
@@ -73,6 +76,20 @@ class PointCache:
     def _set(self, name: str, time: float, value: object) -> None:
         self.layer.SetTimeSample(self.garment.AppendProperty(name), time, value)
 
+    def add_velocities(self, cuts: Container[int]) -> None:
+        """Write the velocities of the points once all frames are there; none leads across `cuts`.
+
+        See `velocities`: frames may have come in any order.
+        """
+        points = self.garment.AppendProperty("points")
+        times = self.shot.start + self.step * np.arange(self.frame_count)
+        read = (np.array(self.layer.QueryTimeSample(points, float(time)), dtype=np.float64) for time in times)
+        for time, (_, moving) in zip(times, with_velocities(read, self.shot.fps / self.step, cuts)):
+            self._set("velocities", float(time), Vt.Vec3fArray.FromNumpy(moving.astype(np.float32)))
+            self.unsaved_count += 1
+            if self.unsaved_count >= FRAMES_PER_SAVE:
+                self.save()
+
     def save(self) -> None:
         """Write pending changes to the file."""
         save(self.layer, self.path)
@@ -93,8 +110,11 @@ def point_cache(
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
 ) -> Iterator[PointCache]:
     """Yield a cache that takes the garment's points frame by frame; the file appears once all are in it.
+
+    Their velocities are added then, for motion blur.
 
     Character, body and time codes are those of a shot by `write_shot`; the garment is bound to nothing.
 
@@ -102,8 +122,8 @@ def point_cache(
         path: the file to write: .usdc, .usd, or .usda for people.
         motion: the character's motion at the samples of the shot, whose rate becomes the shot's.
         start: time code of the first frame, by default the motion's own.
-        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record: as `write_shot` takes
-            them.
+        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record, info: as `write_shot`
+            takes them.
 
     Raises:
         SsilkError: frames are missing at the end, or the file cannot be written.
@@ -123,12 +143,14 @@ def point_cache(
             hidden_polygons=hidden_polygons,
             provenance=provenance,
             record=record,
+            info=info,
         )
         cache = PointCache(temporary, shot, scene.garment.mesh.vertex_count, units, samples_per_frame)
         yield cache
         missing = int((~cache.written).sum())
         if missing:
             fail(str(path), f"{missing} of {motion.frame_count} frames have no points", "every frame needs points")
+        cache.add_velocities(cut_frames(motion, scene.character.skeleton))
         cache.save()
         del cache  # the file is closed before it is renamed
 

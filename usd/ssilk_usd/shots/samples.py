@@ -10,12 +10,11 @@ import numpy as np
 from pxr import Gf, Sdf, UsdSkel, Vt
 
 from ssilk_core.errors import fail
-from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, SkinWeights
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion, SkinWeights
 from ssilk_core.scene.kinematics import (
     combined_transforms,
     continuous,
     local_transforms,
-    matrix_from_quaternion,
     quaternion_from_matrix,
     skinning_matrices,
     sorted_influences,
@@ -36,7 +35,13 @@ class Samples:
         layer: where they go; it holds specs of the SkelRoot and the SkelAnimation.
         start: time code of the first frame.
         step: time codes from one frame to the next.
-        lean: leave joints that stay at rest out; the SkelRoot moves as far as its first root joint leaves its rest.
+        lean: the SkelRoot moves as far as its first root joint leaves its rest.
+
+    All that is constant of an asset's shots is alike in them, joints above all: UsdClipsAPI plays samples alone, so
+    several shots are clips of one asset.
+
+    Raises:
+        SsilkError: the motion is of another skeleton.
     """
 
     def __init__(
@@ -54,10 +59,11 @@ class Samples:
         self.layer, self.asset, self.deformer, self.motion = layer, asset, deformer, motion
         self.units, self.start, self.step, self.lean, self.unsaved_count = units, start, step, lean, 0
         self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in asset.bodies)]
-        self.kept = kept_joints(deformer, motion, lean)
+        _need_same_skeleton(deformer, motion)
         self.path = root_path(deformer, motion)
         self.moves = bool((np.ptp(_stored_translations(deformer, motion, lean), axis=0) > AT_REST).any())
         self.last_rotations: Floats | None = None
+        self.begins = 1  # frames of a chunk that are the shot's first
 
     def append(self, pose: GarmentPose) -> None:
         """Write the frames of `pose`."""
@@ -82,16 +88,15 @@ class Samples:
 
     def _write_joints(self, times: Floats, world: Floats) -> None:
         animation, parents = self.asset.animation, self.deformer.scene.parents
-        local = local_transforms(self.units.transforms_from_core(world), parents)[:, self.kept]
+        local = local_transforms(self.units.transforms_from_core(world), parents)
         rotations = continuous(quaternion_from_matrix(local[..., :3, :3]), self.last_rotations)
         self.last_rotations, rotations = rotations[-1:], rotations[..., [1, 2, 3, 0]]
         self._write(animation, "rotations", times, map(Vt.QuatfArray.FromNumpy, rotations.astype(np.float32)))
         translations = local[..., :3, 3].astype(np.float32)
-        if self.moves:
-            self._write(animation, "translations", times, map(Vt.Vec3fArray.FromNumpy, translations))
-        else:
-            attribute = self.layer.GetAttributeAtPath(animation.AppendProperty("translations"))
-            attribute.default = Vt.Vec3fArray.FromNumpy(translations[0])
+        if not self.moves:  # one sample for all, since clips have no defaults
+            times, translations = times[: self.begins], translations[: self.begins]
+        self._write(animation, "translations", times, map(Vt.Vec3fArray.FromNumpy, translations))
+        self.begins = 0
 
     def _extents(self, pose: GarmentPose, world: Floats) -> Iterator[Vt.Vec3fArray]:
         """Yield the bounds of everything skinned at each frame."""
@@ -129,24 +134,14 @@ def root_path(deformer: Deformer, motion: Motion) -> Floats:
     return motion.translations[:, 0] - deformer.scene.character.skeleton.rest_transforms[0, :3, 3]
 
 
-def kept_joints(deformer: Deformer, motion: Motion, lean: bool) -> Ints:
-    """Return the combined joints that are animated: all; where `lean`, roots, proxies, and those that leave rest.
-
-    Raises:
-        SsilkError: the motion is of another skeleton.
-    """
-    skeleton, scene = deformer.scene.character.skeleton, deformer.scene
+def _need_same_skeleton(deformer: Deformer, motion: Motion) -> None:
+    skeleton = deformer.scene.character.skeleton
     if motion.rotations.shape[1] != skeleton.joint_count:
         fail(
             motion.path,
             f"{motion.rotations.shape[1]} animated joints, where {skeleton.path} has {skeleton.joint_count}",
             "the motion must be one of this skeleton",
         )
-    turned = np.abs(matrix_from_quaternion(motion.rotations) - skeleton.rest_transforms[:, :3, :3])
-    moved = np.abs(motion.translations - skeleton.rest_transforms[:, :3, 3])
-    away = np.maximum(turned.max(axis=(0, 2, 3)), moved.max(axis=(0, 2)))
-    kept = (away > AT_REST) | (skeleton.parents < 0) | (not lean)
-    return np.flatnonzero(np.concatenate([kept, np.ones(scene.rig.proxy_count, dtype=bool)]))
 
 
 class _Surface:

@@ -16,6 +16,7 @@ from ssilk_core.scene.assets import Deformer, GarmentPose, Motion
 
 from ..opening.garment_api import GarmentRecord
 from ..units import StageUnits
+from ..writing.asset_info import AssetInfo
 from ..writing.author import define_asset
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
@@ -56,6 +57,7 @@ def write_shot(
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
 ) -> ShotSummary:
     """Write rest points, blendshapes, weights and joint animation as UsdSkel (Eqs. 5 and 8).
 
@@ -83,7 +85,9 @@ def write_shot(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         hiding = hidden_polygons if include_body else None
-        asset = define_asset(stage, deformer, bodies, units, record=record, hidden_polygons=hiding, output=path)
+        asset = define_asset(
+            stage, deformer, bodies, units, record=record, info=info, hidden_polygons=hiding, output=path
+        )
         span = TimeSpan.of(motion, start, samples_per_frame)
         set_metadata(stage, span, units)
         set_visibility(stage, asset.root, span, hidden)

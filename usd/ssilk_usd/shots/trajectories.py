@@ -11,9 +11,10 @@ import numpy as np
 from pxr import Sdf, UsdGeom
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Ints
 
-from ..opening.stage import USD_SUFFIXES, split_location
+from ..opening.stage import USD_SUFFIXES
 from .play import Shot
 
 MOST_OTHER_EDGES = 0.5  # share of the edges: with all quads divided along their other diagonals a third is others

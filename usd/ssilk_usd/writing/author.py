@@ -13,15 +13,16 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
 from ..opening.garment_api import GarmentRecord, apply_garment_api
-from ..opening.stage import split_location
 from ..reading.mesh import display_colour
 from ..reading.skin import leaf
 from ..units import StageUnits
+from .asset_info import AssetInfo, author_asset_info
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .look import copy_looks
 
@@ -56,6 +57,7 @@ def define_asset(
     *,
     name: str | None = None,
     record: GarmentRecord | None = None,
+    info: AssetInfo | None = None,
     hidden_polygons: HiddenPolygons | None = None,
     output: str | Path = "",
 ) -> Asset:
@@ -64,6 +66,7 @@ def define_asset(
     Args:
         name: of the SkelRoot (default: the character's).
         record: how the garment was made, kept on its mesh.
+        info: of the SkelRoot as an asset, under its own name; None for none.
         hidden_polygons: polygons of the bodies to hide.
         output: where the layer will lie, which paths of textures are relative to.
 
@@ -80,6 +83,8 @@ def define_asset(
     shape_names = [shape_name(index) for index in shapes]
     _define_animation(stage, paths[1], scene.joint_names, shape_names)
     _bind_root(root, skeleton, paths[1])
+    if info is not None:
+        author_asset_info(root.GetPrim(), root.GetPrim().GetName(), info)
     garment = define_mesh(stage, paths[2], scene.garment.mesh, units)
     mark_garment(garment.GetPrim(), scene.garment, scene.rig.joint_names or None)
     apply_garment_api(garment.GetPrim(), record)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 import shutil
 import struct
 import tempfile
@@ -11,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
@@ -98,11 +100,14 @@ def _pack(layer: Path, out: Path) -> None:
 
 
 def _gathered(path: Path) -> dict[str, Path]:
-    """Rename the textures of a layer to their names in a package; return these with their files."""
+    """Rename the textures of a layer to their names in a package; return these with their files.
+
+    Textures in other packages are unpacked into the layer's folder, which is temporary.
+    """
     layer, found, folders = Sdf.Layer.FindOrOpen(str(path)), dict[str, Path](), dict[str, str]()
 
     def packaged_name(name: str) -> str:
-        file = path.parent / name
+        file = _unpacked(name, path.parent) if Ar.IsPackageRelativePath(name) else path.parent / name
         tiles = sorted(file.parent.glob(file.name.replace(UDIM, "[0-9]" * 4))) if UDIM in name else [file]
         tiles = [tile for tile in tiles if name and tile.is_file()]
         if not tiles:
@@ -115,3 +120,17 @@ def _gathered(path: Path) -> dict[str, Path]:
     if found:
         save(layer, path)
     return found
+
+
+def _unpacked(name: str, home: Path) -> Path:
+    """Unpack "file.usdz[texture]", with all tiles of UDIMs, beneath a folder; return where the texture lies then."""
+    package, inner = Ar.SplitPackageRelativePathOuter(name)
+    folder, _, leaf = inner.rpartition("/")
+    place = home / "unpacked" / hashlib.sha256(f"{package}/{folder}".encode()).hexdigest()[:12]
+    tiles = re.compile(re.escape(inner).replace(re.escape(UDIM), "[0-9]{4}"))
+    if zipfile.is_zipfile(home / package):
+        with zipfile.ZipFile(home / package) as archive:
+            for member in filter(tiles.fullmatch, archive.namelist()):
+                place.mkdir(parents=True, exist_ok=True)
+                (place / member.rpartition("/")[2]).write_bytes(archive.read(member))
+    return place / leaf

@@ -17,9 +17,10 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Ints, Mesh
 
-from ..opening.stage import EARLIEST, PRIMS, location, open_stage, split_location
+from ..opening.stage import EARLIEST, PRIMS, location, open_stage
 from ..reading.mesh import is_garment, kept_faces, polygons
 from .body_faces import face_kind
 
@@ -118,6 +119,7 @@ def copy_looks(
         _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
         _copy_subsets(flat, stage, look, path)
         _bind_materials(flat, stage, root, look, path, materials, left)
+        _keep_stand_in(stage, look, path, looks)
     folder = os.path.abspath(os.path.dirname(output))
     UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
     return left
@@ -190,6 +192,17 @@ def _copy_meaning(look: LookSource, mesh: UsdGeom.Mesh) -> None:
     sets, own = UsdGeom.PrimvarsAPI(mesh), look.prim.GetAttribute("primvars:st")
     if sets.HasPrimvar("st") and not own:  # the set has a name of its own
         sets.RemovePrimvar("st")
+
+
+def _keep_stand_in(
+    stage: Usd.Stage, look: LookSource, path: Sdf.Path, looks: Sequence[tuple[Sdf.Path, LookSource]]
+) -> None:
+    """Let a mesh that is rendered name its stand-in, where one mesh of these is what its source names, or in it."""
+    found = UsdGeom.Imageable(look.prim).ComputeProxyPrim()
+    if found:
+        named = [to for to, other in looks if other.prim.GetPath().HasPrefix(found[0].GetPath())]
+        if len(named) == 1:
+            UsdGeom.Imageable(stage.GetPrimAtPath(path)).CreateProxyPrimRel().SetTargets(named)
 
 
 def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf.Path) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
@@ -23,12 +24,12 @@ from ..opening.stage import (
     inherited,
     location,
     open_stage,
-    split_location,
     value,
 )
 from ..reading.carried import carried_by
 from ..reading.garment import fitted_skeleton, garment_place
-from ..reading.mesh import is_garment, winds_backwards
+from ..reading.mesh import is_garment
+from ..reading.shapes import shape_offsets
 from ..reading.skeleton import find_skeleton
 from ..reading.skin import leaf
 from ..reading.spaces import SkelSource
@@ -40,8 +41,10 @@ from .look import copy_looks
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
 
+SAME_SHAPE = 1e-7  # of a garment's size, by which its points may differ and are left as they are
 
-def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> None:
+
+def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> str:
     """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
@@ -55,6 +58,9 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         out: the file to write: .usdc, .usd or .usda.
         moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
 
+    Returns:
+        What a garment from a file of its own loses of its look, for messages; empty where nothing.
+
     Raises:
         SsilkError: the output cannot be written.
     """
@@ -62,11 +68,19 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     layer = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
-    mesh, to_bind = _place_garment(stage, skel, source, scene, moved, out)
+    old, left_out, wanted = _in_stage(stage, source, scene.garment), "", None
+    if old:
+        mesh, to_bind, wanted = _place_garment(stage, skel, old, scene, moved)
+    else:
+        mesh, left_out = _copy_garment(stage, skel, scene.garment, out)
+        to_bind = np.eye(4)
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
+    if wanted is not None:
+        _shape_garment(mesh, skel, wanted)
     export(layer, out)
+    return left_out
 
 
 def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
@@ -92,37 +106,49 @@ def _prim_path(where: str) -> str:
     return split_location(where)[1] or where
 
 
-def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, source: str | Path, scene: Scene, moved: Floats | None, out: str | Path
-) -> tuple[UsdGeom.Mesh, Floats]:
-    """Return the garment's mesh beneath the SkelRoot, and its own space to bind space, shape (4, 4).
-
-    A mesh of the stage keeps its points but for what `moved`, and is moved if it stands elsewhere; one from its own
-    file is copied.
-    """
-    garment, skeleton = scene.garment, scene.character.skeleton
+def _in_stage(stage: Usd.Stage, source: str | Path, garment: Garment) -> Usd.Prim | None:
+    """Return the mesh of a garment that was read from the character's stage; None for one from its own file."""
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
     same = Path(file).exists() and Path(file).samefile(source)
-    if not (same and old and old.IsA(UsdGeom.Mesh)):
-        return _copy_garment(stage, skel, garment, out), np.eye(4)
+    return old if same and old and old.IsA(UsdGeom.Mesh) else None
+
+
+def _place_garment(
+    stage: Usd.Stage, skel: SkelSource, old: Usd.Prim, scene: Scene, moved: Floats | None
+) -> tuple[UsdGeom.Mesh, Floats, Floats | None]:
+    """Bring a garment's mesh beneath the SkelRoot, where it stands elsewhere.
+
+    Returns:
+        The mesh; its own space to bind space, shape (4, 4); and where its points are to be once it is bound, with
+        the blendshapes that are on then, shape (V, 3): None where they stay as they are.
+    """
+    garment, skeleton = scene.garment, scene.character.skeleton
     own = fitted_skeleton(old, str(skel.prim.GetPath())) or skel
     place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
     to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
+    shaped, wanted = shape_offsets(old, own), None
     if place.moves is not None:  # to its bind pose, which another skeleton has otherwise
-        moved = garment.mesh.points - apply(place.to_core, np.array(value(old, "points"), dtype=np.float64))
-    if moved is not None:
-        offset_points(UsdGeom.Mesh(old), moved @ np.linalg.inv(place.to_core[:3, :3]).T)
-    backwards = winds_backwards(old)
+        wanted = apply(np.linalg.inv(place.to_core), garment.mesh.points)
+    elif moved is not None or shaped is not None:
+        wanted = np.array(value(old, "points"), dtype=np.float64) + (0 if shaped is None else shaped)
+        wanted += 0 if moved is None else moved @ np.linalg.inv(place.to_core[:3, :3]).T
     if carried_by(old, own):
         old = _let_go(stage, skel, old)
     if not old.GetPath().HasPrefix(skel.root.GetPath()):
         old = _move(stage, old, _free_path(skel, old.GetName()))
-    if winds_backwards(old) != backwards:  # under other xforms, which mirror it, or no longer
-        tokens = UsdGeom.Tokens
-        turned = tokens.rightHanded if value(old, "orientation") == tokens.leftHanded else tokens.leftHanded
-        UsdGeom.Mesh(old).CreateOrientationAttr(turned)
-    return UsdGeom.Mesh(old), to_bind
+    return UsdGeom.Mesh(old), to_bind, wanted
+
+
+def _shape_garment(mesh: UsdGeom.Mesh, skel: SkelSource, wanted: Floats) -> None:
+    """Move the points of a bound garment so that they are where they are `wanted`, (V, 3), in its own space.
+
+    Blendshapes that its new skeleton has on add to them; those that only its old one had on no longer do.
+    """
+    on = shape_offsets(mesh.GetPrim(), skel)
+    offsets = wanted - np.array(value(mesh.GetPrim(), "points"), dtype=np.float64) - (0 if on is None else on)
+    if np.abs(offsets).max() > SAME_SHAPE * np.ptp(wanted, axis=0).max():
+        offset_points(mesh, offsets)
 
 
 def _keep_surface(prim: Usd.Prim, skel: SkelSource, garment: Garment, moved: Floats | None) -> None:
@@ -163,8 +189,13 @@ def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
     return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
-def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path) -> UsdGeom.Mesh:
-    """Define the garment below the SkelRoot in the stage's bind space; replace an older copy."""
+def _copy_garment(
+    stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path
+) -> tuple[UsdGeom.Mesh, str]:
+    """Define the garment below the SkelRoot in the stage's bind space, and say what its look loses.
+
+    An older copy is replaced.
+    """
     name = prim_names([garment.mesh.path])[0]
     older = stage.GetPrimAtPath(skel.root.GetPath().AppendChild(name))
     if older and is_garment(older):
@@ -172,8 +203,8 @@ def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str
     points = apply(np.linalg.inv(skel.bind_to_core), garment.mesh.points)
     path, file = _free_path(skel, name), split_location(garment.mesh.path)[0]
     mesh = define_mesh(stage, path, replace(garment.mesh, points=points), StageUnits())
-    copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
-    return mesh
+    left = copy_looks(stage, skel.root.GetPath(), file, [(garment.mesh, path)], out)
+    return mesh, str(left)
 
 
 def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
