@@ -84,7 +84,7 @@ def openjd_run(chunk: int) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True)
 
 
-def test_a_bundle_runs_unchanged_with_openjd_and_a_bad_shot_ends_no_session(farm):
+def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     """The first chunk fails, those behind it are baked, and the last step says which shot is missing.
 
     When its motion is whole, the same bundle bakes that shot and finds the others current.
