@@ -8,6 +8,7 @@ import importlib
 import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -50,19 +51,21 @@ def modules(folder: Path) -> list[tuple[Path, tuple[str, ...]]]:
     return [(path, path.relative_to(folder.parent).parts[:-1]) for path in sorted(folder.rglob("*.py"))]
 
 
-def executed(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield all nodes except those under `if TYPE_CHECKING`."""
-    yield node
-    for child in ast.iter_child_nodes(node):
-        if not (isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING"):
-            yield from executed(child)
+def executed(node: ast.AST, without: type[ast.AST] | tuple[()] = ()) -> Iterator[ast.AST]:
+    """Yield all nodes except those under `if TYPE_CHECKING`, and in nodes of a kind."""
+    waiting = [node]
+    while waiting:
+        yield (one := waiting.pop())
+        for child in reversed(list(ast.iter_child_nodes(one))):
+            if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+                continue
+            if not isinstance(child, without):
+                waiting.append(child)
 
 
 def loaded(node: ast.AST) -> Iterator[ast.AST]:
     """Yield the nodes that run when a module is imported: no functions, nothing under `if TYPE_CHECKING`."""
-    inner = (child for child in executed(node) if isinstance(child, ast.FunctionDef))
-    skipped = {id(each) for function in inner for each in ast.walk(function)}
-    yield from (each for each in executed(node) if id(each) not in skipped)
+    yield from executed(node, without=ast.FunctionDef)
 
 
 Nodes = Callable[[ast.AST], Iterator[ast.AST]]
@@ -70,7 +73,16 @@ Nodes = Callable[[ast.AST], Iterator[ast.AST]]
 
 def imports(path: Path, package: tuple[str, ...], nodes: Nodes = executed) -> Iterator[tuple[str, ...]]:
     """Yield what a module imports, as dotted parts; `nodes` picks the code that counts, all that runs by default."""
-    for node in nodes(ast.parse(path.read_text(encoding="utf-8"))):
+    yield from _imports(path.read_text(encoding="utf-8"), package, nodes)
+
+
+@cache
+def _imports(code: str, package: tuple[str, ...], nodes: Nodes) -> tuple[tuple[str, ...], ...]:
+    return tuple(_each_import(ast.parse(code), package, nodes))
+
+
+def _each_import(code: ast.AST, package: tuple[str, ...], nodes: Nodes) -> Iterator[tuple[str, ...]]:
+    for node in nodes(code):
         if isinstance(node, ast.Import):
             yield from (tuple(alias.name.split(".")) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -251,8 +263,13 @@ def test_one_path_leads_to_each_public_name():
 
 def defined(path: Path) -> set[str]:
     """Return the names that a module has, by its code: where there is no Blender it cannot be imported."""
+    return _defined(path.read_text(encoding="utf-8"))
+
+
+@cache
+def _defined(code: str) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):

@@ -57,7 +57,7 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
 @pytest.fixture
 def stopped(world, monkeypatch, capsys):
     """figures.json of a run that was stopped after a row; return its command, and the takes measured since."""
-    words, measured, out = f"{WORLD} --index index.json -o figures.json", [], world / "figures.json"
+    words, measured, out = f"{QUICK} --index index.json -o figures.json", [], world / "figures.json"
 
     def interrupted(*args):
         if out.exists() and not measured:

@@ -26,8 +26,9 @@ def define_mesh(stage: Usd.Stage, path: str, points: np.ndarray, faces: np.ndarr
 
 def write_hero(path: Path) -> Path:
     """A pillar 1.7 m high with two joints, in metres, y up."""
-    body = trimesh.creation.cylinder(0.15, 1.7, sections=24).subdivide().subdivide()
-    points = body.vertices[:, [0, 2, 1]] * [1, 1, -1] + [0, 0.85, 0]
+    side = [(0.15, height) for height in np.linspace(0, 1.7, 25)]  # long triangles are near much of the cloth
+    body = trimesh.creation.revolve([(0, 0), *side, (0, 1.7)], sections=24)
+    points = body.vertices[:, [0, 2, 1]] * [1, 1, -1]
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.SetStageUpAxis(stage, "Y")

@@ -50,9 +50,9 @@ def grid(columns: int = 4, rows: int = 4, size: float = 0.1) -> Mesh:
 
 def pillar(height: float = 1.7, radius: float = 0.15) -> Mesh:
     """A closed body: a cylinder that stands on the floor, with its normals outward."""
-    shape = trimesh.creation.cylinder(radius, height, sections=24).subdivide().subdivide()
-    shape.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0]))
-    return Mesh("hero.usda:/Body", shape.vertices + [0, height / 2, 0], shape.faces)
+    side = [(radius, at) for at in np.linspace(0, height, 25)]  # long triangles are near much of the cloth
+    shape = trimesh.creation.revolve([(0, 0), *side, (0, height)], sections=24)
+    return Mesh("hero.usda:/Body", shape.vertices[:, [0, 2, 1]] * [1, 1, -1], shape.faces)
 
 
 def tube(radius: float = 0.17, low: float = 0.9, high: float = 1.4, rows: int = 13) -> Mesh:

@@ -31,11 +31,12 @@ def tube(radius: float, columns: int = COLUMNS, rows: int = ROWS, height: float 
 
 def limb(radius: float = RADIUS) -> Mesh:
     """Return a closed cylinder about the y axis, longer than the tube."""
-    side = tube(radius, 96, 11, 1.0)
+    rings = 41  # long triangles are near much of the cloth
+    side = tube(radius, 96, rings, 1.0)
     ends = np.array([[0.0, 0, 0], [0, 1, 0]])
-    ring, last = np.arange(96), 10 * 96 + np.arange(96)
-    low = np.c_[np.roll(ring, -1), ring, np.full(96, 11 * 96)]
-    high = np.c_[last, np.roll(last, -1), np.full(96, 11 * 96 + 1)]
+    ring, last = np.arange(96), (rings - 1) * 96 + np.arange(96)
+    low = np.c_[np.roll(ring, -1), ring, np.full(96, rings * 96)]
+    high = np.c_[last, np.roll(last, -1), np.full(96, rings * 96 + 1)]
     return Mesh("Limb", np.r_[side.points, ends] - [0, 0.2, 0], np.r_[side.faces, low, high])
 
 
@@ -105,7 +106,7 @@ def test_an_inspection_promises_only_what_settling_does(monkeypatch):
     assert found.fixable and found.fix.endswith("--fix settles it") and found.count == len(inside.vertices) > 0
     assert f"up to {1000 * inside.depth:.1f} mm deep" in found.found
     run = "ssilk_core.authoring.preflight.settle._Solve.run"
-    monkeypatch.setattr(run, lambda solve: solve.cloth.points + [0, 1e-6, 0])
+    monkeypatch.setattr(run, lambda solve: solve.cloth.points * [1 + 1e-6, 1, 1 + 1e-6])
     found = next(penetration(cloth, limb()))
     assert not found.fixable and found.fix.endswith(f"--fix leaves {found.count} vertices inside")
 
