@@ -15,7 +15,7 @@ from ..motions.keys import has_keys
 from ..motions.simulated import simulating
 from ..playback import playing
 from ..playback.gltf import MOST_LOST, export_glb, largest_loss, visible
-from ..scene.garment import armature_of, unusable_here
+from ..scene.garment import armature_of, unplayable_here
 from .reporting import ReportingOperator
 
 SUFFIX = ".glb"
@@ -32,7 +32,7 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable_here(context):
+        if reason := unplayable_here(context):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played live; bake it first"

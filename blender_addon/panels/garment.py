@@ -10,7 +10,7 @@ from ..operators import make_it_move, tasks
 from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
-from ..scene.garment import armature_of, garments_of, unusable
+from ..scene.garment import armature_of, garments_of, unplayable, unusable
 from .base import SidebarPanel, UsableGarmentPanel, draw_text, draw_work, saying_errors
 from .training import draw_bar
 
@@ -66,7 +66,8 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
         layout, reason = self.layout, unusable(context.object)
         if reason:
             draw_text(layout, reason, icon="INFO")
-            layout.operator("ssilk.import_stage", icon="IMPORT")
+            if unplayable(context.object):
+                layout.operator("ssilk.import_stage", icon="IMPORT")
         else:
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")

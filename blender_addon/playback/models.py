@@ -24,6 +24,7 @@ from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
 from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
 from ..outside.wording import recall, reworded
+from ..scene.linked import absolute, home, origin
 
 FIRST = "wait for its training, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
@@ -43,7 +44,7 @@ def trainings() -> list[OwnedJob]:
 def remembered(garment: bpy.types.Object) -> Path | None:
     """Return the folder of the training that a garment remembers; None where it remembers none."""
     folder = garment.ssilk.training.folder
-    return Path(os.path.normpath(bpy.path.abspath(folder))) if folder else None
+    return absolute(garment, folder, origin(garment).ssilk.training.folder) if folder else None
 
 
 def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -> Path | None:
@@ -52,7 +53,9 @@ def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -
     Args:
         known: the trainings beside the file, where they were read already.
     """
-    own, name, file = remembered(garment), garment.name, Path(bpy.data.filepath).name
+    own, name, file = remembered(garment), origin(garment).name, home(garment).name
+    if origin(garment).library:  # it was trained where it is linked from
+        known = owned(home(garment).parent / FOLDER)
     found = [job for job in (trainings() if known is None else known) if (job.garment, job.file) == (name, file)]
     before = owner(own) if own else None
     if found and not (before and before.begun > found[-1].begun):
@@ -91,7 +94,7 @@ def _read_orphans(known: Sequence[OwnedJob]) -> list[Orphan]:
     if not here:
         return []
     things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
-    linked = {job for thing in things if (job := job_of(thing, known)) and thing.users_scene}
+    linked = {job for thing in things if thing.users_scene and (job := job_of(thing, known))}
     states = ((job, read_state(job.folder)) for job in here if job.folder not in linked)
     return [Orphan(job, state.fraction) for job, state in states if state and state.alive]
 
@@ -114,7 +117,7 @@ def need_model(garment: bpy.types.Object, job: Path | None) -> Path:
     chosen = garment.ssilk.model
     if not chosen and not job:
         raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
-    path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
+    path = absolute(garment, chosen, origin(garment).ssilk.model) if chosen else job / MODEL
     if not path.is_file():
         where, todo = (f" at {path}", "choose another") if chosen else (" yet", FIRST)
         raise SetupError(f"'{garment.name}' has no model{where}; {todo}.")
@@ -173,7 +176,7 @@ def read_all(jobs: Sequence[OwnedJob]) -> bool:
     before = dict(_known)
     forget()
     for thing in bpy.data.objects:
-        if thing.type == "MESH":
+        if thing.type == "MESH" and not thing.library:
             _known[thing.session_uid] = (_question(thing), _read(thing, jobs))
     return before != _known
 

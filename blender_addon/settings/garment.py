@@ -9,7 +9,7 @@ from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProper
 from ..scene.classes import tighten
 from . import fabric, training
 from .fabric import FabricSettings
-from .training import RELATIVE, TrainingSettings
+from .training import RELATIVE, SHOTS, TrainingSettings
 
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
@@ -30,11 +30,13 @@ class GarmentSettings(bpy.types.PropertyGroup):
         poll=_is_armature,
         name="Armature",
         description="Armature of the character that wears the garment; found by its Armature modifier when empty",
+        override=SHOTS,
     )
     bodies: PointerProperty(
         type=bpy.types.Collection,
         name="Bodies",
         description="Meshes that the garment collides with; all others bound to the armature when empty",
+        override=SHOTS,
     )
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
     tightness: FloatProperty(
@@ -56,13 +58,20 @@ class GarmentSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=RELATIVE,
         description="Trained model of the garment; that of its own training when empty",
+        override=SHOTS,
     )
-    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
+    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"}, override=SHOTS)
     awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
-    heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"})
-    heat_told: StringProperty(description="What the heat map shows in this frame, in words", options={"HIDDEN"})
-    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"})
-    training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
+    heat: StringProperty(
+        description="What the heat map shows; empty for none", options={"HIDDEN"}, override=SHOTS
+    )
+    heat_told: StringProperty(
+        description="What the heat map shows in this frame, in words", options={"HIDDEN"}, override=SHOTS
+    )
+    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"}, override=SHOTS)
+    training: PointerProperty(
+        type=TrainingSettings, name="Training", description="How the garment is trained", override=SHOTS
+    )
 
 
 CLASSES = (*training.CLASSES, *fabric.CLASSES, GarmentSettings)
@@ -70,7 +79,7 @@ CLASSES = (*training.CLASSES, *fabric.CLASSES, GarmentSettings)
 
 def attach() -> None:
     """Give every object the settings."""
-    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings)
+    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings, override=SHOTS)
 
 
 def detach() -> None:
