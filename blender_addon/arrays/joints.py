@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.scene.assets import Skeleton
+from ssilk_core.scene.assets import Skeleton, SkinWeights, carrying_joint
 from ssilk_core.scene.kinematics import local_transforms
 
 from ..errors import SetupError
@@ -52,10 +52,18 @@ class Joints:
         return replace(self, names=self.names[:count], parents=self.parents[:count], binds=self.binds[:count],
                        proxy_count=0)  # fmt: skip
 
-    def skeleton(self, path: str) -> Skeleton:
-        """Return the character's joints as a skeleton whose rest pose is its bind pose; `path` is its prim's."""
+    def skeleton(self, path: str, bodies: Sequence[SkinWeights] = ()) -> Skeleton:
+        """Return the character's joints as a skeleton whose rest pose is its bind pose.
+
+        Args:
+            path: of its prim.
+            bodies: weights of the bodies over the joints; with none the first joint carries the character.
+        """
         own = self.character
-        return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents))
+        count = len(own.names)
+        moved = sum((skin.dense(count).mean(axis=0) for skin in bodies), np.zeros(count))
+        hub = carrying_joint(moved, own.parents)
+        return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents), hub)
 
 
 def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = False) -> np.ndarray:

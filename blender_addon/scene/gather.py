@@ -71,7 +71,9 @@ def gather(
     return GatheredScene(
         units=scene_units(),
         joints=joints if rig else joints.character,
-        character=Character(ROOT, joints.skeleton(f"{ROOT}/{SKELETON}"), tuple(bodies)),
+        character=Character(
+            ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", [body.skin for body in bodies]), tuple(bodies)
+        ),
         garment=Garment(
             mesh,
             None if lbs is None else SkinWeights.from_dense(paths[0], lbs),
