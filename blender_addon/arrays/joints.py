@@ -24,12 +24,14 @@ class Joints:
         parents: index of each joint's parent, -1 for roots, shape (J,).
         binds: joint to world at rest, rigid [m], y up, shape (J, 4, 4).
         proxy_count: how many of the last joints are proxies.
+        known: the paths by which a trained garment knows them where bones were renamed since; else empty.
     """
 
     names: tuple[str, ...]
     parents: np.ndarray
     binds: np.ndarray
     proxy_count: int = 0
+    known: tuple[str, ...] = ()
 
     @property
     def character_count(self) -> int:
@@ -43,14 +45,14 @@ class Joints:
     @property
     def paths(self) -> tuple[str, ...]:
         """UsdSkel joint paths."""
-        return joint_paths(self.names, self.parents)
+        return self.known or joint_paths(self.names, self.parents)
 
     @property
     def character(self) -> Joints:
         """The joints without proxies."""
         count = self.character_count
         return replace(self, names=self.names[:count], parents=self.parents[:count], binds=self.binds[:count],
-                       proxy_count=0)  # fmt: skip
+                       proxy_count=0, known=self.known[:count])  # fmt: skip
 
     def skeleton(self, path: str, bodies: Sequence[SkinWeights] = ()) -> Skeleton:
         """Return the character's joints as a skeleton whose rest pose is its bind pose.
@@ -81,7 +83,8 @@ def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = F
     if odd:
         raise SetupError(
             f"The bones are not those that the garment was trained with ('{odd[0].rpartition('/')[2]}' was added, "
-            "removed, renamed or has another parent); undo that, or train again."
+            "removed, renamed or has another parent); undo that, tell which bone it is by Match Bones in the Baking "
+            "panel, or train again."
         )
     places = {name: place for place, name in enumerate(names)}
     return np.array([places.get(path, -1) for path in paths])

@@ -19,6 +19,7 @@ from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
 
 from ..arrays.joints import Joints, joint_order
+from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
@@ -27,7 +28,7 @@ from ..outside.wording import recall, reworded
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
-from ..playback.models import model_of, no_model, trainings_folder
+from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
 from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
@@ -96,6 +97,9 @@ class TimelineOperator(tasks.OutsideOperator):
             raise SetupError(
                 f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again."
             )
+        skinned = self.baked.garment
+        trained = TrainedJoints(skinned.joint_names, skinned.bind_transforms)
+        joints = joints_known_to(garment, armature, joints, trained)
         playing.stop(garment)
         apply_bake(garment, armature, joints, self.baked)
         order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
@@ -104,7 +108,7 @@ class TimelineOperator(tasks.OutsideOperator):
         overridden = told(garment, armature, joints, self.baked)
         self.level = "WARNING" if overridden else "INFO"
         said = f", {overridden}" if overridden else ""
-        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{said}"
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{told_renames(joints)}{said}"
 
 
 class BakeGarment(TimelineOperator, bpy.types.Operator):
@@ -154,13 +158,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if not self.to_timeline and not self.to_usd:
             raise SetupError("Choose where to bake to: the timeline, USD, or both.")
         self.model, armature = model_of(garment), armature_of(garment)
-        joints = read_joints(armature, garment)
+        joints = self.known_joints(garment, armature)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
         if self.to_timeline and self.quality != WHOLE and QUALITIES[self.quality].refine:
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
+        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
@@ -171,6 +175,17 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
             rephrase=self.rephrase,
         )  # fmt: skip
+
+    def known_joints(self, garment: bpy.types.Object, armature: bpy.types.Object) -> Joints:
+        """Return the joints under the names that the model knows; raise `SsilkError` where it cannot be read."""
+        try:
+            scene = load_model(self.model).scene
+        except SsilkError as error:
+            raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
+        trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
+        joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
+        joint_order(joints, scene.joint_names)
+        return joints
 
     def rephrase(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files that were made for the bake."""

@@ -60,6 +60,14 @@ def overridden_line(garment: bpy.types.Object) -> str:
     return f"Blender does not show what was baked or is played: {'; '.join(found)}" if found else ""
 
 
+def draw_bones(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
+    """Draw the bones of the training that only the artist can tell, each with what it is called now."""
+    layout.operator("ssilk.match_bones", icon="BONE_DATA")
+    column = layout.column(align=True)
+    for item in garment.ssilk.bones:
+        column.prop_search(item, "bone", armature_of(garment).data, "bones", text=item.name)
+
+
 class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
@@ -71,6 +79,7 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
+        draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
         layout.operator("ssilk.export_gltf", icon="EXPORT")
         layout.operator("ssilk.remove_bake", icon="TRASH")

@@ -22,6 +22,7 @@ from ssilk_usd.shots.skinned import SkinnedGarment
 from ssilk_core.network.runtime import Playback
 from ssilk_core.scene.assets import GarmentPose, Motion
 
+from ..arrays.joints import Joints
 from ..errors import SetupError
 from ..motions.keys import has_live_keys, need_tracks, remove_keys
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
@@ -215,9 +216,10 @@ class Live:
 
     def _trained(self) -> TrainedGarment:
         """Read the model, and check that the bones move as it says."""
-        trained = TrainedGarment(self.model, self.joints)
+        garment, armature = self.objects()
+        trained = TrainedGarment(self.model, garment, armature, read_joints(armature, garment))
         if trained.player.file.config.translations:
-            need_movable(self.objects()[1], self.joints.proxies)
+            need_movable(armature, self.joints.proxies)
         return trained
 
     def _taking_up(self) -> Iterator[float]:
@@ -229,6 +231,7 @@ class Live:
         garment, armature = self.objects()
         if not self.ready():  # the artist edits it; the model is still a new one afterwards
             return
+        self.joints = self._joints_now()
         moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
         if len(moved):
             playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
@@ -246,9 +249,20 @@ class Live:
         garment, armature = self.objects()
         if not self.ready():
             raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
+        self.joints = self._joints_now()
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
         yield 0.0
+
+    def _joints_now(self) -> Joints:
+        """Return the joints where the armature, which may move as an object, has them in this frame."""
+        garment, armature = self.objects()
+        joints = read_joints(armature, garment)
+        if joints.names != self.joints.names or not np.array_equal(joints.parents, self.joints.parents):
+            raise SetupError(
+                f"Bones of '{armature.name}' were changed while '{garment.name}' was played; play it again."
+            )
+        return joints
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
         """Roll out again from a pose that differs from the one that was read."""

@@ -21,6 +21,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.network.runtime import Player
 
 from ..arrays.joints import Joints, joint_order
+from ..arrays.renamed import TrainedJoints, growth, known_as, renames
 from ..errors import SetupError
 from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
 from ..outside.wording import recall, reworded
@@ -211,25 +212,63 @@ def _read(garment: bpy.types.Object, jobs: Sequence[OwnedJob] | None = None) -> 
     )  # fmt: skip
 
 
+def chosen_bones(garment: bpy.types.Object) -> dict[str, str]:
+    """Return what the artist says that bones were called when a garment was trained, by their names now."""
+    return {item.bone: item.name for item in garment.ssilk.bones if item.bone}
+
+
+def joints_known_to(
+    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, trained: TrainedJoints
+) -> Joints:
+    """Return an armature's joints under the names that a garment was trained with.
+
+    Raises:
+        SetupError: the character has another size than then.
+    """
+    known = known_as(joints, trained, chosen_bones(garment))
+    ratio = growth(known, trained)
+    if ratio != 1:
+        scale = armature.matrix_world.median_scale
+        raise SetupError(
+            f"'{armature.name}' is scaled to {ratio:.4g} times its size when '{garment.name}' was trained, and cloth "
+            f"does not move alike in another size; scale it to {scale / ratio:.4g} (now {scale:.4g}), or train it at "
+            "this size."
+        )
+    return known
+
+
+def told_renames(joints: Joints) -> str:
+    """Return a note about bones that were renamed since a garment was trained; empty where none was."""
+    found = renames(joints)
+    if not found:
+        return ""
+    name = next(iter(found))
+    count = "1 bone is" if len(found) == 1 else f"{len(found)} bones are"
+    return f" ({count} called otherwise than in the training and matched, as '{name}', which was '{found[name]}')"
+
+
 class TrainedGarment:
     """A model on an armature.
 
     Attributes:
         player: plays it.
+        joints: of the armature, under the names that the model knows.
         own: joints of the armature in the order of the model's character, shape (J,).
         order: joints of the model in the order of the armature, proxies included, shape (J + P,).
 
     Raises:
-        SsilkError: it cannot be read, or has other joints than the armature.
+        SsilkError: it cannot be read, or has other joints than the armature, or those of another size.
     """
 
-    def __init__(self, path: Path, joints: Joints) -> None:
+    def __init__(self, path: Path, garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> None:
         try:
             self.player = Player.load(path)
         except SsilkError as error:
             raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
-        self.joints = joints
-        self.order = joint_order(joints, self.player.file.scene.joint_names)
+        scene = self.player.file.scene
+        trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
+        self.joints = joints = joints_known_to(garment, armature, joints, trained)
+        self.order = joint_order(joints, scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
 
     @property

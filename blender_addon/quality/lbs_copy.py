@@ -34,7 +34,7 @@ def show_copy(garment: bpy.types.Object) -> None:
     """
     armature = armature_of(garment)
     joints = read_joints(armature, garment)
-    copy = _lbs_copy(garment, TrainedGarment(model_of(garment), joints))
+    copy = _lbs_copy(garment, TrainedGarment(model_of(garment), garment, armature, joints))
     collection = bpy.data.collections.new(f"{garment.name} LBS")
     collection.objects.link(copy)
     shown = bpy.data.objects.new(f"{garment.name} LBS, beside", None)

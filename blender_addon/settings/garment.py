@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
 
 from ..scene.classes import tighten
 from . import fabric, training
@@ -20,6 +20,15 @@ def _tighten(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
     garment = settings.id_data
     if garment.type == "MESH" and garment.mode != "EDIT" and not garment.data.library:
         tighten(garment.data, settings.tightness)
+
+
+class BoneMatch(bpy.types.PropertyGroup):
+    """A bone that is called otherwise than when the garment was trained; its name is the one from then."""
+
+    bone: StringProperty(
+        name="Bone", description="What this bone of the training is called now; empty where it is not chosen",
+        override=SHOTS,
+    )  # fmt: skip
 
 
 class GarmentSettings(bpy.types.PropertyGroup):
@@ -60,6 +69,12 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Trained model of the garment; that of its own training when empty",
         override=SHOTS,
     )
+    bones: CollectionProperty(
+        type=BoneMatch,
+        description="Bones of the training that the artist has found again",
+        options={"HIDDEN"},
+        override={*SHOTS, "USE_INSERTION"},
+    )
     live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"}, override=SHOTS)
     awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
     heat: StringProperty(
@@ -74,7 +89,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (*training.CLASSES, *fabric.CLASSES, GarmentSettings)
+CLASSES = (*training.CLASSES, *fabric.CLASSES, BoneMatch, GarmentSettings)
 
 
 def attach() -> None:
