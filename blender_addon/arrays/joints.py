@@ -48,6 +48,11 @@ class Joints:
         return self.known or joint_paths(self.names, self.parents)
 
     @property
+    def bones(self) -> dict[str, str]:
+        """Names of the bones by their paths."""
+        return dict(zip(self.paths, self.names))
+
+    @property
     def character(self) -> Joints:
         """The joints without proxies."""
         count = self.character_count

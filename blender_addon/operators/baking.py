@@ -24,7 +24,7 @@ from ..errors import SetupError
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.sources import TIMELINE, Source
-from ..outside.wording import recall, reworded
+from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
@@ -168,7 +168,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
-        self.character, self.inputs = joints.character, inputs_folder(garment, self.model)
+        self.bones, self.character = joints.bones, joints.character
+        self.inputs = inputs_folder(garment, self.model)
         self.words = {f"{self.inputs.name}/{MOTION}": "the timeline"}
         closing = self.closing() if self.to_timeline else None
         return Work(
@@ -191,7 +192,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         """Return a sentence with names of objects in place of files that were made for the bake."""
         sentence = reworded(sentence, self.work.folder, {SHOT: f"the bake of '{self.pair.name}'"})
         sentence = reworded(sentence, self.inputs.parent, self.words)
-        return reworded(sentence, self.model.parent, recall(self.model.parent))
+        return with_bones(reworded(sentence, self.model.parent, recall(self.model.parent)), self.bones)
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
