@@ -38,8 +38,9 @@ def draw_work(layout: bpy.types.UILayout) -> None:
     if work is None:
         draw_failure(layout)
         return
+    draw_text(layout, f"{work.title}: stopping" if work.cancelled else work.title)
     row = layout.row(align=True)
-    row.progress(factor=work.fraction or 0.0, text=work.status)
+    row.progress(factor=work.fraction or 0.0, text=work.share)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
         draw_text(layout, work.text)

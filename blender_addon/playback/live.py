@@ -125,7 +125,10 @@ class Live:
         if self.playback is None or not self.is_in(scene):
             return
         garment, armature = self.objects()
-        self._need_all(garment, armature)
+        self._need_bones(garment, armature)
+        if self._lost_shapes(garment):  # as an undo takes them away, before it is told
+            self.dress_again()
+            return
         index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
@@ -157,7 +160,9 @@ class Live:
         garment, armature = self.objects()
         if self.playback is None:
             return False
-        return bool(self._lost(garment, armature)) or not (
+        bones = armature.pose.bones
+        lost = self._lost_shapes(garment) or any(name not in bones for name in self.joints.names)
+        return lost or not (
             self.unkeyed or has_live_keys(garment, self._moved(garment, armature))
         )
 
@@ -181,16 +186,18 @@ class Live:
         self.unkeyed = ""
         put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
 
-    def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-        """Check that nothing that is written to was deleted."""
-        lost = self._lost(garment, armature)
-        if lost:
-            raise SetupError(f"'{lost[0]}' was deleted while '{garment.name}' was played; play it again.")
+    def _need_bones(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+        """Check that no bone that is read or written to was deleted or renamed."""
+        lost = next((name for name in self.joints.names if name not in armature.pose.bones), None)
+        if lost is not None:
+            raise SetupError(
+                f"The bone '{lost}' of '{armature.name}' was deleted or renamed while '{garment.name}' was played; "
+                "play it again."
+            )
 
-    def _lost(self, garment: bpy.types.Object, armature: bpy.types.Object) -> list[str]:
+    def _lost_shapes(self, garment: bpy.types.Object) -> bool:
         keys = garment.data.shape_keys
-        lost = [name for name in self.joints.names if name not in armature.pose.bones]
-        return lost + [name for name in self.shapes if not keys or name not in keys.key_blocks]
+        return any(not keys or name not in keys.key_blocks for name in self.shapes)
 
     def _reading(self, take: SampledTake) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""

@@ -172,7 +172,10 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
 
 def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     for uid, played in list(_played.items()):
+        waits = played.done is None
         _attempt(uid, played.show, scene, depsgraph)
+        if waits and played.done is not None:  # it lost its shapes, and is dressed again
+            _read_soon(PATIENCE)
 
 
 @persistent

@@ -19,6 +19,7 @@ WORDS = {
     ),
     "Fabric": "Stoff",
     "Match Bones": "Knochen zuordnen",
+    "Bone": "Knochen",
     "Find bones that were renamed since the training, and list those that only you can tell": (
         "Knochen finden, die seit dem Training umbenannt wurden, und auflisten, die nur Sie zuordnen können"
     ),
