@@ -11,6 +11,7 @@ from bpy.props import BoolProperty, StringProperty
 from .outside.python import Handshake
 
 ROOT = __package__  # the extension's name, by which Blender knows its preferences and folders
+CPU = ("cpu", "mps")  # begin the names of devices that want a draft
 
 
 def _forget(preferences: Preferences, _: object) -> None:
@@ -72,6 +73,12 @@ def handshake(settings: Preferences) -> Handshake | None:
     if not settings.handshake:
         return None
     return Handshake.of(interpreter(settings), json.loads(settings.handshake))
+
+
+def on_processor(context: bpy.types.Context) -> bool:
+    """Return whether trainings run on a processor, as where nothing is known of a GPU."""
+    met = handshake(preferences(context))
+    return not (met and met.device) or met.device.startswith(CPU)
 
 
 def state(settings: Preferences) -> tuple[str, str]:

@@ -16,9 +16,14 @@ EXIT_INTERRUPTED = 130
 
 
 class SsilkError(Exception):
-    """Bad input: one sentence that says where, what was found, what is allowed and what to do."""
+    """Bad input: one sentence that says where, what was found, what is allowed and what to do.
+
+    Attributes:
+        found, allowed, todo: its parts, for those who say themselves where; empty where `fail` did not raise it.
+    """
 
     exit_code = EXIT_BAD_INPUT
+    found = allowed = todo = ""
 
 
 class VerificationError(SsilkError):
@@ -30,7 +35,9 @@ class VerificationError(SsilkError):
 def fail(where: str, found: str, allowed: str, todo: str = "") -> NoReturn:
     """Raise `SsilkError` as one sentence: where, what was found, what is allowed, what to do."""
     text = f"{where}: {found}; {allowed}" + (f"; {todo}" if todo else "")
-    raise SsilkError(text if text.endswith("?") else f"{text}.")
+    error = SsilkError(text if text.endswith("?") else f"{text}.")
+    error.found, error.allowed, error.todo = found, allowed, todo
+    raise error
 
 
 def fail_unknown(where: str, found: str, name: str, allowed: Iterable[str]) -> NoReturn:

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from ssilk_core.authoring.preflight.finding import Finding
+from ssilk_core.authoring.preflight.finding import SEVERITIES, Finding
+from ssilk_core.authoring.preflight.fit import open_border
 from ssilk_core.events import format_count
 from ssilk_core.scene.assets import Mesh
-from ssilk_core.scene.mesh.topology import edge_use
 
 HOLES = "body-not-watertight"
 PUSHED = "penetration"  # the finding that Push Out mends; all others are mended by Fix
@@ -39,7 +39,9 @@ def read_findings(
     meshes: Mapping[str, Mesh],
     clips: Mapping[str, Clip] = MappingProxyType({}),
 ) -> list[Finding]:
-    """Return findings by object; those on several bodies as one come apart.
+    """Return findings by object, the worst first, and last of a kind holes, which may be harmless.
+
+    Those on several bodies as one come apart.
 
     Args:
         documents: the findings as `ssilk inspect --json` wrote them.
@@ -63,7 +65,7 @@ def read_findings(
             found += _by_body(finding, bodies)
         else:
             found.append(finding)
-    return found
+    return sorted(found, key=lambda finding: (SEVERITIES.index(finding.severity), finding.code == HOLES))
 
 
 def polygons_of(counts: np.ndarray, triangles: Sequence[int]) -> tuple[int, ...]:
@@ -110,5 +112,4 @@ def _by_body(finding: Finding, bodies: Mapping[str, Mesh]) -> Iterator[Finding]:
 
 def open_edges(mesh: Mesh) -> str:
     """Return along how many edges one of several bodies is open."""
-    _, uses = edge_use(mesh.faces)
-    return f"it is open along {format_count(int(np.count_nonzero(uses == 1)), 'edges')}"
+    return f"it is open along {format_count(open_border(mesh)[1], 'edges')}"

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.scene.assets import Skeleton
+from ssilk_core.scene.assets import Skeleton, SkinWeights, carrying_joint
 from ssilk_core.scene.kinematics import local_transforms
 
 from ..errors import SetupError
@@ -24,12 +24,14 @@ class Joints:
         parents: index of each joint's parent, -1 for roots, shape (J,).
         binds: joint to world at rest, rigid [m], y up, shape (J, 4, 4).
         proxy_count: how many of the last joints are proxies.
+        known: the paths by which a trained garment knows them where bones were renamed since; else empty.
     """
 
     names: tuple[str, ...]
     parents: np.ndarray
     binds: np.ndarray
     proxy_count: int = 0
+    known: tuple[str, ...] = ()
 
     @property
     def character_count(self) -> int:
@@ -43,19 +45,32 @@ class Joints:
     @property
     def paths(self) -> tuple[str, ...]:
         """UsdSkel joint paths."""
-        return joint_paths(self.names, self.parents)
+        return self.known or joint_paths(self.names, self.parents)
+
+    @property
+    def bones(self) -> dict[str, str]:
+        """Names of the bones by their paths."""
+        return dict(zip(self.paths, self.names))
 
     @property
     def character(self) -> Joints:
         """The joints without proxies."""
         count = self.character_count
         return replace(self, names=self.names[:count], parents=self.parents[:count], binds=self.binds[:count],
-                       proxy_count=0)  # fmt: skip
+                       proxy_count=0, known=self.known[:count])  # fmt: skip
 
-    def skeleton(self, path: str) -> Skeleton:
-        """Return the character's joints as a skeleton whose rest pose is its bind pose; `path` is its prim's."""
+    def skeleton(self, path: str, bodies: Sequence[SkinWeights] = ()) -> Skeleton:
+        """Return the character's joints as a skeleton whose rest pose is its bind pose.
+
+        Args:
+            path: of its prim.
+            bodies: weights of the bodies over the joints; with none the first joint carries the character.
+        """
         own = self.character
-        return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents))
+        count = len(own.names)
+        moved = sum((skin.dense(count).mean(axis=0) for skin in bodies), np.zeros(count))
+        hub = carrying_joint(moved, own.parents)
+        return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents), hub)
 
 
 def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = False) -> np.ndarray:
@@ -73,7 +88,8 @@ def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = F
     if odd:
         raise SetupError(
             f"The bones are not those that the garment was trained with ('{odd[0].rpartition('/')[2]}' was added, "
-            "removed, renamed or has another parent); undo that, or train again."
+            "removed, renamed or has another parent); undo that, tell which bone it is by Match Bones in the Baking "
+            "panel, or train again."
         )
     places = {name: place for place, name in enumerate(names)}
     return np.array([places.get(path, -1) for path in paths])

@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
+from ..scene.linked import origin
 from ..scene.objects import scene_step
 
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
@@ -163,6 +164,17 @@ def _tracks(thing: Any, garment: bpy.types.Object, live: bool | None) -> list[bp
     """Return the tracks on which something plays that was baked for a garment."""
     tracks = thing.animation_data.nla_tracks if thing.animation_data else ()
     return [track for track in tracks if any(_is_of(strip.action, garment, live) for strip in track.strips)]
+
+
+def mute_inherited(garment: bpy.types.Object, things: Sequence[Any], muted: bool = True) -> None:
+    """Mute what the file that a garment is linked from has baked for it, or let it play; what was copied goes."""
+    linked = origin(garment)
+    for thing in things if linked != garment else ():
+        for track in _tracks(thing, linked, None):
+            if track.is_override_data:
+                track.mute = muted
+            else:
+                thing.animation_data.nla_tracks.remove(track)
 
 
 def _cleared_track(thing: Any, garment: bpy.types.Object, live: bool) -> bpy.types.NlaTrack:

@@ -26,7 +26,7 @@ from ..scene.gather import ROOT
 from ..scene.handover import MOTIONS, loading_usd
 from ..scene.objects import found_again, scene_rate, scene_units
 from .evaluating import evaluating
-from .sources import FILE, Source, frames_of, playing
+from .sources import FILE, Source, frames_of, moves_alone, playing
 
 SLICE = 0.04  # seconds that Blender waits for us at a time
 STILL = 1e-6  # how far an armature that stays in place may move, as a share of its size
@@ -40,12 +40,14 @@ class SampledTake:
     Attributes:
         worlds: joint to world of the frames sampled so far, rigid, in Blender's units, shape (J, 4, 4) each.
         placements: object to world of the armature at these frames, shape (4, 4) each.
+        above: object to world of the objects that it hangs on, by name, likewise.
     """
 
     source: Source
     frames: range
     worlds: list[np.ndarray] = field(default_factory=list)
     placements: list[np.ndarray] = field(default_factory=list)
+    above: dict[str, list[np.ndarray]] = field(default_factory=dict)
 
     @property
     def complete(self) -> bool:
@@ -80,17 +82,34 @@ def prepare_takes(armature: bpy.types.Object, chosen: Sequence[Source]) -> list[
 def need_company(garment: bpy.types.Object, armature: bpy.types.Object, take: SampledTake) -> None:
     """Check that a garment moves along where its armature moves as an object, besides its bones.
 
+    It does where it hangs on the armature, or with it on something that moves both, as on an empty above a character.
+
     Raises:
         SetupError: it stays where it is, so that Blender would deform it from a wrong place.
     """
-    still = np.ptp(take.placements, axis=0).max() <= STILL * max(armature.dimensions)
-    above = garment.parent
-    while above and above != armature:
-        above = above.parent
-    if not still and not above:
-        raise SetupError(
-            f"'{armature.name}' moves as an object and leaves '{garment.name}' behind; make it the parent."
-        )
+    still = STILL * max(armature.dimensions)
+    carriers = [above.name for above in _above(garment)]
+    if np.ptp(take.placements, axis=0).max() <= still or armature.name in carriers:
+        return
+    shared = next((name for name in carriers if name in take.above), None)
+    if shared is not None:
+        own = carriers[: carriers.index(shared)]
+        alone = [name for name in (garment.name, *own) if moves_alone(bpy.data.objects[name])]
+        inside = np.linalg.inv(take.above[shared]) @ np.array(take.placements)
+        if not alone and np.ptp(inside, axis=0).max() <= still:
+            return
+    raise SetupError(
+        f"'{armature.name}' moves as an object and leaves '{garment.name}' behind; make it the parent, or let one "
+        "object above both move them."
+    )
+
+
+def _above(thing: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return what an object hangs on, the nearest first."""
+    found: list[bpy.types.Object] = []
+    while (thing := thing.parent) is not None:
+        found.append(thing)
+    return found
 
 
 def sample(armature: bpy.types.Object, joints: Joints, takes: Sequence[SampledTake]) -> Iterator[float]:
@@ -118,11 +137,28 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: SampledTake)
     with playing(leader_of(armature), take.source), evaluating(armature) as frames:
         while True:
             frame = take.frames[len(take.worlds)]
-            evaluated = armature.evaluated_get(frames(frame))
+            depsgraph = frames(frame)
+            evaluated = armature.evaluated_get(depsgraph)
             take.placements.append(np.array(evaluated.matrix_world))
+            _need_same_size(armature, evaluated, take.source.name, frame)
+            for above in _above(armature):
+                placed = np.array(above.evaluated_get(depsgraph).matrix_world)
+                take.above.setdefault(above.name, []).append(placed)
             take.worlds.append(_rigid(worlds(evaluated)[columns], joints, take.source.name, frame))
             if take.complete or time.monotonic() > until:
                 return
+
+
+def _need_same_size(
+    armature: bpy.types.Object, evaluated: bpy.types.Object, motion: str, frame: int
+) -> None:
+    """Raise `SetupError` if an armature has another scale in a frame than when its joints were read."""
+    now, then = armature.matrix_world.median_scale, evaluated.matrix_world.median_scale
+    if abs(then - now) > UNEVEN * now:
+        raise SetupError(
+            f"'{armature.name}' is scaled {then:.4g} at frame {frame} of '{motion}' and {now:.4g} in the frame that "
+            "is shown; cloth does not move alike in another size: remove the keys of its scale."
+        )
 
 
 def worlds(armature: bpy.types.Object) -> np.ndarray:

@@ -61,13 +61,18 @@ def is_still(armature: bpy.types.Object) -> bool:
         return False
     above: bpy.types.Object | None = armature
     while above:
-        animation = above.animation_data
-        tracks = animation.nla_tracks if animation else ()
-        animated = animation and (animation.action or animation.drivers or any(track.strips for track in tracks))
-        if animated or above.constraints:
+        if moves_alone(above):
             return False
         above = above.parent
     return True
+
+
+def moves_alone(thing: bpy.types.Object) -> bool:
+    """Return whether an object may move by itself, besides its bones and what it hangs on."""
+    animation = thing.animation_data
+    tracks = animation.nla_tracks if animation else ()
+    animated = animation and (animation.action or animation.drivers or any(track.strips for track in tracks))
+    return bool(animated or thing.constraints)
 
 
 def frames_of(armature: bpy.types.Object, source: Source) -> range:

@@ -19,22 +19,24 @@ from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
 
 from ..arrays.joints import Joints, joint_order
+from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.sources import TIMELINE, Source
-from ..outside.wording import recall, reworded
+from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
-from ..playback.models import model_of, no_model
+from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
 from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
 from ..scene.classes import current_classes
-from ..scene.garment import armature_of, unusable_here
+from ..scene.garment import armature_of, unplayable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
+from ..scene.linked import is_override
 from ..scene.objects import Pair, scene_rate
 from ..scene.weights import has_trained_weights
 from ..settings.training import RELATIVE
@@ -95,6 +97,9 @@ class TimelineOperator(tasks.OutsideOperator):
             raise SetupError(
                 f"Bones of '{armature.name}' were changed while '{garment.name}' was baked; bake it again."
             )
+        skinned = self.baked.garment
+        trained = TrainedJoints(skinned.joint_names, skinned.bind_transforms)
+        joints = joints_known_to(garment, armature, joints, trained)
         playing.stop(garment)
         apply_bake(garment, armature, joints, self.baked)
         order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
@@ -103,7 +108,7 @@ class TimelineOperator(tasks.OutsideOperator):
         overridden = told(garment, armature, joints, self.baked)
         self.level = "WARNING" if overridden else "INFO"
         said = f", {overridden}" if overridden else ""
-        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{said}"
+        return f"frames {self.take.frames[0]} to {self.take.frames[-1]}{still}{told_renames(joints)}{said}"
 
 
 class BakeGarment(TimelineOperator, bpy.types.Operator):
@@ -134,7 +139,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return tasks.busy() or unusable_here(context) or unready(context) or no_model(context.object)
+        return tasks.busy() or unplayable_here(context) or unready(context) or no_model(context.object)
 
     def invoke(self, context: bpy.types.Context, _: bpy.types.Event) -> set[str]:
         """Ask for the options."""
@@ -153,28 +158,41 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if not self.to_timeline and not self.to_usd:
             raise SetupError("Choose where to bake to: the timeline, USD, or both.")
         self.model, armature = model_of(garment), armature_of(garment)
-        joints = read_joints(armature, garment)
+        joints = self.known_joints(garment, armature)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
         if self.to_timeline and self.quality != WHOLE and QUALITIES[self.quality].refine:
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment)
+        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
         self.pair = Pair.of(garment, armature)
-        self.words = {f"{INPUTS}/{MOTION}": "the timeline"}
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
-        self.character = joints.character
+        self.bones, self.character = joints.bones, joints.character
+        self.inputs = inputs_folder(garment, self.model)
+        self.words = {f"{self.inputs.name}/{MOTION}": "the timeline"}
         closing = self.closing() if self.to_timeline else None
         return Work(
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
             rephrase=self.rephrase,
         )  # fmt: skip
 
+    def known_joints(self, garment: bpy.types.Object, armature: bpy.types.Object) -> Joints:
+        """Return the joints under the names that the model knows; raise `SsilkError` where it cannot be read."""
+        try:
+            scene = load_model(self.model).scene
+        except SsilkError as error:
+            raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
+        trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
+        joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
+        joint_order(joints, scene.joint_names)
+        return joints
+
     def rephrase(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files that were made for the bake."""
         sentence = reworded(sentence, self.work.folder, {SHOT: f"the bake of '{self.pair.name}'"})
-        return reworded(sentence, self.model.parent, {**recall(self.model.parent), **self.words})
+        sentence = reworded(sentence, self.inputs.parent, self.words)
+        return with_bones(reworded(sentence, self.model.parent, recall(self.model.parent)), self.bones)
 
     def steps(self) -> Iterator[float]:
         """Sample the timeline, then write it."""
@@ -189,12 +207,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         """Write the inputs of the bake; return the command."""
         garment, armature = self.pair.objects()
         need_company(garment, armature, self.take)
-        inputs = inputs_folder(self.model)
+        inputs = self.inputs
         shutil.copyfile(folder / MOTION, inputs / MOTION)
         stage = self.model.parent / STAGE
         if self.scene:
             given = hand_over(self.scene, self.pair, inputs)
-            self.words |= {f"{INPUTS}/{made}": name for made, name in given.words.items()}
+            self.words |= {f"{inputs.name}/{made}": name for made, name in given.words.items()}
             stage = inputs / STAGE
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
@@ -228,9 +246,10 @@ class RemoveBake(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable_here(context):
+        if reason := unplayable_here(context):
             return reason
-        baked = has_keys(context.object) or has_trained_weights(context.object)
+        worn = not context.object.data.library and has_trained_weights(context.object)
+        baked = has_keys(context.object) or worn
         return "" if baked else f"Nothing was baked for '{context.object.name}'"
 
     def apply(self, context: bpy.types.Context) -> str:
@@ -278,19 +297,26 @@ def usd_path(garment: bpy.types.Object, chosen: str) -> Path:
     return path
 
 
-def inputs_folder(model: Path) -> Path:
-    """Return the folder beside a model for a bake's inputs, to which the shot's provenance points.
+def inputs_folder(garment: bpy.types.Object, model: Path) -> Path:
+    """Return the folder for a bake's inputs, to which the shot's provenance points: beside the model.
+
+    Where a shot links the garment it is beside the shot: other files' folders are not written to.
 
     Raises:
-        SetupError: nothing can be written there.
+        SetupError: nothing can be written there, or the shot has no place yet.
     """
-    folder = model.parent / INPUTS
+    folder, todo = model.parent / INPUTS, "move the model"
+    if is_override(garment):
+        if not bpy.data.filepath:
+            raise SetupError("Save the file first: what a bake of a linked garment reads lies beside it.")
+        folder = trainings_folder() / f"{bpy.path.clean_name(garment.name)} {INPUTS}"
+        todo = "save the blend file elsewhere"
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SetupError(f"{folder} cannot be made ({error.strerror or error}); move the model.") from error
+        raise SetupError(f"{folder} cannot be made ({error.strerror or error}); {todo}.") from error
     if not os.access(folder, os.W_OK):
-        raise SetupError(f"Nothing can be written into {folder}; move the model.")
+        raise SetupError(f"Nothing can be written into {folder}; {todo}.")
     return folder
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A baked garment on its character as a glTF binary."""
+"""A baked garment on its character as a glTF binary, exported beside the artist's Blender."""
 
 from __future__ import annotations
 
+import importlib.util
+import shutil
+import sys
 from pathlib import Path
 
 import bpy
@@ -13,15 +16,19 @@ from ssilk_core.files import replacing
 from ..errors import SetupError
 from ..motions.keys import has_keys
 from ..motions.simulated import simulating
+from ..outside.work import Work
 from ..playback import playing
-from ..playback.gltf import MOST_LOST, export_glb, largest_loss, visible
-from ..scene.garment import armature_of, unusable_here
-from .reporting import ReportingOperator
+from ..playback.gltf import MOST_LOST
+from ..scene.garment import armature_of, unplayable_here
+from ..scene.objects import Pair
+from . import tasks
 
 SUFFIX = ".glb"
+SCRIPT = Path(__file__).parents[1] / "outside" / "gltf_export.py"
+COPY, MADE = "scene.blend", "made.glb"
 
 
-class ExportGltf(ReportingOperator, bpy.types.Operator):
+class ExportGltf(tasks.OutsideOperator, bpy.types.Operator):
     """Write the character and its baked garment as a glTF binary over the scene's frames, and compare it with them"""
 
     bl_idname = "ssilk.export_gltf"
@@ -32,7 +39,7 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable_here(context):
+        if reason := tasks.busy() or unplayable_here(context):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played live; bake it first"
@@ -48,20 +55,45 @@ class ExportGltf(ReportingOperator, bpy.types.Operator):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def apply(self, context: bpy.types.Context) -> str:
-        garment, path = context.object, Path(bpy.path.abspath(self.filepath))
-        if path.suffix != SUFFIX:
-            raise SetupError(f"'{path.name}' is no name for a glTF binary; it ends in {SUFFIX}.")
-        armature = armature_of(garment)
-        with visible([garment, armature]), replacing(path) as unverified:
-            export_glb(garment, armature, unverified)
-            loss, frame = largest_loss(garment, unverified)
-            if not loss <= MOST_LOST:
-                raise SetupError(
-                    f"'{garment.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
-                    f"{_reason(garment)}."
-                )
-        return f"'{garment.name}' is in {path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+    def prepare(self, context: bpy.types.Context) -> Work:
+        garment, self.path = context.object, Path(bpy.path.abspath(self.filepath))
+        if self.path.suffix != SUFFIX:
+            raise SetupError(f"'{self.path.name}' is no name for a glTF binary; it ends in {SUFFIX}.")
+        self.pair = Pair.of(garment, armature_of(garment))
+        self.reason = _reason(garment)
+        return Work(f"Exporting '{garment.name}'", self.commands, parent=bpy.app.tempdir)
+
+    def commands(self, folder: Path) -> list[list[str]]:
+        """Write a copy of the file as it is now; return the command."""
+        garment, armature = self.pair.objects()
+        bpy.ops.wm.save_as_mainfile(filepath=str(folder / COPY), copy=True)
+        files = [str(folder / COPY), garment.name, armature.name, str(folder / MADE)]
+        return [[*_blender(), "--", *files, *_folders()]]
+
+    def finish(self, context: bpy.types.Context, work: Work) -> str:
+        loss, frame = work.result["loss"], work.result["frame"]
+        if not loss <= MOST_LOST:
+            raise SetupError(
+                f"'{self.pair.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
+                f"{self.reason}."
+            )
+        with replacing(self.path) as unverified:
+            shutil.copyfile(work.folder / MADE, unverified)
+        return f"'{self.pair.name}' is in {self.path.name}, at most {1000 * loss:.2g} mm off what Blender shows."
+
+
+def _blender() -> list[str]:
+    """Return what runs a script in a Blender of its own: this program, or this Python where Blender is a module."""
+    if not bpy.app.binary_path:
+        return [sys.executable, str(SCRIPT)]
+    options = ["--background", "--factory-startup", "--python-exit-code", "1"]
+    return [bpy.app.binary_path, *options, "--python", str(SCRIPT)]
+
+
+def _folders() -> list[str]:
+    """Return the folders of the modules that this Blender has of ssilk."""
+    found = [importlib.util.find_spec(name) for name in ("ssilk_core", "ssilk_usd")]
+    return list(dict.fromkeys(str(Path(spec.origin).parents[1]) for spec in found if spec and spec.origin))
 
 
 def proposed(garment: bpy.types.Object) -> Path:

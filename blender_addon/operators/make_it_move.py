@@ -12,8 +12,9 @@ import bpy
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import LOOSE
 
+from ..arrays.enough import enough
 from ..errors import SetupError
-from ..motions.sources import TIMELINE, is_still
+from ..motions.sources import ACTION, STRIP, TIMELINE, Source, frames_of, is_still
 from ..outside.jobs import read_state
 from ..playback import playing
 from ..playback.models import job_of
@@ -21,12 +22,12 @@ from ..preferences import handshake, interpreter, preferences
 from ..scene.armature import leader_of, proxy_names
 from ..scene.classes import current_classes
 from ..scene.garment import armature_of, unusable_here
-from ..scene.objects import found_again, select_object
+from ..scene.objects import found_again, scene_rate, select_object
 from . import tasks
 from .reporting import RefusingOperator, ReportingOperator
+from .training import choose_preset
 
 LOOK = 0.2  # seconds between two looks at a step that runs
-CPU = ("cpu", "mps")  # begin the names of devices that want a draft
 
 
 @dataclass
@@ -36,12 +37,14 @@ class Course:
     Attributes:
         begun: names of the operators that were called.
         before: the folder of the training that it had at first.
+        told: which motions were taken, in words; empty where all were.
     """
 
     uid: int
     name: str
     before: Path | None
     begun: list[str] = field(default_factory=list)
+    told: str = ""
 
     @property
     def garment(self) -> bpy.types.Object:
@@ -118,6 +121,8 @@ def go_on() -> float | None:
         else:
             course.begun.append(needed)
             _call(needed, course.garment)
+            if needed == FIND:
+                course.told = take_enough(course.garment)
     except SsilkError as error:
         needed, tasks.failed = None, str(error)
     if needed is None:
@@ -143,7 +148,8 @@ def line(garment: bpy.types.Object) -> str:
     if under_way() and course.uid == garment.session_uid:
         if bpy.context.mode != "OBJECT":
             return "Goes on in Object Mode"
-        return f"Step {len(course.begun)} of at most {len(STEPS)}"
+        step = f"Step {len(course.begun)} of at most {len(STEPS)}"
+        return f"{step}. {course.told}" if course.told else step
     return "Plays as soon as the training has its first model" if garment.ssilk.awaited else ""
 
 
@@ -167,6 +173,25 @@ def _call(name: str, garment: bpy.types.Object) -> None:
             raise SetupError(str(error).strip().removeprefix("Error: ").split("\n")[0]) from error
 
 
+def take_enough(garment: bpy.types.Object) -> str:
+    """Leave out found motions that a training does not need; return in words what was left, empty if nothing was.
+
+    All of 76 actions would be sampled for minutes, and a training sees no more of them than its steps.
+    """
+    choose_preset(garment)
+    settings, armature = garment.ssilk.training, leader_of(armature_of(garment))
+    used = [item for item in settings.motions if item.use and item.kind in (ACTION, STRIP)]
+    lengths = [len(frames_of(armature, Source(item.kind, item.name, item.track))) / scene_rate() for item in used]
+    most = DRAFTED if settings.preset == "draft" else TAKEN
+    chosen = enough([item.name for item in used], lengths, most)
+    for index, item in enumerate(used):
+        item.use = index in chosen
+    if len(chosen) == len(used):
+        return ""
+    seconds = sum(lengths[index] for index in chosen)
+    return f"Trains on {len(chosen)} of {len(used)} motions, {seconds:.0f} s; choose others under Training"
+
+
 def has_budget(garment: bpy.types.Object) -> bool:
     """Return whether the artist has said how long a garment is trained; without that it goes on and gets better."""
     return bool(garment.ssilk.training.iterations or garment.ssilk.training.minutes)
@@ -174,11 +199,7 @@ def has_budget(garment: bpy.types.Object) -> bool:
 
 def _prepare_training(garment: bpy.types.Object) -> None:
     """Choose what fits the device, unless the artist has chosen; show what this training makes."""
-    settings = garment.ssilk.training
-    met = handshake(preferences(bpy.context))
-    if not settings.is_property_set("preset"):
-        slow = not (met and met.device) or met.device.startswith(CPU)
-        settings.preset = "draft" if slow else "preview"
+    choose_preset(garment)
     garment.ssilk.model = ""
 
 
@@ -215,13 +236,14 @@ def _needs_training(made: Course) -> bool:
     return folder == made.before and not (state and state.alive)
 
 
-TRAIN = "ssilk.train"
+TRAIN, FIND = "ssilk.train", "ssilk.find_motions"
+DRAFTED, TAKEN = 80.0, 240.0  # seconds of motion that a draft, and any other preset, is given of what is found
 STEPS: dict[str, Callable[[Course], bool]] = {
     "ssilk.find_python": _needs_python,
     "ssilk.check_python": _needs_check,
     "ssilk.classify": _needs_classes,
     "ssilk.generate_rig": _needs_rig,
-    "ssilk.find_motions": _needs_motions,
+    FIND: _needs_motions,
     "ssilk.add_demo_motions": _needs_demo_motions,
     TRAIN: _needs_training,
 }

@@ -8,7 +8,7 @@ import bpy
 from ..errors import SetupError
 from ..playback import playing
 from ..playback.models import model_of, no_model
-from ..scene.garment import unusable, unusable_here
+from ..scene.garment import unplayable, unplayable_here
 from .reporting import ReportingOperator
 
 
@@ -21,7 +21,7 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable_here(context):
+        if reason := unplayable_here(context):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played already"
@@ -39,7 +39,7 @@ class LiveOperator(ReportingOperator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable(context.object):
+        if reason := unplayable(context.object):
             return reason
         return "" if playing.live(context.object) else f"'{context.object.name}' is not played"
 

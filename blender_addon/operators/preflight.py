@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
 import numpy as np
@@ -14,6 +15,7 @@ from ssilk_core.events import format_count
 from ..arrays.findings import PUSHED, Clip, read_findings
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
+from ..outside.wording import reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
 from ..quality.checks import SCALE, look_again, scene_findings
@@ -90,11 +92,19 @@ class Inspect(InspectOperator, bpy.types.Operator):
         motions = [*(str(folder / MOTIONS / name) for name in self.chosen.names), *map(str, self.chosen.files)]
         return ["--preset", self.preset, *(["--motion", *motions] if motions else [])]
 
+    def in_words(self, documents: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        """Return findings that speak of objects, motions and bones, and not of files that were made for them."""
+
+        def told(text: str) -> str:
+            return self.rephrase(reworded(text, self.work.folder, self.chosen.words))
+
+        return [{**each, **{part: told(each[part]) for part in ("found", "why", "fix")}} for each in documents]
+
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         taken = [Clip(take.source.name, take.frames.start) for take in self.chosen.takes]
         clips = dict(zip((str(work.folder / MOTIONS / name) for name in self.chosen.names), taken))
         clips |= {str(path): Clip(path.name) for path in self.chosen.files}
-        findings = read_findings(work.result["findings"], self.handover.name, self.scene.meshes, clips)
+        findings = read_findings(self.in_words(work.result["findings"]), self.handover.name, self.scene.meshes, clips)
         keep_findings(context, self.handover.name, findings)
         bad = sum(finding.severity != "info" for finding in findings)
         return (

@@ -15,7 +15,7 @@ from ..playback.models import no_model
 from ..quality import heat, lbs_copy
 from ..quality.covered_skin import CoveredSkinSearch
 from ..scene import overlay
-from ..scene.garment import unusable_here
+from ..scene.garment import unplayable_here
 from ..scene.masks import masked, show, unmasked
 from ..scene.objects import found_again
 from . import tasks
@@ -38,7 +38,7 @@ class QualityOperator(ReportingOperator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return unusable_here(context)
+        return unplayable_here(context)
 
 
 class MeasuringOperator(tasks.OutsideOperator):
@@ -46,7 +46,7 @@ class MeasuringOperator(tasks.OutsideOperator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        return tasks.busy() or unusable_here(context)
+        return tasks.busy() or unplayable_here(context)
 
     def prepare(self, context: bpy.types.Context) -> Work:
         self.garment, self.called = context.object.session_uid, context.object.name
@@ -251,7 +251,7 @@ class ShowCoveredSkin(QualityOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := unusable_here(context):
+        if reason := unplayable_here(context):
             return reason
         return "" if masked(context.object) else f"No skin is hidden under '{context.object.name}'"
 

@@ -18,7 +18,7 @@ from ..outside.work import Work
 from ..playback.bake import animated, need_bakeable, need_movable
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
-from ..scene.garment import armature_of, unusable_here
+from ..scene.garment import armature_of, unplayable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.objects import Pair, scene_rate
@@ -38,7 +38,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
 
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
-        if reason := tasks.busy() or unusable_here(context) or unready(context):
+        if reason := tasks.busy() or unplayable_here(context) or unready(context):
             return reason
         try:
             need_simulated(context.object)

@@ -23,7 +23,7 @@ from ..outside.work import Work
 from ..playback import models, playing
 from ..playback.bake import need_bakeable
 from ..playback.models import job_of, orphans, progress_of, relative, trainings, trainings_folder
-from ..preferences import interpreter, preferences, unready
+from ..preferences import interpreter, on_processor, preferences, unready
 from ..quality.checks import look_again
 from ..scene.armature import leader_of
 from ..scene.garment import armature_of, unusable, unusable_here
@@ -67,6 +67,7 @@ class FindMotions(MotionOperator, bpy.types.Operator):
             key = (source.kind, source.name, source.track)
             add_motion(garment, source).use = used.get(key, source.kind != TIMELINE or len(found) == 1)
         settings.active, settings.search = 0, ""
+        choose_preset(garment)
         count = len(found) - 1
         return f"'{armature.name}' has {count} motion{'' if count == 1 else 's'} besides the timeline."
 
@@ -166,6 +167,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
             raise SetupError(f"{no_motion(garment)}.")
         if settings.iterations and settings.minutes:
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
+        choose_preset(garment)
         self.scene = gather(garment)
         need_trainable(garment, armature, self.scene)
         self.chosen = ChosenMotions.of(garment, armature)
@@ -265,6 +267,13 @@ class ResumeTraining(JobOperator, bpy.types.Operator):
         begun.add(folder)
         models.forget()
         return f"The training of '{context.object.name}' goes on."
+
+
+def choose_preset(garment: bpy.types.Object) -> None:
+    """Choose what fits the device, unless the artist has chosen: processors take days for what GPUs do in minutes."""
+    settings = garment.ssilk.training
+    if not settings.is_property_set("preset"):
+        settings.preset = "draft" if on_processor(bpy.context) else "preview"
 
 
 def no_motion(garment: bpy.types.Object) -> str:

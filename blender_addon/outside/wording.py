@@ -30,6 +30,20 @@ def recall(folder: Path) -> dict[str, str]:
     return {str(made): str(name) for made, name in document.items()} if isinstance(document, dict) else {}
 
 
+CLASSES = "primvars:ssilk:class"  # which is what artists paint
+
+
+def with_bones(sentence: str, bones: Mapping[str, str]) -> str:
+    """Return a sentence with names of bones in place of joints, by their paths or the last parts of these."""
+    names = {path: name for path, name in bones.items() if path != name}
+    leaves = [(path.rpartition("/")[2], name) for path, name in bones.items()]
+    names |= {leaf: name for leaf, name in leaves if leaf != name and leaf not in bones}
+    if names:
+        places = "|".join(map(re.escape, sorted(names, key=len, reverse=True)))
+        sentence = re.sub(rf"(?<![\w/.])(?:{places})(?![\w/])", lambda found: names[found[0]], sentence)
+    return sentence.replace(CLASSES, "its classes")
+
+
 def reworded(sentence: str, folder: Path, names: Mapping[str, str]) -> str:
     """Return a sentence with names in place of what lies in a folder."""
     places = "|".join(re.escape(place) for place in {str(folder), folder.as_posix()})

@@ -68,14 +68,21 @@ class Work:
             raise
 
     @property
+    def share(self) -> str:
+        """How far it is in a few letters, which no bar cuts off: the part, else how long it has run."""
+        if self.cancelled:
+            return ""
+        if self.fraction is not None:
+            return f"{self.fraction:.0%}"
+        seconds = int(time.monotonic() - self._since)
+        return format_seconds(seconds) if seconds else ""
+
+    @property
     def status(self) -> str:
         """What is done and how far it is, in one line; how long it has run where the part that is done is unknown."""
         if self.cancelled:
             return f"{self.title}: stopping"
-        if self.fraction is not None:
-            return f"{self.title}: {self.fraction:.0%}"
-        seconds = int(time.monotonic() - self._since)
-        return f"{self.title}: {format_seconds(seconds)}" if seconds else self.title
+        return f"{self.title}: {self.share}" if self.share else self.title
 
     def poll(self) -> bool:
         """Do some steps, or take in what was said meanwhile; return whether everything has ended."""

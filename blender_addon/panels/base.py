@@ -13,7 +13,7 @@ import bpy
 from ssilk_core.errors import SsilkError
 
 from ..operators import tasks
-from ..scene.garment import unusable
+from ..scene.garment import unplayable, unusable
 
 LETTER = 7  # how wide a letter is on average [pixels, at an interface scale of one]
 MARGIN = 40  # beside text in a panel [pixels, likewise]
@@ -38,8 +38,9 @@ def draw_work(layout: bpy.types.UILayout) -> None:
     if work is None:
         draw_failure(layout)
         return
+    draw_text(layout, f"{work.title}: stopping" if work.cancelled else work.title)
     row = layout.row(align=True)
-    row.progress(factor=work.fraction or 0.0, text=work.status)
+    row.progress(factor=work.fraction or 0.0, text=work.share)
     row.operator("ssilk.cancel", text="", icon="CANCEL")
     if work.text:
         draw_text(layout, work.text)
@@ -82,6 +83,14 @@ class SidebarPanel:
     def draw_header_preset(self, _: bpy.types.Context) -> None:
         """Draw a button that opens the guide, at the right end of the panel's header."""
         self.layout.operator("ssilk.open_guide", text="", icon="HELP", emboss=False).section = self.section
+
+
+class PlayableGarmentPanel(SidebarPanel):
+    """Base of the panels that are there for a garment that a shot links and overrides, too."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return not unplayable(context.object)
 
 
 class UsableGarmentPanel(SidebarPanel):

@@ -10,7 +10,7 @@ from ..operators import make_it_move, tasks
 from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
-from ..scene.garment import armature_of, garments_of, unusable
+from ..scene.garment import armature_of, garments_of, unplayable, unusable
 from .base import SidebarPanel, UsableGarmentPanel, draw_text, draw_work, saying_errors
 from .training import draw_bar
 
@@ -50,10 +50,10 @@ def draw_orphans(layout: bpy.types.UILayout) -> None:
     """Draw the file's trainings that go on for garments which are not in it any more, each to be cancelled."""
     for orphan in orphans():
         job = orphan.job
-        row = layout.row(align=True)
-        row.progress(factor=orphan.fraction, text=job.garment)
-        row.operator("ssilk.cancel_orphan", text="", icon="CANCEL").folder = str(job.folder)
         draw_text(layout, f"This training goes on without its garment '{job.garment}'", icon="INFO")
+        row = layout.row(align=True)
+        row.progress(factor=orphan.fraction, text=f"{orphan.fraction:.0%}")
+        row.operator("ssilk.cancel_orphan", text="", icon="CANCEL").folder = str(job.folder)
 
 
 class GarmentPanel(SidebarPanel, bpy.types.Panel):
@@ -66,7 +66,8 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
         layout, reason = self.layout, unusable(context.object)
         if reason:
             draw_text(layout, reason, icon="INFO")
-            layout.operator("ssilk.import_stage", icon="IMPORT")
+            if unplayable(context.object):
+                layout.operator("ssilk.import_stage", icon="IMPORT")
         else:
             layout.use_property_split = True
             layout.prop(context.object.ssilk, "armature")
@@ -74,12 +75,14 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             draw_course(layout, context.object)
             draw_garments(layout, context.object)
         missing = "" if tasks.current else unready(context)  # what runs may be finding it
-        if missing:
-            draw_text(layout, missing, icon="ERROR")
+        if missing:  # why the search for a Python failed is said in its place, not beside it
+            draw_text(layout, tasks.failed or missing, icon="ERROR")
             row = layout.row(align=True)
             row.operator("ssilk.find_python")
-            row.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = ROOT
-        draw_work(layout)
+            row.operator("ssilk.create_environment", text="Create", icon="ADD")
+            layout.operator("preferences.addon_show", text="Preferences", icon="PREFERENCES").module = ROOT
+        else:
+            draw_work(layout)
         draw_orphans(layout)
 
 

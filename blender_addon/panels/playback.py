@@ -10,7 +10,7 @@ from ..playback import playing
 from ..playback.models import no_model
 from ..playback.overrides import overriding
 from ..scene.garment import armature_of
-from .base import UsableGarmentPanel, draw_text, saying_errors
+from .base import PlayableGarmentPanel, draw_text, saying_errors
 
 
 def live_line(garment: bpy.types.Object) -> str:
@@ -29,7 +29,7 @@ def live_line(garment: bpy.types.Object) -> str:
     return playing.warning(garment) or "Follows the armature"
 
 
-class PlaybackPanel(UsableGarmentPanel, bpy.types.Panel):
+class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_playback"
     bl_label = "Live Playback"
     section = "7-look"
@@ -60,7 +60,15 @@ def overridden_line(garment: bpy.types.Object) -> str:
     return f"Blender does not show what was baked or is played: {'; '.join(found)}" if found else ""
 
 
-class BakingPanel(UsableGarmentPanel, bpy.types.Panel):
+def draw_bones(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
+    """Draw the bones of the training that only the artist can tell, each with what it is called now."""
+    layout.operator("ssilk.match_bones", icon="BONE_DATA")
+    column = layout.column(align=True)
+    for item in garment.ssilk.bones:
+        column.prop_search(item, "bone", armature_of(garment).data, "bones", text=item.name)
+
+
+class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_baking"
     bl_label = "Baking"
     section = "6-bake"
@@ -71,6 +79,7 @@ class BakingPanel(UsableGarmentPanel, bpy.types.Panel):
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
         layout.operator("ssilk.bake", icon="REC")
+        draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
         layout.operator("ssilk.export_gltf", icon="EXPORT")
         layout.operator("ssilk.remove_bake", icon="TRASH")

@@ -54,7 +54,12 @@ def sentence(text: str) -> str:
 
 
 def line(item: bpy.types.PropertyGroup) -> str:
-    """Return a finding in a few words."""
+    """Return a finding in a few words, with the name of its object where that is not the garment."""
+    there = item.target and item.target != bpy.context.window_manager.ssilk_preflight.garment
+    return f"{item.target}: {_words(item)}" if there else _words(item)
+
+
+def _words(item: bpy.types.PropertyGroup) -> str:
     words, noun = item.code.replace("-", " "), {"polygons": "faces"}.get(item.elements, item.elements)
     if not item.indices:
         return words

@@ -8,7 +8,7 @@ import bpy
 from ..quality.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..quality.lbs_copy import find_copy
 from ..quality.repairs import DISPLACEMENT
-from .base import UsableGarmentPanel, draw_text, saying_errors
+from .base import PlayableGarmentPanel, draw_text, saying_errors
 
 
 def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
@@ -18,7 +18,7 @@ def draw_kind(layout: bpy.types.UILayout, kind: str, text: str) -> None:
     row.operator("ssilk.find_worst", text="", icon="MARKER_HLT").kind = kind
 
 
-class QualityPanel(UsableGarmentPanel, bpy.types.Panel):
+class QualityPanel(PlayableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_quality"
     bl_label = "Quality"
     section = "7-look"

@@ -11,6 +11,7 @@ from ..motions.sources import FILE
 from ..outside.jobs import JobState
 from ..outside.training_report import findings, progress
 from ..playback.models import TrainingProgress, progress_of
+from ..preferences import on_processor
 from ..scene.armature import proxy_names
 from ..scene.garment import armature_of
 from .base import UsableGarmentPanel, draw_text, saying_errors
@@ -64,8 +65,10 @@ def draw_motions(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:
 
 def draw_bar(layout: bpy.types.UILayout, state: JobState) -> None:
     """Draw how far a training is, with a button that ends it or lets it go on."""
+    if state.alive:
+        draw_text(layout, progress(state))
     row = layout.row(align=True)
-    row.progress(factor=state.fraction, text=progress(state) if state.alive else f"{state.done} of {state.total}")
+    row.progress(factor=state.fraction, text=f"{state.fraction:.0%}" if state.total else "")
     if state.alive and state.round:
         layout.operator("ssilk.cancel_training", text="Finish", icon="CHECKMARK")
     elif state.alive:
@@ -96,6 +99,16 @@ def draw_energies(layout: bpy.types.UILayout, training: TrainingProgress) -> Non
         layout.label(text=f"{name.capitalize()}: {values[-1, 1]:.3g} J", icon_value=swatch(index), translate=False)
 
 
+def slow_line(context: bpy.types.Context, garment: bpy.types.Object) -> str:
+    """Return a warning where a preset for GPUs would run on a processor; empty where it is fine or has a budget."""
+    settings = garment.ssilk.training
+    chosen = settings.is_property_set("preset")  # else Train chooses what fits
+    budget = settings.minutes or settings.iterations
+    if not chosen or settings.preset == "draft" or budget or not on_processor(context):
+        return ""
+    return f"'{settings.preset.capitalize()}' is for a GPU: this processor takes days. Take Draft, or set Minutes"
+
+
 class TrainingPanel(UsableGarmentPanel, bpy.types.Panel):
     bl_idname = "SSILK_PT_training"
     bl_label = "Training"
@@ -107,6 +120,8 @@ class TrainingPanel(UsableGarmentPanel, bpy.types.Panel):
         settings, training = garment.ssilk.training, progress_of(garment)
         draw_motions(layout, garment)
         layout.prop(settings, "preset")
+        if slow := slow_line(context, garment):
+            draw_text(layout, slow, icon="ERROR")
         column = layout.column(align=True)
         column.prop(settings, "iterations")
         column.prop(settings, "minutes")

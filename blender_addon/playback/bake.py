@@ -19,9 +19,10 @@ from ssilk_core.scene.kinematics import (
 
 from ..arrays.joints import Joints, joint_order
 from ..errors import SetupError
-from ..motions.keys import Channel, bake_keys, continuous, remove_keys
+from ..motions.keys import Channel, bake_keys, continuous, mute_inherited, remove_keys
 from ..scene.armature import bring_back, proxy_names, put_away
 from ..scene.garment import need_linear, need_linear_bodies, need_own_mesh, need_uncarried
+from ..scene.linked import give_back_mesh, give_own_mesh, has_lent_mesh
 from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
@@ -136,6 +137,8 @@ def apply_deformation(
     """
     to_trained = _moved_back(armature, joints, skinned, order) @ scene_units().matrix @ np.array(garment.matrix_world)
     _need_same_points(garment, to_trained, skinned)
+    give_own_mesh(garment)
+    mute_inherited(garment, animated(garment, armature))
     shapes = write_shapes(garment, skinned.shapes @ np.linalg.inv(to_trained[:3, :3]).T, skinned.shape_names)
     weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
     put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
@@ -179,8 +182,12 @@ def _rest_places(joints: Joints) -> np.ndarray:
 def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     """Remove what was baked for a garment, and give it its own weights back. In object mode."""
     remove_keys(garment, animated(garment, armature))
-    remove_shapes(garment)
-    restore_own_weights(armature, garment)
+    if has_lent_mesh(garment):
+        give_back_mesh(garment)
+        mute_inherited(garment, [armature], muted=False)
+    else:
+        remove_shapes(garment)
+        restore_own_weights(armature, garment)
     _free(armature, proxy_names(armature, garment))
     bring_back(armature, garment)
 

@@ -49,6 +49,17 @@ MOST_LOST = 1e-3  # [m] by which a vertex may differ from what Blender shows
 SAME = 1e-5  # of the garment's size: rest points that are one place
 
 
+def exported(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> tuple[float, int]:
+    """Write a glb of a garment with its armature, shown though they may be hidden; return its `largest_loss`.
+
+    Raises:
+        SsilkError: as `export_glb` and `largest_loss` do, or a collection hides one of both.
+    """
+    with visible([garment, armature]):
+        export_glb(garment, armature, path)
+        return largest_loss(garment, path)
+
+
 def export_glb(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> None:
     """Write an armature with everything that it moves over the scene's frames.
 

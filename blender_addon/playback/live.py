@@ -22,6 +22,7 @@ from ssilk_usd.shots.skinned import SkinnedGarment
 from ssilk_core.network.runtime import Playback
 from ssilk_core.scene.assets import GarmentPose, Motion
 
+from ..arrays.joints import Joints
 from ..errors import SetupError
 from ..motions.keys import has_live_keys, need_tracks, remove_keys
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
@@ -124,7 +125,10 @@ class Live:
         if self.playback is None or not self.is_in(scene):
             return
         garment, armature = self.objects()
-        self._need_all(garment, armature)
+        self._need_bones(garment, armature)
+        if self._lost_shapes(garment):  # as an undo takes them away, before it is told
+            self.dress_again()
+            return
         index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
@@ -156,7 +160,9 @@ class Live:
         garment, armature = self.objects()
         if self.playback is None:
             return False
-        return bool(self._lost(garment, armature)) or not (
+        bones = armature.pose.bones
+        lost = self._lost_shapes(garment) or any(name not in bones for name in self.joints.names)
+        return lost or not (
             self.unkeyed or has_live_keys(garment, self._moved(garment, armature))
         )
 
@@ -180,16 +186,18 @@ class Live:
         self.unkeyed = ""
         put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
 
-    def _need_all(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
-        """Check that nothing that is written to was deleted."""
-        lost = self._lost(garment, armature)
-        if lost:
-            raise SetupError(f"'{lost[0]}' was deleted while '{garment.name}' was played; play it again.")
+    def _need_bones(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+        """Check that no bone that is read or written to was deleted or renamed."""
+        lost = next((name for name in self.joints.names if name not in armature.pose.bones), None)
+        if lost is not None:
+            raise SetupError(
+                f"The bone '{lost}' of '{armature.name}' was deleted or renamed while '{garment.name}' was played; "
+                "play it again."
+            )
 
-    def _lost(self, garment: bpy.types.Object, armature: bpy.types.Object) -> list[str]:
+    def _lost_shapes(self, garment: bpy.types.Object) -> bool:
         keys = garment.data.shape_keys
-        lost = [name for name in self.joints.names if name not in armature.pose.bones]
-        return lost + [name for name in self.shapes if not keys or name not in keys.key_blocks]
+        return any(not keys or name not in keys.key_blocks for name in self.shapes)
 
     def _reading(self, take: SampledTake) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
@@ -215,9 +223,10 @@ class Live:
 
     def _trained(self) -> TrainedGarment:
         """Read the model, and check that the bones move as it says."""
-        trained = TrainedGarment(self.model, self.joints)
+        garment, armature = self.objects()
+        trained = TrainedGarment(self.model, garment, armature, read_joints(armature, garment))
         if trained.player.file.config.translations:
-            need_movable(self.objects()[1], self.joints.proxies)
+            need_movable(armature, self.joints.proxies)
         return trained
 
     def _taking_up(self) -> Iterator[float]:
@@ -229,6 +238,7 @@ class Live:
         garment, armature = self.objects()
         if not self.ready():  # the artist edits it; the model is still a new one afterwards
             return
+        self.joints = self._joints_now()
         moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
         if len(moved):
             playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
@@ -246,9 +256,20 @@ class Live:
         garment, armature = self.objects()
         if not self.ready():
             raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
+        self.joints = self._joints_now()
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
         yield 0.0
+
+    def _joints_now(self) -> Joints:
+        """Return the joints where the armature, which may move as an object, has them in this frame."""
+        garment, armature = self.objects()
+        joints = read_joints(armature, garment)
+        if joints.names != self.joints.names or not np.array_equal(joints.parents, self.joints.parents):
+            raise SetupError(
+                f"Bones of '{armature.name}' were changed while '{garment.name}' was played; play it again."
+            )
+        return joints
 
     def _take_notice(self, armature: bpy.types.Object, index: int) -> None:
         """Roll out again from a pose that differs from the one that was read."""

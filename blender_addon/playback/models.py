@@ -21,9 +21,11 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.network.runtime import Player
 
 from ..arrays.joints import Joints, joint_order
+from ..arrays.renamed import TrainedJoints, growth, known_as, renames
 from ..errors import SetupError
 from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
 from ..outside.wording import recall, reworded
+from ..scene.linked import absolute, home, origin
 
 FIRST = "wait for its training, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
@@ -43,7 +45,7 @@ def trainings() -> list[OwnedJob]:
 def remembered(garment: bpy.types.Object) -> Path | None:
     """Return the folder of the training that a garment remembers; None where it remembers none."""
     folder = garment.ssilk.training.folder
-    return Path(os.path.normpath(bpy.path.abspath(folder))) if folder else None
+    return absolute(garment, folder, origin(garment).ssilk.training.folder) if folder else None
 
 
 def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -> Path | None:
@@ -52,7 +54,9 @@ def job_of(garment: bpy.types.Object, known: Sequence[OwnedJob] | None = None) -
     Args:
         known: the trainings beside the file, where they were read already.
     """
-    own, name, file = remembered(garment), garment.name, Path(bpy.data.filepath).name
+    own, name, file = remembered(garment), origin(garment).name, home(garment).name
+    if origin(garment).library:  # it was trained where it is linked from
+        known = owned(home(garment).parent / FOLDER)
     found = [job for job in (trainings() if known is None else known) if (job.garment, job.file) == (name, file)]
     before = owner(own) if own else None
     if found and not (before and before.begun > found[-1].begun):
@@ -91,7 +95,7 @@ def _read_orphans(known: Sequence[OwnedJob]) -> list[Orphan]:
     if not here:
         return []
     things = [thing for thing in bpy.data.objects if thing.type == "MESH"]
-    linked = {job for thing in things if (job := job_of(thing, known)) and thing.users_scene}
+    linked = {job for thing in things if thing.users_scene and (job := job_of(thing, known))}
     states = ((job, read_state(job.folder)) for job in here if job.folder not in linked)
     return [Orphan(job, state.fraction) for job, state in states if state and state.alive]
 
@@ -114,7 +118,7 @@ def need_model(garment: bpy.types.Object, job: Path | None) -> Path:
     chosen = garment.ssilk.model
     if not chosen and not job:
         raise SetupError(f"'{garment.name}' has no trained model; train it, or choose a model in the Baking panel.")
-    path = Path(bpy.path.abspath(chosen)) if chosen else job / MODEL
+    path = absolute(garment, chosen, origin(garment).ssilk.model) if chosen else job / MODEL
     if not path.is_file():
         where, todo = (f" at {path}", "choose another") if chosen else (" yet", FIRST)
         raise SetupError(f"'{garment.name}' has no model{where}; {todo}.")
@@ -173,7 +177,7 @@ def read_all(jobs: Sequence[OwnedJob]) -> bool:
     before = dict(_known)
     forget()
     for thing in bpy.data.objects:
-        if thing.type == "MESH":
+        if thing.type == "MESH" and not thing.library:
             _known[thing.session_uid] = (_question(thing), _read(thing, jobs))
     return before != _known
 
@@ -208,25 +212,63 @@ def _read(garment: bpy.types.Object, jobs: Sequence[OwnedJob] | None = None) -> 
     )  # fmt: skip
 
 
+def chosen_bones(garment: bpy.types.Object) -> dict[str, str]:
+    """Return what the artist says that bones were called when a garment was trained, by their names now."""
+    return {item.bone: item.name for item in garment.ssilk.bones if item.bone}
+
+
+def joints_known_to(
+    garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, trained: TrainedJoints
+) -> Joints:
+    """Return an armature's joints under the names that a garment was trained with.
+
+    Raises:
+        SetupError: the character has another size than then.
+    """
+    known = known_as(joints, trained, chosen_bones(garment))
+    ratio = growth(known, trained)
+    if ratio != 1:
+        scale = armature.matrix_world.median_scale
+        raise SetupError(
+            f"'{armature.name}' is scaled to {ratio:.4g} times its size when '{garment.name}' was trained, and cloth "
+            f"does not move alike in another size; scale it to {scale / ratio:.4g} (now {scale:.4g}), or train it at "
+            "this size."
+        )
+    return known
+
+
+def told_renames(joints: Joints) -> str:
+    """Return a note about bones that were renamed since a garment was trained; empty where none was."""
+    found = renames(joints)
+    if not found:
+        return ""
+    name = next(iter(found))
+    count = "1 bone is" if len(found) == 1 else f"{len(found)} bones are"
+    return f" ({count} called otherwise than in the training and matched, as '{name}', which was '{found[name]}')"
+
+
 class TrainedGarment:
     """A model on an armature.
 
     Attributes:
         player: plays it.
+        joints: of the armature, under the names that the model knows.
         own: joints of the armature in the order of the model's character, shape (J,).
         order: joints of the model in the order of the armature, proxies included, shape (J + P,).
 
     Raises:
-        SsilkError: it cannot be read, or has other joints than the armature.
+        SsilkError: it cannot be read, or has other joints than the armature, or those of another size.
     """
 
-    def __init__(self, path: Path, joints: Joints) -> None:
+    def __init__(self, path: Path, garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> None:
         try:
             self.player = Player.load(path)
         except SsilkError as error:
             raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
-        self.joints = joints
-        self.order = joint_order(joints, self.player.file.scene.joint_names)
+        scene = self.player.file.scene
+        trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
+        self.joints = joints = joints_known_to(garment, armature, joints, trained)
+        self.order = joint_order(joints, scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
 
     @property

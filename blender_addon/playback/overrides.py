@@ -22,6 +22,7 @@ from ..motions.evaluating import evaluating
 from ..motions.keys import SLOTS, curves_of, is_baked
 from ..motions.sampling import worlds
 from ..scene.armature import proxy_names
+from ..scene.linked import local_copy
 from ..scene.meshes import PREFIX, world_points
 from ..scene.objects import scene_units
 
@@ -150,7 +151,7 @@ def _listed(names: Sequence[str], what: str) -> str:
 @contextmanager
 def _probe(garment: bpy.types.Object) -> Iterator[bpy.types.Object]:
     """Yield a copy of a garment that shape keys and bones move alone, without modifiers that refine it."""
-    probe = garment.copy()
+    probe = local_copy(garment)
     try:
         for modifier in list(probe.modifiers):
             if modifier.type != "ARMATURE":

@@ -85,7 +85,7 @@ def play_what_is_awaited() -> None:
     if bpy.context.mode != "OBJECT":
         return
     for garment in bpy.data.objects:
-        if not garment.ssilk.awaited or garment.name not in bpy.context.scene.objects:
+        if garment.library or not garment.ssilk.awaited or garment.name not in bpy.context.scene.objects:
             continue
         job = job_of(garment)
         state = job and read_state(job)
@@ -172,7 +172,10 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
 
 def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     for uid, played in list(_played.items()):
+        waits = played.done is None
         _attempt(uid, played.show, scene, depsgraph)
+        if waits and played.done is not None:  # it lost its shapes, and is dressed again
+            _read_soon(PATIENCE)
 
 
 @persistent
@@ -238,10 +241,10 @@ def _undone(*_: object) -> None:
 
 @persistent
 def _loaded(_: str) -> None:
-    """Go on playing what was played when the file was saved."""
+    """Go on playing what was played when the file was saved; of linked garments the keys play."""
     _forget()
     for garment in bpy.data.objects:
-        if garment.ssilk.live:
+        if garment.ssilk.live and not garment.library:
             _attempt(garment.session_uid, play, garment)
 
 

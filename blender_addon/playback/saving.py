@@ -11,19 +11,21 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..motions.sources import FILE
+from ..scene.linked import is_override, origin
 from .models import job_of, relative, remembered, trainings
 
 _before: list[tuple[Any, str, str]] = []
 
 
 def paths() -> Iterator[tuple[Any, str]]:
-    """Yield each relative path that a garment remembers, as what holds it and under which name."""
+    """Yield each relative path that a garment remembers of its own, as what holds it and under which name."""
     for thing in bpy.data.objects:
         if thing.library is None and thing.type == "MESH":
             training = thing.ssilk.training
-            files = [(item, "name") for item in training.motions if item.kind == FILE]
+            files = [(item, "name") for item in training.motions if item.kind == FILE and not is_override(thing)]
+            linked = {origin(thing).ssilk.model, origin(thing).ssilk.training.folder} if is_override(thing) else set()
             for holder, name in ((thing.ssilk, "model"), (training, "folder"), *files):
-                if getattr(holder, name).startswith("//"):
+                if getattr(holder, name).startswith("//") and getattr(holder, name) not in linked:
                     yield holder, name
 
 
@@ -31,7 +33,7 @@ def remember_trainings() -> None:
     """Let garments remember their trainings again, which an undo may have taken from them."""
     known = trainings()
     for thing in bpy.data.objects:
-        if thing.library is None and thing.type == "MESH":
+        if thing.library is None and thing.type == "MESH" and not is_override(thing):
             folder = job_of(thing, known)
             if folder and folder != remembered(thing):
                 thing.ssilk.training.folder = relative(folder)

@@ -15,9 +15,9 @@ import numpy as np
 
 from ssilk_core.authoring.preflight import mesh as checks
 from ssilk_core.authoring.preflight.finding import Finding, index_tuple
+from ssilk_core.authoring.preflight.fit import open_border
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Mesh
-from ssilk_core.scene.mesh.topology import edge_use
 
 from ..arrays.findings import HOLES, on_polygons, open_edges
 from ..scene.armature import is_evenly_scaled
@@ -52,8 +52,7 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
 
 
 def _holes(mesh: Mesh) -> Iterator[Finding]:
-    pairs, uses = edge_use(mesh.faces)
-    rim = np.unique(pairs[uses == 1])
+    rim, _ = open_border(mesh)
     if len(rim):
         yield Finding(
             severity="warning", code=HOLES, prim=mesh.path, found=open_edges(mesh), elements="vertices",

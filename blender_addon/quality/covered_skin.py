@@ -14,6 +14,7 @@ from ssilk_core.scene.assets import Mesh
 from ..errors import SetupError
 from ..scene.garment import armature_of, bodies_of
 from ..scene.gather import gather
+from ..scene.linked import home
 from ..scene.masks import mask, show
 from ..scene.modifiers import cage_points
 from ..scene.objects import scene_units
@@ -70,9 +71,12 @@ class CoveredSkinSearch:
 
 
 def _need_editable(bodies: Sequence[bpy.types.Object]) -> None:
-    linked = next((body.name for body in bodies if body.library or body.data.library), None)
+    linked = next((body for body in bodies if body.data.library or body.data.override_library), None)
     if linked:
-        raise SetupError(f"'{linked}' is linked from another file; make it local to hide its skin.")
+        raise SetupError(
+            f"The mesh of '{linked.name}' belongs to '{home(linked.data).name}'; hide its skin there, or make it "
+            "local."
+        )
 
 
 def _posed(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> np.ndarray:

@@ -19,6 +19,7 @@ from ssilk_core.physics.skin.figures import COVER_REACH, SHOW_DEPTH
 from ..arrays import heat
 from ..errors import SetupError
 from ..scene.garment import armature_of, bodies_of, rest_world
+from ..scene.linked import give_own_mesh, is_override, need_local
 from ..scene.masks import need_unmasked
 from ..scene.meshes import mixed_points, rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
@@ -140,6 +141,10 @@ def show(garment: bpy.types.Object, measured: HeatMap, red: float) -> None:
     Raises:
         SetupError: it has other vertices by now.
     """
+    for thing in _coloured(garment, measured.kind):
+        if is_override(garment) and thing == garment:
+            give_own_mesh(garment)
+        need_local(thing)
     if not _fits(garment, measured):
         raise SetupError(f"'{garment.name}' was edited while it was measured; look again.")
     hide(garment)

@@ -13,6 +13,7 @@ from ..arrays.classes import COLOR_ATTRIBUTE
 from ..playback.models import TrainedGarment, model_of
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
+from ..scene.linked import local_copy, open_collection, own_copy
 from ..scene.weights import write_groups
 from .heat import ATTRIBUTE
 
@@ -33,14 +34,14 @@ def show_copy(garment: bpy.types.Object) -> None:
     """
     armature = armature_of(garment)
     joints = read_joints(armature, garment)
-    copy = _lbs_copy(garment, TrainedGarment(model_of(garment), joints))
+    copy = _lbs_copy(garment, TrainedGarment(model_of(garment), garment, armature, joints))
     collection = bpy.data.collections.new(f"{garment.name} LBS")
     collection.objects.link(copy)
     shown = bpy.data.objects.new(f"{garment.name} LBS, beside", None)
     shown[OWNER] = garment
     shown.instance_type, shown.instance_collection = "COLLECTION", collection
     shown.location.x = GAP * max(garment.dimensions.x, garment.dimensions.y)
-    garment.users_collection[0].objects.link(shown)
+    open_collection(garment).objects.link(shown)
 
 
 def remove_copy(shown: bpy.types.Object) -> None:
@@ -72,8 +73,8 @@ def _clear_shapes(copy: bpy.types.Object) -> None:
 
 
 def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment) -> bpy.types.Object:
-    copy = garment.copy()
-    copy.data, copy.name = garment.data.copy(), f"{garment.name} LBS"
+    copy = local_copy(garment)
+    copy.data, copy.name = own_copy(garment.data), f"{garment.name} LBS"
     copy[OWNER] = garment
     copy.ssilk.live = False
     copy.ssilk.heat = ""  # the heat of the garment is not its own

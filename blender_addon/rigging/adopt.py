@@ -17,7 +17,7 @@ from ..errors import SetupError
 from ..scene.armature import MADE, made_collection, proxy_names
 from ..scene.garment import armature_of
 from ..scene.weights import PLAIN, keep_weights, read_groups, read_kept
-from .edit_tracking import remember_bones, remember_weights
+from .edit_tracking import moving_groups, remember_bones, remember_weights
 from .proxies import PALETTE
 
 
@@ -68,5 +68,5 @@ def _remember(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
         matrix = [value for row in bone.matrix_local for value in row]
         records[bone.name] = {"matrix": matrix, "parent": bone.parent.name if bone.parent else ""}
     remember_bones(armature, garment, records)
-    names = [group.name for group in garment.vertex_groups]
+    names = moving_groups(armature, garment)
     remember_weights(armature, garment, read_groups(garment, garment.data, names), names)

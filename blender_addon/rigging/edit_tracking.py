@@ -36,6 +36,12 @@ def remember_weights(
     attribute.data.foreach_set("value", signature(weights, keys_of(armature, names)))
 
 
+def moving_groups(armature: bpy.types.Object, garment: bpy.types.Object) -> list[str]:
+    """Return the vertex groups of a garment that bones move or moved; others, as of pins, are no weights of a rig."""
+    bones = {*armature.data.bones.keys(), *generated(armature, garment)}
+    return [group.name for group in garment.vertex_groups if group.name in bones]
+
+
 def generated(armature: bpy.types.Object, garment: bpy.types.Object) -> dict[str, dict[str, object]]:
     """Return the proxies as `remember_bones` was given them; empty where none were generated."""
     collection = collection_of(armature.data, garment)
@@ -98,6 +104,6 @@ def _repainted(armature: bpy.types.Object, garment: bpy.types.Object, keys: dict
     if attribute is None:
         return now > 0
     attribute.data.foreach_get("value", now)
-    names = [group.name for group in garment.vertex_groups]
+    names = moving_groups(armature, garment)
     weights = own_groups(armature, garment, names)
     return np.abs(signature(weights, [keys.get(name, name) for name in names]) - now) > SAME_WEIGHTS

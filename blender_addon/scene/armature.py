@@ -18,6 +18,7 @@ from mathutils import Matrix
 
 from ..arrays.joints import Joints
 from ..errors import SetupError
+from .linked import is_owner, open_collection
 from .objects import scene_units
 
 OWNER = "ssilk_garment"  # custom property of a bone collection: the garment object
@@ -35,7 +36,7 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
     owners = owners_of(armature.data)
     bones = [bone for bone in armature.data.bones if bone.use_deform]  # Blender keeps parents before children
     own = [bone for bone in bones if bone.name not in owners]
-    proxies = [bone for bone in bones if owners.get(bone.name) == garment]
+    proxies = [bone for bone in bones if is_owner(owners.get(bone.name), garment)]
     if not own:
         raise SetupError(
             f"No bone of '{armature.name}' deforms; switch on Deform for the bones that move the character."
@@ -54,7 +55,7 @@ def read_joints(armature: bpy.types.Object, garment: bpy.types.Object) -> Joints
 
 def proxy_names(armature: bpy.types.Object, garment: bpy.types.Object) -> list[str]:
     """Return the names of a garment's proxies."""
-    return [name for name, owner in owners_of(armature.data).items() if owner == garment]
+    return [name for name, owner in owners_of(armature.data).items() if is_owner(owner, garment)]
 
 
 def keys_of(armature: bpy.types.Object, names: Sequence[str]) -> list[str]:
@@ -95,7 +96,7 @@ def owners_of(armature: bpy.types.Armature) -> dict[str, object]:
 
 def collection_of(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection | None:
     """Return the bone collection of a garment's proxies; None where it has none."""
-    return next((group for group in armature.collections_all if group.get(OWNER) == garment), None)
+    return next((group for group in armature.collections_all if is_owner(group.get(OWNER), garment)), None)
 
 
 def made_collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> bpy.types.BoneCollection:
@@ -110,8 +111,13 @@ def made_collection(armature: bpy.types.Armature, garment: bpy.types.Object) -> 
 def put_away(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
     """Hide and lock the proxies of a garment once, so that *Select All* and *Insert Keys* pass them by.
 
-    Whoever shows their bone collection again wants them, and they stay.
+    Whoever shows their bone collection again wants them, and they stay. Collections of a linked armature cannot be
+    changed here, only the bones of what overrides it: since Blender 5 these are hidden one by one.
     """
+    if armature.data.library:
+        _hide(armature, garment, True)
+        _lock(armature, garment, True)
+        return
     collection = collection_of(armature.data, garment)
     if collection is None or AWAY in collection.keys():  # noqa: SIM118 (no dictionary)
         return
@@ -121,12 +127,23 @@ def put_away(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
 
 def bring_back(armature: bpy.types.Object, garment: bpy.types.Object) -> None:
     """Show and unlock the proxies of a garment."""
+    if armature.data.library:
+        _hide(armature, garment, False)
+        _lock(armature, garment, False)
+        return
     collection = collection_of(armature.data, garment)
     if collection is None or AWAY not in collection.keys():  # noqa: SIM118 (no dictionary)
         return
     del collection[AWAY]
     collection.is_visible = True
     _lock(armature, garment, False)
+
+
+def _hide(armature: bpy.types.Object, garment: bpy.types.Object, hidden: bool) -> None:
+    for name in proxy_names(armature, garment):
+        bone = armature.pose.bones[name]
+        if "hide" in bone.bl_rna.properties:
+            bone.hide = hidden
 
 
 def _lock(armature: bpy.types.Object, garment: bpy.types.Object, locked: bool) -> None:
@@ -204,7 +221,7 @@ def is_linked(armature: bpy.types.Object) -> bool:
 def make_follower(garment: bpy.types.Object, leader: bpy.types.Object) -> bpy.types.Object:
     """Give a garment an armature of its own that follows a linked one. In object mode."""
     follower = bpy.data.objects.new(f"{garment.name} rig", bpy.data.armatures.new(f"{garment.name} rig"))
-    garment.users_collection[0].objects.link(follower)
+    open_collection(garment).objects.link(follower)
     follower.parent = leader  # the same place and scale, also where the character's object is animated
     follower[LEADER] = leader
     bpy.context.view_layer.update()

@@ -15,16 +15,41 @@ from ..arrays.classes import ATTRIBUTE
 from ..arrays.joints import Joints
 from ..errors import SetupError
 from .armature import leader_of
+from .linked import home, is_override
+
+
+def unplayable(thing: bpy.types.Object | None) -> str:
+    """Return why an object cannot be a garment that is played, baked and looked at; empty if it can."""
+    group = thing.instance_collection if thing and thing.type == "EMPTY" else None
+    if group and group.library:
+        return f"'{thing.name}' is {_linked(group)}, then select the garment"
+    if thing is None or thing.type != "MESH":
+        return "Select the garment, a mesh, first"
+    if thing.library:
+        return f"'{thing.name}' is {_linked(thing)}, or open that file"
+    if thing.data.library and not is_override(thing):
+        return (
+            f"The mesh of '{thing.name}' is linked from '{home(thing.data).name}'; make it local (Object > Relations "
+            "> Make Single User > Object & Data), or open that file"
+        )
+    if not len(thing.data.polygons):
+        return f"'{thing.name}' has no faces"
+    return ""
+
+
+def _linked(thing: bpy.types.ID) -> str:
+    return f"linked from '{home(thing).name}'; override it (Object > Library Override > Make)"
 
 
 def unusable(thing: bpy.types.Object | None) -> str:
-    """Return why an object cannot be a garment; empty if it can."""
-    if thing is None or thing.type != "MESH":
-        return "Select the garment, a mesh, first"
-    if thing.library or thing.data.library:
-        return f"'{thing.name}' is linked from another file; make it local or open that file"
-    if not len(thing.data.polygons):
-        return f"'{thing.name}' has no faces"
+    """Return why an object cannot be a garment that is changed; empty if it can."""
+    if reason := unplayable(thing):
+        return reason
+    if is_override(thing):
+        return (
+            f"'{thing.name}' belongs to '{home(thing).name}'; open that file to change it. Here it can be played and "
+            "baked"
+        )
     return ""
 
 
@@ -36,6 +61,11 @@ def not_in_object_mode(context: bpy.types.Context) -> str:
 def unusable_here(context: bpy.types.Context) -> str:
     """Return why the active object cannot be worked on as a garment in object mode; empty if it can."""
     return unusable(context.object) or not_in_object_mode(context)
+
+
+def unplayable_here(context: bpy.types.Context) -> str:
+    """Return why the active object cannot be played, baked and looked at in object mode; empty if it can."""
+    return unplayable(context.object) or not_in_object_mode(context)
 
 
 def is_garment(thing: bpy.types.Object) -> bool:
@@ -163,6 +193,8 @@ def hang_on_armature(thing: bpy.types.Object) -> None:
 
 def need_own_mesh(thing: bpy.types.Object) -> None:
     """Raise `SetupError` if other objects share the mesh of one whose weights and shape keys are to be written."""
+    if is_override(thing) and (thing.data.library or thing.data.override_library):
+        return  # which gets one of this file before anything is written
     others = [other.name for other in bpy.data.objects if other.data == thing.data and other != thing]
     if others:
         raise SetupError(

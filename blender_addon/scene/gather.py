@@ -47,7 +47,12 @@ class GatheredScene:
 
 
 def gather(
-    garment: bpy.types.Object, *, classes: bool = True, proxies: bool = True, simulated: bool = False
+    garment: bpy.types.Object,
+    *,
+    classes: bool = True,
+    proxies: bool = True,
+    simulated: bool = False,
+    joints: Joints | None = None,
 ) -> GatheredScene:
     """Return a garment with its armature and bodies. In object mode.
 
@@ -55,13 +60,14 @@ def gather(
         classes: whether to take the painted classes along.
         proxies: whether to take the proxies and their weights along; without, the garment's own weights are.
         simulated: whether modifiers may simulate the garment.
+        joints: the armature's, where they are to be called otherwise than its bones.
 
     Raises:
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
     armature = armature_of(garment)
     need_plain_modifiers(garment, simulated=simulated)
-    joints = read_joints(armature, garment)
+    joints = joints or read_joints(armature, garment)
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
     lbs = own_weights(armature, garment, joints)
@@ -71,7 +77,9 @@ def gather(
     return GatheredScene(
         units=scene_units(),
         joints=joints if rig else joints.character,
-        character=Character(ROOT, joints.skeleton(f"{ROOT}/{SKELETON}"), tuple(bodies)),
+        character=Character(
+            ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", [body.skin for body in bodies]), tuple(bodies)
+        ),
         garment=Garment(
             mesh,
             None if lbs is None else SkinWeights.from_dense(paths[0], lbs),

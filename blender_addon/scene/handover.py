@@ -15,7 +15,7 @@ import numpy as np
 from ssilk_core.scene.assets import Garment, ProxyRig
 
 from ..errors import SetupError
-from ..outside.wording import reworded
+from ..outside.wording import reworded, with_bones
 from .gather import GatheredScene
 from .objects import Pair
 
@@ -70,8 +70,8 @@ class Handover:
         return {**named, STAGE: "the character", RIGGED: "its rig", REPAIRED: "the repaired character"}
 
     def in_blender_words(self, sentence: str) -> str:
-        """Return a sentence with names of objects in place of files and prims."""
-        return reworded(sentence, self.stage.parent, self.words)
+        """Return a sentence with names of objects and bones in place of files, prims and joints."""
+        return with_bones(reworded(sentence, self.stage.parent, self.words), self.scene.joints.bones)
 
 
 def hand_over(scene: GatheredScene, pair: Pair, folder: Path) -> Handover:

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, FloatProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
 
 from ..scene.classes import tighten
 from . import fabric, training
 from .fabric import FabricSettings
-from .training import RELATIVE, TrainingSettings
+from .training import RELATIVE, SHOTS, TrainingSettings
 
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
@@ -22,6 +22,15 @@ def _tighten(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
         tighten(garment.data, settings.tightness)
 
 
+class BoneMatch(bpy.types.PropertyGroup):
+    """A bone that is called otherwise than when the garment was trained; its name is the one from then."""
+
+    bone: StringProperty(
+        name="Bone", description="What this bone of the training is called now; empty where it is not chosen",
+        override=SHOTS,
+    )  # fmt: skip
+
+
 class GarmentSettings(bpy.types.PropertyGroup):
     """Choices for one garment; where one is empty, what is meant is found (see `scene.garment`)."""
 
@@ -30,11 +39,13 @@ class GarmentSettings(bpy.types.PropertyGroup):
         poll=_is_armature,
         name="Armature",
         description="Armature of the character that wears the garment; found by its Armature modifier when empty",
+        override=SHOTS,
     )
     bodies: PointerProperty(
         type=bpy.types.Collection,
         name="Bodies",
         description="Meshes that the garment collides with; all others bound to the armature when empty",
+        override=SHOTS,
     )
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
     tightness: FloatProperty(
@@ -56,21 +67,34 @@ class GarmentSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=RELATIVE,
         description="Trained model of the garment; that of its own training when empty",
+        override=SHOTS,
     )
-    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"})
+    bones: CollectionProperty(
+        type=BoneMatch,
+        description="Bones of the training that the artist has found again",
+        options={"HIDDEN"},
+        override={*SHOTS, "USE_INSERTION"},
+    )
+    live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"}, override=SHOTS)
     awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
-    heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"})
-    heat_told: StringProperty(description="What the heat map shows in this frame, in words", options={"HIDDEN"})
-    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"})
-    training: PointerProperty(type=TrainingSettings, name="Training", description="How the garment is trained")
+    heat: StringProperty(
+        description="What the heat map shows; empty for none", options={"HIDDEN"}, override=SHOTS
+    )
+    heat_told: StringProperty(
+        description="What the heat map shows in this frame, in words", options={"HIDDEN"}, override=SHOTS
+    )
+    heat_red: FloatProperty(description="Value that is red", options={"HIDDEN"}, override=SHOTS)
+    training: PointerProperty(
+        type=TrainingSettings, name="Training", description="How the garment is trained", override=SHOTS
+    )
 
 
-CLASSES = (*training.CLASSES, *fabric.CLASSES, GarmentSettings)
+CLASSES = (*training.CLASSES, *fabric.CLASSES, BoneMatch, GarmentSettings)
 
 
 def attach() -> None:
     """Give every object the settings."""
-    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings)
+    bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings, override=SHOTS)
 
 
 def detach() -> None:

@@ -13,6 +13,8 @@ from ..motions.sources import FILE, KINDS
 # Paths may begin with "//", the folder of the blend file; Blender wants to be told since 4.5.
 RELATIVE = {"ANIMATABLE", "PATH_SUPPORTS_BLEND_RELATIVE"} if bpy.app.version >= (4, 5, 0) else {"ANIMATABLE"}
 
+SHOTS = {"LIBRARY_OVERRIDABLE"}  # what a shot may choose for a garment that it links, besides its own file
+
 ABOUT = {
     "draft": "A first look, after minutes on any machine",
     "preview": "Nearly the final quality, after minutes on a GPU",
@@ -71,6 +73,7 @@ class TrainingSettings(bpy.types.PropertyGroup):
         subtype="DIR_PATH",
         description="Folder of the garment's training, relative to the blend file",
         options=RELATIVE,
+        override=SHOTS,
     )
 
 

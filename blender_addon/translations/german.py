@@ -18,6 +18,14 @@ WORDS = {
         "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an das Skelett gebunden sind"
     ),
     "Fabric": "Stoff",
+    "Match Bones": "Knochen zuordnen",
+    "Bone": "Knochen",
+    "Find bones that were renamed since the training, and list those that only you can tell": (
+        "Knochen finden, die seit dem Training umbenannt wurden, und auflisten, die nur Sie zuordnen können"
+    ),
+    "What this bone of the training is called now; empty where it is not chosen": (
+        "Wie dieser Knochen des Trainings jetzt heißt; leer: nicht gewählt"
+    ),
     "What the garment is made of": "Woraus das Kleidungsstück besteht",
     "Preset": "Vorgabe",
     "Cloth to start from; sets all values": "Stoff, von dem ausgegangen wird; setzt alle Werte",

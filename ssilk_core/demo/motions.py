@@ -70,28 +70,34 @@ def demo_shot(skeleton: Skeleton) -> Motion:
     walk = biped.solve("walk", locomotion(biped, replace(WALK, rate=1.0), 2.5, (0.4, 1.9, np.radians(-115))))
     leap = biped.solve("jump", jump(biped, height=0.16, forward=0.2))
     still = biped.solve("idle", idle(biped, 1.6))
-    return chain("demo_shot", walk.clip(0, walk.frame_count - 15), leap.clip(6, leap.frame_count - 12), still)
+    walk, leap = walk.clip(0, walk.frame_count - 15), leap.clip(6, leap.frame_count - 12)
+    return chain("demo_shot", skeleton, walk, leap, still)
 
 
-def chain(name: str, *motions: Motion) -> Motion:
-    """Return motions one after the other, each moved so that it begins where the last one ended."""
+def chain(name: str, skeleton: Skeleton, *motions: Motion) -> Motion:
+    """Return motions of a biped one after the other, each moved so that it begins where the last one ended.
+
+    The hips are moved: joints above them stand still.
+    """
+    hips = Biped(skeleton).index["Hips"]
     rotations, translations = [motions[0].rotations], [motions[0].translations]
     for motion in motions[1:]:
-        end, start = root(rotations[-1], translations[-1], -1), root(motion.rotations, motion.translations, 0)
+        end = local(rotations[-1], translations[-1], -1, hips)
+        start = local(motion.rotations, motion.translations, 0, hips)
         turn, place = motion.rotations.copy(), motion.translations.copy()
         move = end @ invert_rigid(start)
-        turn[:, 0] = multiply_quaternions(quaternion_from_matrix(move[:3, :3]), turn[:, 0])
-        if np.dot(turn[0, 0], rotations[-1][-1, 0]) < 0:
-            turn[:, 0] *= -1
-        place[:, 0] = place[:, 0] @ move[:3, :3].T + move[:3, 3]
+        turn[:, hips] = multiply_quaternions(quaternion_from_matrix(move[:3, :3]), turn[:, hips])
+        if np.dot(turn[0, hips], rotations[-1][-1, hips]) < 0:
+            turn[:, hips] *= -1
+        place[:, hips] = place[:, hips] @ move[:3, :3].T + move[:3, 3]
         rotations.append(turn[1:])
         translations.append(place[1:])
     return Motion(name, FPS, np.concatenate(rotations), np.concatenate(translations))
 
 
-def root(rotations: Floats, translations: Floats, frame: int) -> Floats:
-    """Return the transform of the root joint in one frame, (4, 4)."""
-    return rigid(matrix_from_quaternion(rotations[frame, 0]), translations[frame, 0])
+def local(rotations: Floats, translations: Floats, frame: int, joint: int) -> Floats:
+    """Return the transform of a joint to its parent in one frame, (4, 4)."""
+    return rigid(matrix_from_quaternion(rotations[frame, joint]), translations[frame, joint])
 
 
 def mirrored(track: Track) -> Track:

@@ -68,6 +68,10 @@ class Biped:
                 "the motions made in code need a two-legged rig with the joint names of the CMU mocap skeletons",
                 "rename the joints, or use motions of your own",
             )
+        self.above: set[int] = set()  # joints that the hips hang from
+        joint = self.index["Hips"]
+        while (joint := int(skeleton.parents[joint])) >= 0:
+            self.above.add(joint)
         legs = [
             np.linalg.norm(self.at(a) - self.at(b)) for a, b in (("LeftUpLeg", "LeftLeg"), ("LeftLeg", "LeftFoot"))
         ]
@@ -120,8 +124,7 @@ class Biped:
         for side in range(2):
             turns |= self.leg_turns(track, side, points)
             turns |= self.arm_turns(track, side, points, turns)
-        rotations, _ = self.place(track.hips, turns)
-        return self.motion(name, track.hips, rotations)
+        return self.motion(name, *self.place(track.hips, turns))
 
     def torso(self, track: Track) -> dict[str, Floats]:
         """Return rotations from pelvis to head, the bend shared evenly by the joints between."""
@@ -140,13 +143,20 @@ class Biped:
         return turns
 
     def place(self, hips: Floats, turns: dict[str, Floats]) -> tuple[Floats, Floats]:
-        """Return rotations (F, J, 3, 3) and positions (F, J, 3); joints without a turn follow their parents."""
-        count = self.skeleton.joint_count
+        """Return rotations (F, J, 3, 3) and positions (F, J, 3); joints without a turn follow their parents.
+
+        Joints above the hips stand still, and other roots follow the hips.
+        """
+        count, carrier = self.skeleton.joint_count, self.index["Hips"]
         rotations, points = np.zeros((len(hips), count, 3, 3)), np.zeros((len(hips), count, 3))
         given = {self.index[name]: turn for name, turn in turns.items() if name in self.index}
         for joint, parent in enumerate(self.skeleton.parents):
-            if parent < 0:
-                rotations[:, joint], points[:, joint] = given.get(joint, turns["Hips"]), hips
+            if joint in self.above:
+                rotations[:, joint], points[:, joint] = np.eye(3), self.points[joint]
+                continue
+            if joint == carrier or parent < 0:
+                rotations[:, joint] = given.get(joint, turns["Hips"])
+                points[:, joint] = hips + apply(turns["Hips"], self.points[joint] - self.points[carrier])
                 continue
             rotations[:, joint] = given.get(joint, rotations[:, parent])
             points[:, joint] = points[:, parent] + apply(
@@ -199,8 +209,11 @@ class Biped:
             frame_of(lower, hinge) @ np.swapaxes(frame_of(second, rest), -1, -2),
         )
 
-    def motion(self, name: str, hips: Floats, rotations: Floats) -> Motion:
-        """Return local rotations and translations of rotations (F, J, 3, 3) from the bind pose."""
+    def motion(self, name: str, rotations: Floats, points: Floats) -> Motion:
+        """Return local rotations and translations of rotations from the bind pose and places, as `place` has them.
+
+        Joints but roots and the hips keep their places in their parents.
+        """
         bind = self.skeleton.bind_transforms
         world = rotations @ bind[:, :3, :3]
         parents = np.asarray(self.skeleton.parents)
@@ -209,8 +222,13 @@ class Biped:
         local[:, children] = np.swapaxes(world[:, parents[children]], -1, -2) @ world[:, children]
         offsets = bind[:, :3, 3].copy()
         offsets[children] = (invert_rigid(bind[parents[children]]) @ bind[children])[:, :3, 3]
-        translations = np.repeat(offsets[None], len(hips), axis=0)
-        translations[:, parents < 0] = hips[:, None]
+        translations = np.repeat(offsets[None], len(points), axis=0)
+        translations[:, parents < 0] = points[:, parents < 0]
+        carrier = self.index["Hips"]
+        if self.above:
+            above = parents[carrier]
+            back = np.swapaxes(world[:, above], -1, -2)
+            translations[:, carrier] = apply(back, points[:, carrier] - points[:, above])
         return Motion(name, FPS, one_sign(quaternion_from_matrix(local)), translations)
 
 

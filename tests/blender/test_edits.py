@@ -287,3 +287,13 @@ def test_the_dialog_says_what_there_is_to_keep(ready, rigged, edit):
     assert edits_line(rigged) == "By hand: nothing"
     edit(lambda bones: bones.remove(bones[proxies_of(ready)[-1]]))
     assert edits_line(rigged) == "By hand: 1 deleted"
+
+
+def test_a_vertex_group_that_no_bone_moves_is_no_edit_of_a_rig(ready, rigged):
+    """As a group of pins, whose vertices nobody has repainted."""
+    from blender_addon.rigging.edit_tracking import find_edits
+
+    rigged.vertex_groups.new(name="Pins").add(list(range(28)), 1.0, "REPLACE")
+    assert find_edits(ready.data.objects["Rig"], rigged).summary == ""
+    rigged.vertex_groups["Hips"].add([5], 0.123, "REPLACE")
+    assert find_edits(ready.data.objects["Rig"], rigged).summary == "1 vertices repainted"

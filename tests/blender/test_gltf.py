@@ -104,7 +104,7 @@ def test_a_glb_plays_at_a_rate_that_is_no_integer(ready, baked, tmp_path, monkey
                 export(path)
 
         monkeypatch.setattr(gltf, "_export", mended)
-    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    gltf.exported(baked, ready.data.objects["Rig"], path)
     assert render.fps_base == before
     played = SkinnedGlb(path, "Skirt")
     assert (played.start, played.end) == pytest.approx((1.001 / 24, 12 * 1.001 / 24), rel=1e-6)
@@ -128,3 +128,23 @@ def test_what_a_glb_cannot_hold_is_refused_and_leaves_no_file(ready, baked, tmp_
     assert ready.ops.ssilk.export_gltf.poll()
     assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
     assert not ready.ops.ssilk.export_gltf.poll()
+
+
+def test_an_export_tells_how_far_it_is_and_can_be_cancelled(ready, baked, tmp_path, monkeypatch, capfd):
+    from blender_addon.operators import tasks
+    from blender_addon.outside.work import Work
+
+    heard, poll = [], Work.poll
+
+    def polled(work) -> bool:
+        ended = poll(work)
+        if work.fraction is not None and not work.cancelled:
+            heard.append(work.fraction)
+            work.cancel()
+        return ended
+
+    monkeypatch.setattr(Work, "poll", polled)
+    assert ready.ops.ssilk.export_gltf(filepath=str(tmp_path / "Skirt.glb")) == {"CANCELLED"}
+    assert "Exporting 'Skirt' was cancelled" in capfd.readouterr().out
+    assert 0 < heard[0] < 1 and tasks.current is None
+    assert not list(tmp_path.iterdir())

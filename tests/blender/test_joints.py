@@ -8,6 +8,7 @@ import pytest
 
 from blender_addon.arrays.joints import Joints, identifiers, joint_order, joint_paths
 from blender_addon.errors import SetupError
+from ssilk_core.scene.assets import SkinWeights
 
 
 def test_names_become_unique_identifiers():
@@ -50,3 +51,12 @@ def test_proxies_alone_may_be_missing_and_only_where_that_is_allowed(joints):
     ):
         with pytest.raises(SetupError, match=f"'{odd}' was added, removed, renamed or has another parent"):
             joint_order(joints, names, fewer_proxies=fewer)
+
+
+def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
+    """As readers of stages find it: a root above the hips may stand still."""
+    moved = SkinWeights.from_dense("/Body", np.array([[0.0, 1.0], [0.0, 1.0]]))
+    assert joints.skeleton("/").hub == 0
+    assert joints.skeleton("/", [moved]).hub == 1
+    spread = SkinWeights.from_dense("/Body", np.array([[0.5, 0.5], [0.0, 1.0]]))
+    assert joints.skeleton("/", [moved, spread]).hub == 0

@@ -92,7 +92,7 @@ def test_a_linked_garment_cannot_be_changed_and_says_so(ready, skirt, tmp_path):
         wanted.objects = ["Skirt"]
     ready.context.scene.collection.objects.link(wanted.objects[0])
     ready.context.view_layer.objects.active = wanted.objects[0]
-    with pytest.raises(RuntimeError, match="'Skirt' is linked from another file; make it local"):
+    with pytest.raises(RuntimeError, match=r"'Skirt' is linked from 'garment\.blend'; override it"):
         ready.ops.ssilk.paint_classes()
 
 

@@ -72,6 +72,37 @@ def test_without_a_python_the_way_to_one_is_shown(bpy, skirt):
     notes = drawn(GarmentPanel, bpy.context)
     assert {"armature", "bodies", "ssilk.find_python"} <= set(notes)
     assert "No Python with ssilk is chosen; find one in the extension's preferences" in " ".join(notes)
+    assert "ssilk.create_environment" in notes
+
+
+def test_a_search_that_found_no_python_is_told_once(bpy, skirt, monkeypatch):
+    from blender_addon.operators import environment, tasks
+    from blender_addon.panels import GarmentPanel
+
+    monkeypatch.setattr(environment.pythons, "find", lambda _: [])
+    with pytest.raises(RuntimeError, match="No Python with ssilk was found"):
+        bpy.ops.ssilk.find_python()
+    told = " ".join(drawn(GarmentPanel, bpy.context))
+    tasks.stop()
+    assert told.count("No Python with ssilk") == 1 and "create an environment" in told
+
+
+def test_a_preset_for_gpus_is_not_offered_on_a_processor(bpy, skirt, monkeypatch):
+    from blender_addon.operators import training as operators
+    from blender_addon.panels import training
+
+    settings = skirt.ssilk.training
+    for cpu, preset in ((False, "preview"), (True, "draft")):
+        settings.property_unset("preset")
+        monkeypatch.setattr(operators, "on_processor", lambda _, cpu=cpu: cpu)
+        monkeypatch.setattr(training, "on_processor", lambda _, cpu=cpu: cpu)
+        assert bpy.ops.ssilk.find_motions() == {"FINISHED"}
+        assert settings.preset == preset and not training.slow_line(bpy.context, skirt)
+    settings.preset = "preview"
+    assert "'Preview' is for a GPU" in training.slow_line(bpy.context, skirt)
+    assert bpy.ops.ssilk.find_motions() == {"FINISHED"} and settings.preset == "preview"
+    settings.minutes = 10
+    assert not training.slow_line(bpy.context, skirt)
 
 
 def test_classes_are_counted_and_buttons_follow_the_mode(bpy, skirt):
@@ -175,9 +206,11 @@ def test_work_shows_its_progress_and_a_way_out(bpy, skirt, monkeypatch):
     from blender_addon.operators import tasks
     from blender_addon.panels import GarmentPanel
 
-    current = SimpleNamespace(status="Rigging", fraction=0.25, text="half way", close=int)
+    current = SimpleNamespace(
+        title="Rigging 'Skirt'", share="25%", cancelled=False, fraction=0.25, text="half way", close=int
+    )
     monkeypatch.setattr(tasks, "current", current)
-    assert drawn(GarmentPanel, bpy.context)[-3:] == ["Rigging 25%", "ssilk.cancel", "half way"]
+    assert drawn(GarmentPanel, bpy.context)[-4:] == ["Rigging 'Skirt'", "25% 25%", "ssilk.cancel", "half way"]
 
 
 def test_preferences_show_the_python(bpy):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from blender_addon.outside import jobs
-from blender_addon.outside.wording import recall, remember, reworded
+from blender_addon.outside.wording import recall, remember, reworded, with_bones
 
 NAMES = {
     "dressed.usdc:/Character/Skirt": "'Skirt'",
@@ -32,6 +32,22 @@ NAMES = {
 def test_what_was_made_is_called_what_it_stands_for(said, meant):
     folder = Path("/tmp/a (job) + more")
     assert reworded(said.format(folder), folder, NAMES) == meant
+
+
+BONES = {"Hips": "Hips", "Hips/Arm_L": "Arm.L", "Hips/Arm_L/handslot_l": "handslot.l", "Hips/Spine": "Spine"}
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        ("joint 'Hips/Arm_L/handslot_l' is 0.2 m off", "joint 'handslot.l' is 0.2 m off"),
+        ("handslot_l, Arm_L and 3 more stand still", "handslot.l, Arm.L and 3 more stand still"),
+        ("'Hips' and 'Hips/Spine'; /home/Arm_L/a.usd, Arm_L_2", "'Hips' and 'Spine'; /home/Arm_L/a.usd, Arm_L_2"),
+        ("pin it, or paint primvars:ssilk:class", "pin it, or paint its classes"),
+    ],
+)
+def test_joints_are_called_as_the_bones_are(said, meant):
+    assert with_bones(said, BONES) == meant
 
 
 def test_names_are_kept_with_a_training_and_read_with_its_state(tmp_path):

@@ -932,3 +932,14 @@ def test_a_joint_that_is_listed_twice_is_refused_by_name():
     body.CreateJointsAttr([*JOINTS[:4], JOINTS[3]])
     with pytest.raises(SsilkError, match=r"/Hero/Body: joint 'Hips/Leg' is listed twice"):
         read_character(stage)
+
+
+def test_an_animation_of_blendshapes_alone_is_called_that():
+    stage = author(Usd.Stage.CreateInMemory())
+    skeleton = read_character(stage).skeleton
+    shapes = UsdSkel.Animation.Define(stage, "/Face")
+    shapes.CreateBlendShapesAttr(["smile"])
+    shapes.CreateBlendShapeWeightsAttr().Set([0.5], 1)
+    with pytest.raises(SsilkError, match="turns no joint, it moves blendshapes alone") as raised:
+        read_motion(stage, skeleton, prim="/Face")
+    assert "retarget" not in str(raised.value)

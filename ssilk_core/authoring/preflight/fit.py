@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...events import format_count
-from ...scene.assets import Character, Floats, Mesh
+from ...scene.assets import Character, Floats, Ints, Mesh
 from ...scene.fabrics import FABRICS
 from ...scene.mesh.topology import edge_use, is_inside_out, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
 from .finding import Finding, Findings, format_joints, index_tuple
+from .mesh import distinct_faces, merged_places
 from .settle import DEEPEST, FARTHEST, Settled, settle
 
 COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
@@ -130,17 +131,26 @@ def _described(guess: UnitCorrection | None) -> str:
     return "; it appears to be " + " and ".join(words)
 
 
+def open_border(body: Mesh) -> tuple[Ints, int]:
+    """Return the vertices along which a body is open, and how many edges that are.
+
+    Vertices in one place count as one: glTF files split a mesh along the seams of its texture.
+    """
+    place = merged_places(body.points)
+    pairs, uses = edge_use(distinct_faces(place[body.faces]))
+    return np.flatnonzero(np.isin(place, pairs[uses == 1])), int(np.count_nonzero(uses == 1))
+
+
 def body_holes(body: Mesh) -> Findings:
     """Yield the border vertices of a body that is not closed."""
-    pairs, uses = edge_use(body.faces)
-    rim = np.unique(pairs[uses == 1])
+    rim, edges = open_border(body)
     if len(rim):
         yield Finding(
             severity="warning",
             code="body-not-watertight",
             prim=body.path,
             count=len(rim),
-            found=f"the body is open along {format_count(int(np.count_nonzero(uses == 1)), 'edges')}",
+            found=f"the body is open along {format_count(edges, 'edges')}",
             why="inside and outside are ambiguous near a hole, so cloth may pass through undetected",
             fix="close the holes that cloth can reach; others are harmless",
             elements="vertices",

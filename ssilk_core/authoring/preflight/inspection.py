@@ -145,7 +145,14 @@ def _on_scene(inputs: PreflightInput, blocked: bool) -> Findings:
     try:
         scene = prepare_scene(inputs.character, garment, inputs.rig)
     except SsilkError as error:
-        yield Finding(severity="error", code="not-riggable", prim=garment.mesh.path, found=str(error))
+        yield Finding(
+            severity="error",
+            code="not-riggable",
+            prim=garment.mesh.path,
+            found=error.found or str(error),
+            why=error.allowed,
+            fix=error.todo,
+        )
         return
     if garment.classes is None:
         yield from attachment.class_coverage(garment.mesh, scene.classes)

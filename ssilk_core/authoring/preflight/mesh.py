@@ -133,8 +133,13 @@ def distinct_faces(faces: Ints) -> Ints:
 
 def shared_places(points: Floats) -> Ints:
     """Return which points coincide with another to a micrometre, shape (V,)."""
-    _, place, uses = np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True, return_counts=True)
-    return uses[place.reshape(-1)] > 1
+    place = merged_places(points)
+    return np.bincount(place)[place] > 1
+
+
+def merged_places(points: Floats) -> Ints:
+    """Return a number for the place of each point, the same to a micrometre for those that coincide, shape (V,)."""
+    return np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _longest_edges(mesh: Mesh) -> Floats:

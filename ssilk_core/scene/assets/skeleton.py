@@ -10,6 +10,8 @@ import numpy as np
 from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
+_STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
+
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
@@ -79,6 +81,24 @@ class Skeleton:
         while (above := int(self.parents[path[0]])) >= 0:
             path.insert(0, above)
         return tuple(path)
+
+
+def carrying_joint(moved: Floats, parents: Ints) -> int:
+    """Return the joint that carries the body, a hub: the lowest that all of it hangs from, but for `_STRAY` of it.
+
+    Game skeletons have joints above the hips, which may stand still while the character runs.
+
+    Args:
+        moved: how much of the bodies each joint moves itself: of each body its mean weight, summed, shape (J,).
+        parents: as a skeleton has them, shape (J,).
+    """
+    below = np.array(moved, dtype=np.float64)
+    for joint in range(len(parents) - 1, -1, -1):
+        if parents[joint] >= 0:
+            below[parents[joint]] += below[joint]
+    whole = (1 - _STRAY) * np.sum(moved)
+    held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
+    return int(held[-1]) if len(held) else 0
 
 
 def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:

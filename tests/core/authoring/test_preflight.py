@@ -242,6 +242,12 @@ def test_body_not_watertight_and_inside_out():
     open_body = Mesh(body.path, body.points, body.faces[1:])
     assert only(fit.body_holes(open_body)).indices == tuple(sorted(body.faces[0].tolist()))
     assert not list(fit.body_holes(body)) and not list(fit.body_inside_out(body))
+    corners = np.arange(open_body.faces.size).reshape(-1, 3)
+    split = Mesh(body.path, open_body.points[open_body.faces].reshape(-1, 3), corners)
+    found = only(fit.body_holes(split))  # as glTF files split bodies along seams of their textures
+    assert found.found == "the body is open along 3 edges"
+    rim = np.unique(split.points[list(found.indices)], axis=0)
+    np.testing.assert_array_equal(rim, np.unique(body.points[body.faces[0]], axis=0))
     assert only(fit.body_inside_out(Mesh(body.path, body.points, body.faces[:, ::-1]))).severity == "error"
 
 
@@ -587,6 +593,8 @@ def test_what_cannot_be_rigged_is_an_error_in_the_words_of_the_rig():
     )
     found = only(f for f in inspect(world(Garment(halves))) if f.severity == "error")
     assert found.code == "not-riggable" and "rest nowhere on the body" in found.found
+    assert found.found.startswith("1 of 2 islands")  # where it is, the finding says itself
+    assert "or it falls off" in found.why and "move the garment onto the body" in found.fix
 
 
 def test_findings_are_grouped_the_worst_first():

@@ -186,7 +186,7 @@ def test_mirrored_track_is_the_mirror_image() -> None:
 
 
 def test_chained_clips_join_without_a_jump() -> None:
-    joined = chain("both", motion("turn_and_stop"), motion("jump"))
+    joined = chain("both", skeleton(), motion("turn_and_stop"), motion("jump"))
     seam = motion("turn_and_stop").frame_count
     assert np.abs(np.diff(places(joined, "Head"), axis=0)[seam - 3 : seam + 3]).max() < 2e-3
     assert joined.frame_count == seam + motion("jump").frame_count - 1
@@ -240,3 +240,24 @@ def test_curves_against_their_definitions() -> None:
     assert travel(5.0, 10.0, 2.0) == pytest.approx(4.0)
     time = np.array([0.0, 1.0, 2.0, 3.0, 9.0])
     assert np.allclose(keyframes(time, (1.0, 5.0), (2.0, -1.0), (3.0, 2.0)), [5.0, 5.0, -1.0, 2.0, 2.0])
+
+
+def below_a_still_root() -> Skeleton:
+    """The demo's skeleton as game engines have it: the hips hang from a root that stands on the ground, turned."""
+    own = skeleton()
+    root = np.eye(4)
+    root[:3, :3] = kinematics.matrix_from_quaternion(np.array([np.sqrt(0.5), 0, np.sqrt(0.5), 0]))
+    parents = np.r_[-1, own.parents + 1]
+    binds = np.concatenate([root[None], own.bind_transforms])
+    names = ("root", *(f"root/{name}" for name in own.joint_names))
+    return Skeleton("game", names, parents, binds, kinematics.local_transforms(binds, parents), hub=1)
+
+
+@pytest.mark.parametrize("name", ["walk", "demo_shot"])
+def test_a_joint_above_the_hips_stands_still_and_the_figure_moves_alike(name: str) -> None:
+    game = below_a_still_root()
+    clip = demo_shot(game) if name == "demo_shot" else build_motion(name, game)
+    placed = kinematics.motion_transforms(clip, game.parents)
+    assert np.ptp(placed[:, 0], axis=0).max() < 1e-9
+    wanted = kinematics.motion_transforms(motion(name), skeleton().parents)
+    np.testing.assert_allclose(placed[:, 1:], wanted, atol=1e-6)

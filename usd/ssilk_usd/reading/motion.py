@@ -107,6 +107,13 @@ def read_motion(
     where = location(animation)
     joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
     need_unique(joints, where)
+    if not joints and UsdSkel.Animation(animation).GetBlendShapesAttr().Get():
+        fail(
+            where,
+            "this animation turns no joint, it moves blendshapes alone",
+            "a motion turns the joints of the skeleton",
+            "choose an animation of the body",
+        )
     posed = posed_joints(joints, placed) if placed else None
     match = _matched(joints, posed, skeleton, where)
     codes, fps = _time_codes(stage, animation, placed, within)

@@ -7,7 +7,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import SsilkError, fail
-from ssilk_core.scene.assets import Floats, Ints, Skeleton
+from ssilk_core.scene.assets import Floats, Ints, Skeleton, carrying_joint
 
 from ..names import PROXIES, SKEL
 from ..opening.stage import (
@@ -27,7 +27,6 @@ from .mesh import is_drawn, is_garment
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
-_STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
 _CHOOSE = "choose one with --root, or as MODEL:/ROOT in a bake"
 
 
@@ -111,7 +110,7 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     parents = position[source.parents[kept]]
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
-    hub = _carries_body(_moved_weights(source)[kept], parents)
+    hub = carrying_joint(_moved_weights(source)[kept], parents)
     binds, placement = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
     return Skeleton(location(source.prim), names, parents, binds, rest, hub, placement)
 
@@ -129,23 +128,6 @@ def _moved_weights(source: SkelSource) -> Floats:
                 at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
                 np.add.at(total, at, np.abs(influences.weights) / max(len(at), 1))
     return total[:-1]
-
-
-def _carries_body(moved: Floats, parents: Ints) -> int:
-    """Return the joint that carries the body: the lowest one that all of it hangs from, but for `_STRAY` of it.
-
-    Game skeletons have joints above the hips, which may stand still while the character runs.
-
-    Args:
-        moved: how much of the body each joint moves itself, shape (J,).
-    """
-    below = np.array(moved)
-    for joint in range(len(parents) - 1, -1, -1):
-        if parents[joint] >= 0:
-            below[parents[joint]] += below[joint]
-    whole = (1 - _STRAY) * moved.sum()
-    held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
-    return int(held[-1]) if len(held) else 0
 
 
 def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
