@@ -185,7 +185,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
         joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
-        joint_order(joints, scene.joint_names)
+        joint_order(joints, scene.joint_names, fewer_proxies=True)
         return joints
 
     def rephrase(self, sentence: str) -> str:

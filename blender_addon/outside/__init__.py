@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Work in other processes: commands, trainings and their reports. No module here imports `bpy`.
+"""Work in other processes: commands, trainings and their reports. No module here imports `bpy`, but for one script.
 
 A command comes in; progress and a result go out. Open `work.py` first for one piece of work, and `jobs.py` for
 trainings that outlive Blender: `runner.py` runs each, in the Python that has ssilk. `python` finds that Python, and
-`probe` and `demo_motions` are scripts that it runs. `training_report` and `wording` put what was said into an
-artist's words.
+`probe` and `demo_motions` are scripts that it runs, `gltf_export` one that another Blender runs. `training_report`
+and `wording` put what was said into an artist's words.
 """

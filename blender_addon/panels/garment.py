@@ -52,7 +52,7 @@ def draw_orphans(layout: bpy.types.UILayout) -> None:
         job = orphan.job
         draw_text(layout, f"This training goes on without its garment '{job.garment}'", icon="INFO")
         row = layout.row(align=True)
-        row.progress(factor=orphan.fraction, text=f"{orphan.fraction:.0%}")
+        row.progress(factor=orphan.fraction, text=job.garment)
         row.operator("ssilk.cancel_orphan", text="", icon="CANCEL").folder = str(job.folder)
 
 

@@ -20,7 +20,8 @@ class FindingList(bpy.types.UIList):
     bl_idname = "SSILK_UL_findings"
 
     def draw_item(self, _context, layout, _data, item, _icon, _active, _property) -> None:  # type: ignore[no-untyped-def]
-        layout.label(text=sentence(line(item)), icon=ICONS.get(item.severity, "INFO"), translate=False)
+        garment = bpy.context.window_manager.ssilk_preflight.garment
+        layout.label(text=named_line(item, garment), icon=ICONS.get(item.severity, "INFO"), translate=False)
 
 
 class PreflightPanel(UsableGarmentPanel, bpy.types.Panel):
@@ -53,13 +54,13 @@ def sentence(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def named_line(item: bpy.types.PropertyGroup, garment: str) -> str:
+    """Return a finding in a few words, after the name of its object where that is not the garment."""
+    return f"{item.target}: {line(item)}" if item.target not in ("", garment) else sentence(line(item))
+
+
 def line(item: bpy.types.PropertyGroup) -> str:
-    """Return a finding in a few words, with the name of its object where that is not the garment."""
-    there = item.target and item.target != bpy.context.window_manager.ssilk_preflight.garment
-    return f"{item.target}: {_words(item)}" if there else _words(item)
-
-
-def _words(item: bpy.types.PropertyGroup) -> str:
+    """Return a finding in a few words."""
     words, noun = item.code.replace("-", " "), {"polygons": "faces"}.get(item.elements, item.elements)
     if not item.indices:
         return words

@@ -324,8 +324,9 @@ def test_findings_are_counted_in_words():
 
 
 def test_each_body_is_told_its_own_holes():
-    quad = Mesh("/Character/Torso", np.zeros((4, 3)), np.array([[0, 1, 2], [0, 2, 3]]), np.array([4]), np.arange(4))
-    triangle = Mesh("/Character/Hand", np.zeros((3, 3)), np.array([[0, 1, 2]]), np.array([3]), np.arange(3))
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
+    quad = Mesh("/Character/Torso", corners, np.array([[0, 1, 2], [0, 2, 3]]), np.array([4]), np.arange(4))
+    triangle = Mesh("/Character/Hand", corners[:3], np.array([[0, 1, 2]]), np.array([3]), np.arange(3))
     document = {"severity": "warning", "code": "body-not-watertight", "prim": "a.usdc:/Character", "why": "",
                 "found": "the body is open along 7 edges", "fix": "", "fixable": False, "elements": "vertices",
                 "indices": list(range(7))}  # fmt: skip
@@ -333,6 +334,21 @@ def test_each_body_is_told_its_own_holes():
     assert [(each.prim, each.found) for each in found] == [
         ("Torso", "it is open along 4 edges"), ("Hand", "it is open along 3 edges"),
     ]  # fmt: skip
+    other = {**document, "code": "low-poly-body", "indices": [], "elements": ""}
+    error = {**other, "severity": "error", "code": "body-inside-out"}
+    found = read_findings([document, other, error], "Shirt", {**SHIRT, "Torso": quad})
+    assert [each.code for each in found] == ["body-inside-out", "low-poly-body", "body-not-watertight"]
+
+
+def test_findings_on_others_than_the_garment_name_them():
+    from types import SimpleNamespace
+
+    from blender_addon.panels.preflight import named_line
+
+    item = SimpleNamespace(code="body-not-watertight", elements="vertices", indices=[1, 2], target="Torso")
+    assert named_line(item, "Shirt") == "Torso: body not watertight: 2 vertices"
+    item.target = "Shirt"
+    assert named_line(item, "Shirt") == "Body not watertight: 2 vertices"
 
 
 def test_what_was_mended_by_hand_goes_and_the_rest_says_that_it_is_old(ready, skirt):
