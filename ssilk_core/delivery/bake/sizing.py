@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from ...scene.decomposition import Decomposition
 
+STATED = 2048  # bytes of what a shot says of its origin and of its skin, which an excerpt does not hold
 EXCERPT = 64  # frames that are written to estimate the bytes of a whole shot
 
 
@@ -64,7 +65,7 @@ def load_sized(
 
         def size_bytes(file: ModelFile) -> float:
             found = shot_bytes(with_model(at_fps, file), suffix, include_body=include_body)
-            return found.of(at_fps.motion.frame_count)
+            return found.of(at_fps.motion.frame_count) + STATED
 
         size = spend(budget, reducer, size, rollout.source, size_bytes, report).size
     return load_rollout(replace(request, keep=None if size == reducer.whole else size))
