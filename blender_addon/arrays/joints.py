@@ -84,7 +84,8 @@ def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = F
     """
     paths = joints.paths
     lacking = set(paths[joints.character_count :]) - set(names) if fewer_proxies else set()
-    odd = sorted(set(paths) ^ set(names) ^ lacking)
+    # Two bones that are taken for one joint are odd as well.
+    odd = sorted({path for path in paths if paths.count(path) > 1} or set(paths) ^ set(names) ^ lacking)
     if odd:
         raise SetupError(
             f"The bones are not those that the garment was trained with ('{odd[0].rpartition('/')[2]}' was added, "

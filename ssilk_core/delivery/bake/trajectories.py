@@ -134,7 +134,7 @@ def skin_trajectories(
                 summary = write_glb_shot(layer, found.deformer, motion, found.poses, **common)
             else:
                 summary = write_shot(layer, found.deformer, motion, found.poses, units=units, **common)
-            name = Path(motion.path.partition(":/")[0]).stem
+            name = Path(split_location(motion.path)[0]).stem
             shown = state_shown_skin(layer, found.deformer.scene, motion, name=name, device=device)
         if verify:
             need_valid(unverified, report)
