@@ -16,16 +16,17 @@ from ssilk_core.files import replacing
 from ..errors import SetupError
 from ..motions.keys import has_keys
 from ..motions.simulated import simulating
+from ..outside import scripts
 from ..outside.work import Work
 from ..playback import playing
-from ..playback.gltf import MOST_LOST
+from ..playback.gltf import MOST_LOST, write_seen
 from ..scene.garment import armature_of, unplayable_here
 from ..scene.objects import Pair
 from . import tasks
 
 SUFFIX = ".glb"
 SCRIPT = Path(__file__).parents[1] / "outside" / "gltf_export.py"
-COPY, MADE = "scene.blend", "made.glb"
+COPY, MADE, SEEN = "scene.blend", "made.glb", "seen.npy"
 
 
 class ExportGltf(tasks.OutsideOperator, bpy.types.Operator):
@@ -64,10 +65,12 @@ class ExportGltf(tasks.OutsideOperator, bpy.types.Operator):
         return Work(f"Exporting '{garment.name}'", self.commands, parent=bpy.app.tempdir)
 
     def commands(self, folder: Path) -> list[list[str]]:
-        """Write a copy of the file as it is now; return the command."""
+        """Write a copy of the file as it is now, and some of what Blender shows of it; return the command."""
         garment, armature = self.pair.objects()
+        write_seen(garment, armature, folder / SEEN)
+        trust = "trusted" if scripts.run_here() else "untrusted"
         bpy.ops.wm.save_as_mainfile(filepath=str(folder / COPY), copy=True)
-        files = [str(folder / COPY), garment.name, armature.name, str(folder / MADE)]
+        files = [str(folder / COPY), trust, garment.name, armature.name, str(folder / MADE), str(folder / SEEN)]
         return [[*_blender(), "--", *files, *_folders()]]
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
@@ -76,6 +79,13 @@ class ExportGltf(tasks.OutsideOperator, bpy.types.Operator):
             raise SetupError(
                 f"'{self.pair.name}' would be {1000 * loss:.3g} mm off what Blender shows in frame {frame}; "
                 f"{self.reason}."
+            )
+        apart, where = work.result["apart"], work.result["where"]
+        if not apart <= MOST_LOST:
+            raise SetupError(
+                f"'{self.pair.name}' is {1000 * apart:.3g} mm elsewhere in the Blender that exports it (frame "
+                f"{where}), which has no add-ons and only the file's own scripts; bake to keys what Python drivers "
+                "and handlers move, and export again."
             )
         with replacing(self.path) as unverified:
             shutil.copyfile(work.folder / MADE, unverified)

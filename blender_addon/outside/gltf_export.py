@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Export a glTF binary in a Blender of its own, so that the artist's stays usable and may stop it; then compare.
 
-Run by Blender, or by a Python with the bpy module. After `--` come the copy of the file, the names of garment
-and armature, the .glb to write, and the folders of the modules that the artist's Blender has.
+Run by Blender, or by a Python with the bpy module. After `--` come the copy of the file, whether its scripts run in
+the artist's Blender ("trusted" or "untrusted"), the names of garment and armature, the .glb to write, what that
+Blender showed (.npy), and the folders of the modules that it has.
 """
 
 import importlib
@@ -38,23 +39,25 @@ def heed_interrupts():
             signal.signal(getattr(signal, name), lambda *_: os._exit(130))
 
 
-def main(blend, garment, armature, path, *folders):
-    """Open the file, export, and compare what is in the .glb with what Blender shows."""
+def main(blend, trust, garment, armature, path, seen, *folders):
+    """Open the file, export, and compare what is in the .glb with what Blender shows, here and there."""
     heed_interrupts()
     sys.path[:0] = folders
     own = Path(__file__).resolve().parents[1]
     sys.path.insert(0, str(own.parent))
     gltf = importlib.import_module(f"{own.name}.playback.gltf")
     errors = importlib.import_module("ssilk_core.errors")
-    bpy.ops.wm.open_mainfile(filepath=blend, load_ui=False)
+    bpy.ops.wm.open_mainfile(filepath=blend, load_ui=False, use_scripts=trust == "trusted")
     scene = bpy.context.scene
     count_frames(2 * (scene.frame_end - scene.frame_start + 1))
     try:
-        loss, frame = gltf.exported(bpy.data.objects[garment], bpy.data.objects[armature], Path(path))
+        things = bpy.data.objects[garment], bpy.data.objects[armature]
+        loss, frame = gltf.exported(*things, Path(path))
+        apart, where = gltf.apart(*things, Path(seen))
     except errors.SsilkError as error:
         say("failed", error=str(error))
         sys.exit(2)
-    say("result", task="export", detail={"loss": loss, "frame": frame})
+    say("result", task="export", detail={"loss": loss, "frame": frame, "apart": apart, "where": where})
 
 
 if __name__ == "__main__":

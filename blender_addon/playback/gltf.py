@@ -46,6 +46,7 @@ SETTINGS: dict[str, Any] = {
 ADDON = "io_scene_gltf2"
 REST_FRAME = 0  # which the exporter shows before it reads meshes, without `export_current_frame`
 MOST_LOST = 1e-3  # [m] by which a vertex may differ from what Blender shows
+MOMENTS = 8  # frames, about, in which two Blenders are compared
 SAME = 1e-5  # of the garment's size: rest points that are one place
 
 
@@ -58,6 +59,40 @@ def exported(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) 
     with visible([garment, armature]):
         export_glb(garment, armature, path)
         return largest_loss(garment, path)
+
+
+def write_seen(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> None:
+    """Write the vertices of a garment in some frames of the scene (.npy), for `apart` in another Blender.
+
+    Raises:
+        SetupError: as `visible` and `sample_vertices` do.
+    """
+    np.save(path, _seen(garment, armature))
+
+
+def apart(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> tuple[float, int]:
+    """Return how far a garment is from what `write_seen` saw, at most [m], and in which frame.
+
+    Two Blenders show one file alike, unless only one of them has what drivers and handlers call.
+    """
+    losses = np.linalg.norm(np.load(path) - _seen(garment, armature), axis=2).max(axis=1)
+    return float(losses.max()), _moments()[int(losses.argmax())]
+
+
+def _seen(garment: bpy.types.Object, armature: bpy.types.Object) -> np.ndarray:
+    """Return a garment's vertices in the world [m], y up, shape (F, V, 3)."""
+    shown: list[np.ndarray] = []
+    with visible([garment, armature]):
+        for _ in sample_vertices(garment, _moments(), shown):
+            pass
+    return np.array(shown)
+
+
+def _moments() -> range:
+    """Return frames over the scene's range, always with its last one, since most drivers move with time."""
+    scene = bpy.context.scene
+    count = scene.frame_end - scene.frame_start
+    return range(scene.frame_end, scene.frame_start - 1, -max(1, count // MOMENTS))[::-1]
 
 
 def export_glb(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> None:

@@ -91,6 +91,27 @@ def test_what_is_hidden_is_shown_while_it_is_exported(ready, baked, tmp_path):
         setattr(layer, hide, False)
 
 
+def test_python_drivers_play_as_in_the_session_or_nothing_is_written(ready, baked, tmp_path):
+    """A driver that the file brings runs wherever it runs here; a function that this Blender alone has does not."""
+    path = tmp_path / "Skirt.glb"
+    driver = ready.data.objects["Rig"].driver_add("location", 0).driver
+    driver.expression = "[frame / 10].pop()"
+    ready.ops.wm.save_as_mainfile(filepath=str(tmp_path / "driven.blend"))
+    for trusted in (False, True):
+        ready.ops.wm.open_mainfile(filepath=str(tmp_path / "driven.blend"), use_scripts=trusted)
+        garment, rig = (ready.data.objects[name] for name in ("Skirt", "Rig"))
+        ready.context.scene.frame_set(12)
+        assert rig.location.x == pytest.approx(1.2 * trusted)
+        assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+        assert largest_loss(garment, path)[0] < 5e-4
+    path.unlink()
+    ready.app.driver_namespace["ours"] = lambda frame: frame / 10
+    rig.animation_data.drivers[0].driver.expression = "ours(frame)"
+    with pytest.raises(RuntimeError, match=r"'Skirt' is 2\.?\d*e\+03 mm elsewhere in the Blender that exports it"):
+        ready.ops.ssilk.export_gltf(filepath=str(path))
+    assert not path.exists() and len(ready.data.scenes) == 1
+
+
 @pytest.mark.parametrize("divides", [False, True])
 def test_a_glb_plays_at_a_rate_that_is_no_integer(ready, baked, tmp_path, monkeypatch, divides):
     render, path = ready.context.scene.render, tmp_path / "Skirt.glb"
