@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from blender_addon.arrays.joints import Joints, identifiers, joint_order, joint_paths
+from blender_addon.arrays.renamed import TrainedJoints, known_as
 from blender_addon.errors import SetupError
 from ssilk_core.scene.assets import SkinWeights
 
@@ -51,6 +52,16 @@ def test_proxies_alone_may_be_missing_and_only_where_that_is_allowed(joints):
     ):
         with pytest.raises(SetupError, match=f"'{odd}' was added, removed, renamed or has another parent"):
             joint_order(joints, names, fewer_proxies=fewer)
+
+
+def test_two_bones_are_not_one_joint(joints):
+    """A bone is chosen to be what a new one beside it is called: the names alone are those of the training."""
+    then = TrainedJoints(joints.paths[:2], joints.binds[:2])
+    now = Joints(("Hips", "Back", "Über-Spine"), np.array([-1, 0, 0]), joints.binds[[0, 1, 1]])
+    both = known_as(now, then, {"Back": "_ber_Spine"})
+    assert both.paths == ("Hips", "Hips/_ber_Spine", "Hips/_ber_Spine")
+    with pytest.raises(SetupError, match="'_ber_Spine' was added, removed, renamed or has another parent"):
+        joint_order(both, then.names)
 
 
 def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
