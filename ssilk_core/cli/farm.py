@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail("--cluster", "no folder for the layers", "-o names one")
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
     if options.output:
-        LayerFolder(options.output).need_names(tasks)
+        LayerFolder(options.output).need_names(tasks, complete=not options.bundle)
     job = submitted(tasks, report)
     if options.bundle:
         return _write(job, options, report)

@@ -103,6 +103,39 @@ def test_levels_of_quality_are_variants_of_one_garment(copy, capsys):
     assert "levels are variants of a shot in a folder of layers" in capsys.readouterr().err
 
 
+def test_levels_are_of_a_garment_that_is_there_and_no_level(copy, capsys):
+    shirt = "--motion walk.usda --lbs -o layers --garment-name"
+    assert bake("shirt.safetensors", f"{shirt} hero --level-of overalls") == 0
+    for words, says in (
+        ("crowd --level-of cape", "--level-of cape: no garment 'cape' is baked in this shot"),
+        ("crowd --level-of hero", "--level-of hero: 'hero' is a level of 'overalls' itself; .*; name 'overalls'"),
+        ("overalls_hero --level-of overalls", "'overalls_hero' and 'hero' would both be its level 'hero'"),
+    ):
+        assert bake("shirt.safetensors", f"{shirt} {words}") == 2
+        assert re.search(says, capsys.readouterr().err)
+    assert bake("overalls.safetensors", "--motion walk.usda -o layers --garment-name overalls --level-of hat") == 2
+    assert "no garment 'hat'" in capsys.readouterr().err
+    assert not Path("layers/assets/crowd").exists() and garments() == ["overalls"]
+    request = BakeRequest(model="overalls.safetensors", stage="rigged.usda", motion="walk.usda")
+    late, base = replace(request, garment="crowd", level_of="overalls"), replace(request, garment="hat")
+    LayerFolder("new").need_names(plan_layers([late, request]))  # a command may bake both
+    LayerFolder("new").need_names(plan_layers([late]), complete=False)  # and a farm the other one with another job
+    with pytest.raises(SsilkError, match=r"'overalls' has a level itself, 'hero'; .*; name this garment with"):
+        LayerFolder("layers").need_names(plan_layers([base, replace(request, level_of="hat")]))
+
+
+def test_a_body_is_shown_whichever_levels_are_selected(copy, capsys):
+    words = "--motion walk.usda --lbs -o layers"
+    assert bake("shirt.safetensors", f"{words} --no-body --garment-name overalls_crowd --level-of overalls") == 0
+    assert "the level 'overalls_crowd' of 'overalls' has no body, as others have" in capsys.readouterr().err
+    assert bake("shirt.safetensors", words) == 0
+    assert "has no body" not in capsys.readouterr().err
+    stage = Usd.Stage.Open("layers/shots/walk/shot.usda")
+    for level in ("default", "crowd"):
+        assert stage.GetPrimAtPath("/Shot/overalls").GetVariantSet("level").SetVariantSelection(level)
+        assert [mesh.path for mesh in Shot(stage).meshes if not mesh.is_garment] == ["/Shot/shirt/Body"]
+
+
 def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy, monkeypatch):
     """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
     write, other = layers_of_usd.write_stage, []

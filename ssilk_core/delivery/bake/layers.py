@@ -17,6 +17,7 @@ from ..targets import check_influences
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
+from .levels import need_levels
 from .load import LoadedGarment, load_garment
 from .names_used import GarmentUse, UsedNames, need_distinct_case, write_use
 from .origin import shot_metadata
@@ -135,14 +136,15 @@ class LayerFolder:
             and current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
         )
 
-    def need_names(self, tasks: Iterable[BakeTask]) -> None:
+    def need_names(self, tasks: Iterable[BakeTask], *, complete: bool = True) -> None:
         """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
-        input, unless its task says so.
+        input, unless its task says so, and as `need_levels` does.
 
         It lists the folders of all shots and assets, so it is for a whole command; `bake` lists none.
         """
         tasks = list(tasks)
         need_distinct_case(self.path, tasks)
+        need_levels(self.path, tasks, complete=complete)
         self._need_inputs(tasks)
 
     def _need_inputs(self, tasks: Iterable[BakeTask]) -> None:
@@ -169,6 +171,7 @@ class LayerFolder:
         wanted = task.pinned or self.inputs.hashes(task.request)
         if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
             return replace(record.result, current=True)
+        need_levels(self.path, [task], complete=False)
         self._need_inputs([task])
         request = task.request
         garment = self.garment(task)

@@ -45,13 +45,13 @@ def write_shot_stage(
     # file systems, and the lock file of a process that was killed would stop everybody else. Where a process is
     # killed between the rename and the second look, the next bake of the shot, or the check of a job, puts it right.
     while True:
-        found = _finished(folder, shot)
+        found = finished(folder, shot)
         layouts = {Layout(folder, name, shot): wearer for name, wearer in _wearers(found).items()}
         levels = {name: record.level_of for name, record in found.items() if record and record.level_of}
         written = write_stage(layouts, needed, levels)
         if not layouts:
             Layout(folder, "", shot).stage.unlink(missing_ok=True)
-        if _finished(folder, shot) == found:
+        if finished(folder, shot) == found:
             break
     for text in written.unreadable.values():
         left = "the shot is without this garment, until it is baked again or taken out with 'ssilk remove'"
@@ -60,6 +60,12 @@ def write_shot_stage(
         place = folder / "shots" / shot / name / RECORD
         kept = "the garment stays in the shot, but nothing tells what it was baked from"
         report(Message(f"{place}: it is damaged; {kept}; bake it again with --replace", "warning"))
+    for name in [name for name, base in levels.items() if base not in found]:
+        text = f"'{name}' is a level of '{levels[name]}', which is not in this shot; bake that one as well"
+        report(Message(f"{folder / 'shots' / shot}: {text}", "warning"))
+    for name, base in written.bodiless.items():
+        text = f"the level '{name}' of '{base}' has no body, as others have; with it the shot shows none"
+        report(Message(f"{folder / 'shots' / shot}: {text}; bake it again without --no-body", "warning"))
     if behind := _behind(found, replaced):
         text = f"{', '.join(behind)} follow another motion than {', '.join(replaced)}, with a body of their own"
         todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
@@ -95,7 +101,7 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
     return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
 
 
-def _finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:
+def finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:
     """Return the records of the garments that are finished in a shot, by name; None for one that is damaged."""
     home = folder / "shots" / shot
     # Listed, because a client of a network file system may remember for a while that a single file was not there.

@@ -348,11 +348,17 @@ def with_points(path: str | Path) -> Shot:
 
 @dataclass(frozen=True)
 class WrittenStage:
-    """The stage of a shot: garments that are left out because they cannot be read, and why; garments whose body is
-    not shown, with the garment whose body is."""
+    """The stage of a shot.
+
+    Attributes:
+        unreadable: garments that are left out because they cannot be read, and why.
+        bodies: garments whose body is not shown, with the garment whose body is.
+        bodiless: levels without a body of a garment that shows it with its other levels, with that garment.
+    """
 
     unreadable: Mapping[str, str]
     bodies: Mapping[str, str]
+    bodiless: Mapping[str, str]
 
 
 def write_stage(
@@ -366,7 +372,7 @@ def write_stage(
 
     Args:
         garments: the garments of one shot, and who wears each: the body of a character is shown with the first of
-            its garments that has one. If none can be read, no stage is written.
+            its garments that has one in all its levels, else in some. If none can be read, no stage is written.
         needed: names of garments that have to be in it; others are left out where they cannot be read.
         levels: names of garments that are levels of another one, by their own.
 
@@ -375,10 +381,14 @@ def write_stage(
             written.
     """
     stages, unreadable = _opened(garments, needed)
-    shown: dict[Hashable, str] = {}
     others: dict[str, str] = {}
     if not stages:
-        return WrittenStage(unreadable, others)
+        return WrittenStage(unreadable, others, {})
+    grouped: dict[str, list[Layout]] = {}
+    for garment in stages:
+        grouped.setdefault((levels or {}).get(garment.garment, garment.garment), []).append(garment)
+    bodies = {garment: _body_names(stage) for garment, stage in stages.items()}
+    shown = _shown_with(grouped, garments, bodies)
     layout, units = next(iter(stages)), _common_units(stages)
     first = stages[layout].GetRootLayer()
     spans = [_span(stage.GetRootLayer(), first.timeCodesPerSecond) for stage in stages.values()]
@@ -391,22 +401,39 @@ def write_stage(
             stage.SetMetadata(name, first.pseudoRoot.GetInfo(name))
         stage.SetStartTimeCode(min(start for start, _ in spans))
         stage.SetEndTimeCode(max(end for _, end in spans))
-        grouped: dict[str, list[Layout]] = {}
-        for garment in stages:
-            grouped.setdefault((levels or {}).get(garment.garment, garment.garment), []).append(garment)
         for name, group in grouped.items():
             prim = stage.DefinePrim(shot.GetPath().AppendChild(name))
             _reference_levels(prim, name, group)
             for garment in group:
-                bodies = _body_names(stages[garment])
-                if bodies and shown.setdefault(garments[garment], name) != name:
+                if bodies[garment] and shown[garments[garment]] != name:
                     others[garment.garment] = shown[garments[garment]]
-                    for body in bodies:
+                    for body in bodies[garment]:
                         stage.OverridePrim(prim.GetPath().AppendChild(body)).SetActive(False)
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.stage)
         del stage, shot, prim
-    return WrittenStage(unreadable, others)
+    showing = {name: grouped[name] for name in shown.values()}
+    bodiless = {each.garment: name for name, group in showing.items() for each in group if not bodies[each]}
+    return WrittenStage(unreadable, others, bodiless)
+
+
+def _shown_with(
+    grouped: Mapping[str, Sequence[Layout]],
+    wearers: Mapping[Layout, Hashable],
+    bodies: Mapping[Layout, Sequence[str]],
+) -> dict[Hashable, str]:
+    """Return with which garment the body of each wearer is shown.
+
+    A variant cannot show what is beneath another prim, so a garment that has the body in all its levels comes first:
+    its body is there whichever levels are selected.
+    """
+    shown: dict[Hashable, str] = {}
+    for all_levels in (True, False):
+        for name, group in grouped.items():
+            for one in filter(bodies.get, group):
+                if not all_levels or all(bodies[each] and wearers[each] == wearers[one] for each in group):
+                    shown.setdefault(wearers[one], name)
+    return shown
 
 
 def _reference_levels(prim: Usd.Prim, name: str, group: Sequence[Layout]) -> None:
