@@ -232,51 +232,42 @@ def _results(
     options: argparse.Namespace, asked: EvaluationOptions, opened: Sequence[OpenedModel], listed: ListedClips
 ) -> EvaluationResults:
     """Return the results to write, with their provenance; their inputs are told by content, wherever they lie."""
-    import torch
-
-    from .. import __version__
-    from ..delivery.bake.inputs import stage_contents
-    from ..devices import device_name, select_device
     from ..files import sha256
     from ..quality.evaluation.results import EvaluationResults
+    from ._measured import contents, measured_inputs
     from ._reference import shots
 
     if not options.output:
         return EvaluationResults(None, {}, {})
-    models, stage = [sha256(path) for path in options.models], stage_contents(str(options.stage))
+    inputs = measured_inputs(
+        models=options.models,
+        stage=options.stage,
+        clips=listed.files,
+        device=options.device,
+        others={"motions of the training": listed.seen},
+    )
     garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
     simulated = {name: shots(options.reference, name) for name in garments}
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}
-    hardware = device_name(select_device(options.device))
-    versions = {"ssilk": __version__, "torch": torch.__version__}
-
-    def contents(paths: Iterable[Path]) -> list[str]:
-        return [stage_contents(str(path)).digest for path in paths]
-
     return EvaluationResults(
         options.output,
         {
             "units": "SI",
-            "models": dict(zip(map(str, options.models), models)),
-            "stage": {str(options.stage): stage.first},
+            "models": {str(path): digest for path, (_, digest) in zip(options.models, inputs["models"])},
+            "stage": {str(options.stage): sha256(options.stage)},
             "reference": options.reference and str(options.reference),
             "options": settings,
-            "hardware": hardware,
-            "versions": versions,
+            "hardware": inputs["hardware"],
+            "versions": inputs["versions"],
         },
         {
-            "models": list(zip((path.stem for path in options.models), models)),
-            "stage": stage.digest,
-            "motions": dict(zip(listed.files, contents(listed.files.values()))),
+            **inputs,
             "splits": listed.splits,
-            "motions of the training": contents(listed.seen),
             "simulated shots": {
                 name: dict(zip(used, contents(files[clip] for clip in used)))
                 for name, files in simulated.items()
                 if (used := [clip for clip in files if clip in listed.files])
             },
             "options": settings,
-            "hardware": hardware,
-            "versions": versions,
         },
     )

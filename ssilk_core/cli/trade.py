@@ -21,10 +21,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .. import __version__
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Reporter, Result, Started
 from . import options as shared
+from ._measured import measured_inputs
 
 if TYPE_CHECKING:
     from ..delivery.bake import BakeRollout
@@ -109,14 +109,13 @@ class Bench:
         clips: motions to measure on, by name.
         takes: what is measured of them.
         frames: how many frames that is of each clip.
-        others: motions that models are reduced for.
+        others, other_paths: motions that models are reduced for, and their files.
         first_of_garment: the first model of each garment, with the garment's name.
         asked: what distinguishes one sweep from another.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
         from ..devices import select_device
-        from ..files import sha256
         from ..network.checkpoint import load_model
         from ..quality.evaluation.takes import takes_of, within
 
@@ -134,20 +133,29 @@ class Bench:
         self.first_of_garment: dict[Path, str] = {}
         for path, file in self.files.items():
             self._check(path, file, first)
-        self.paths, self.others = self._motions(first)
+        self.paths, self.other_paths = self._motions()
+        self.others = [self._read(path, first) for path in self.other_paths]
         self.clips = {name: self._read(path, first) for name, path in self.paths.items()}
         skeleton = first.scene.character.skeleton
         fps = first.config.fps
         cut = [within(takes_of(name, clip, skeleton, fps), options.frames) for name, clip in self.clips.items()]
         self.takes = [take for own in cut for take in own]
         self.frames = {name: sum(take.frame_count for take in own) for name, own in zip(self.clips, cut)}
-        self.asked: dict[str, Any] = {
-            "models": {str(path): sha256(path) for path in options.models},
-            "stage": sha256(options.stage),
+        self.asked = self._asked() if options.output else {}
+
+    def _asked(self) -> dict[str, Any]:
+        return {
+            **measured_inputs(
+                models=self.options.models,
+                stage=self.options.stage,
+                clips=self.paths,
+                device=self.options.device,
+                others={"motions that models are reduced for": self.other_paths},
+            ),
             "clips": list(self.clips),
             "frames": self.frames,
-            "hardware": f"{platform.processor() or platform.machine()}, {self.device}",
-            "ssilk": __version__,
+            "processor": platform.processor() or platform.machine(),
+            "root": self.options.root,
         }
 
     def _check(self, path: Path, file: ModelFile, first: ModelFile) -> None:
@@ -209,8 +217,8 @@ class Bench:
 
         return weigh
 
-    def _motions(self, file: ModelFile) -> tuple[dict[str, Path], list[Motion]]:
-        """Return the files of the clips to measure on, and the motions to reduce models for: the others, if any."""
+    def _motions(self) -> tuple[dict[str, Path], list[Path]]:
+        """Return the files of the clips to measure on, and those to reduce models for: the others, if any."""
         from ssilk_usd.reading.motion import motion_files
 
         folder: Path = self.options.motions
@@ -226,7 +234,7 @@ class Bench:
                 f"it holds {', '.join(list(files)[:3])} and so on",
             )
         others = [path for name, path in files.items() if name not in names] or list(files.values())
-        return {name: files[name] for name in names}, [self._read(path, file) for path in others]
+        return {name: files[name] for name in names}, others
 
     def _read(self, path: Path, file: ModelFile) -> Motion:
         from ssilk_usd.reading.motion import read_motion

@@ -3,14 +3,18 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shlex
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from pxr import Sdf
 
 from ssilk_core.cli import main
+from ssilk_core.cli.trade import Bench
 from ssilk_core.errors import EXIT_WORSE
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.quality.cost import Time
@@ -54,6 +58,31 @@ def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     assert run(f"{TRADE} --clips long short --frames 12 --no-refine -o trade.json") == 0
     assert f"{len(points)} rows were measured before and are taken over; it is complete" in capsys.readouterr().err
     assert json.loads((world / "trade.json").read_text()) == document
+
+
+def test_points_are_of_what_files_hold_and_not_of_their_names(world):
+    """A clip, another motion, or a layer of the stage changes under its name, and all files move together."""
+    (world / "above.usda").write_text("#usda 1.0\n(\n    subLayers = [@./rigged.usda@]\n)\n")
+
+    def asked(folder: Path) -> dict[str, object]:
+        options = argparse.Namespace(
+            models=[folder / "model.safetensors"], stage=folder / "above.usda", motions=folder / "motions",
+            clips=["long"], frames=12, root=None, device="cpu", output=folder / "trade.json",
+        )  # fmt: skip
+        return Bench(options).asked
+
+    before = asked(world)
+    assert before["clips"] == ["long"] and before["frames"] == {"long": 12}
+    moved = shutil.copytree(world, world / "moved")
+    assert asked(moved) == before
+    reduced = "motions that models are reduced for"
+    for name, kind in (("motions/long", "motions"), ("motions/other", reduced), ("rigged", "stage")):
+        layer = Sdf.Layer.OpenAsAnonymous(str(moved / f"{name}.usda"))
+        layer.comment = "another one"
+        layer.Export(str(moved / f"{name}.usda"))
+        found = asked(moved)
+        assert [name for name, value in found.items() if before[name] != value] == [kind]
+        before = found
 
 
 def test_models_are_put_on_one_table(world, capsys, no_clock):
