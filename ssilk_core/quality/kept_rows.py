@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -32,6 +32,7 @@ class KeptRows(Generic[Row]):
         inputs: hashes of the files and all settings that figures depend on, by name. Where they differ, a file is
             begun anew: figures of different inputs must not stand in one table, and outputs are replaced everywhere.
         inputs_at, rows_at: under what the file holds inputs and rows.
+        beside: lists of other figures of the same run that the file tells, a dataclass for each by its name there.
     """
 
     path: Path | None
@@ -41,6 +42,7 @@ class KeptRows(Generic[Row]):
     inputs: Mapping[str, Any]
     inputs_at: str = "inputs"
     rows_at: str = "figures"
+    beside: Mapping[str, type] = field(default_factory=dict)
 
     def known(self, report: Reporter) -> list[Row]:
         """Return the rows of these inputs that an earlier run wrote, and tell how many there are.
@@ -60,6 +62,8 @@ class KeptRows(Generic[Row]):
                 _ = [row[name] for name in self.names]
             other = f"its figures are of other {', '.join(changed)}" if changed else ""
             rows = [] if changed else [self._row(row) for row in written]
+            for name, kind in () if changed else self.beside.items():
+                _ = [from_plain(kind, each, figures=True) for each in document.get(name, ())]
         except OtherFieldsError as error:
             other, rows = f"another version measured its figures ({error})", []
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

@@ -25,7 +25,7 @@ def from_plain(kind: type[T], document: object, *, figures: bool = False) -> T:
             number that is null was not finite, and becomes NaN.
 
     Raises:
-        OtherFieldsError: a field is unknown, or of `figures` missing.
+        OtherFieldsError: a field is unknown, of `figures` missing, or a plain value where it has fields now.
         TypeError: a field without a default is missing, or one is of another type.
         SsilkError: the dataclass refuses a value.
     """
@@ -35,7 +35,8 @@ def from_plain(kind: type[T], document: object, *, figures: bool = False) -> T:
 def _dataclass(kind: type[T], inside: str, document: object, figures: bool) -> T:
     """Return a dataclass; messages put the name of the field that it is `inside`, with a dot, before its own."""
     if not isinstance(document, Mapping):
-        raise TypeError(f"{str(document)[:40]!r} has no fields")
+        found = f"{str(document)[:40]!r} has no fields"
+        raise OtherFieldsError(f"{inside.rstrip('.')!r}, {found}") if inside else TypeError(found)
     types = _types(kind)  # type: ignore[arg-type]
     known = {item.name for item in fields(kind)}  # type: ignore[arg-type]
     unknown = sorted(str(name) for name in document.keys() - known)

@@ -18,6 +18,8 @@ from .point import TradePoint
 from .shot_method import GIVEN
 from .variants import Variant
 
+COSTS = "judging"  # where the file holds the costs of collisions
+
 
 @dataclass
 class Results:
@@ -38,8 +40,16 @@ class Results:
     def kept(self) -> KeptRows[TradePoint]:
         """Where the points are kept."""
         names = ("garment", "model", "swept", "variant")
-        at = {"inputs_at": "asked", "rows_at": "points"}
-        return KeptRows(path=self.path, verb="trade", kind=TradePoint, names=names, inputs=self.asked, **at)
+        return KeptRows(
+            path=self.path,
+            verb="trade",
+            kind=TradePoint,
+            names=names,
+            inputs=self.asked,
+            inputs_at="asked",
+            rows_at="points",
+            beside={COSTS: CollisionCost},
+        )
 
     def resume(self, report: Reporter) -> None:
         """Read the points that an earlier run of the same sweep measured, as `KeptRows.known` does.
@@ -48,11 +58,8 @@ class Results:
             SsilkError: the file is none of a sweep.
         """
         self.points = self.kept.known(report)
-        costs = self.kept.told().get("judging", ()) if self.points else ()
-        try:
-            self.collision_costs = [from_plain(CollisionCost, each, figures=True) for each in costs]
-        except TypeError as error:
-            raise SsilkError(f"{self.path}: damaged figures of collisions ({error}); name another file.") from error
+        costs = self.kept.told().get(COSTS, ()) if self.points else ()
+        self.collision_costs = [from_plain(CollisionCost, each, figures=True) for each in costs]
 
     def found(self, model: str, variant: Variant) -> bool:
         """Return whether a variant has been measured."""
@@ -69,7 +76,7 @@ class Results:
         self._write(finished=True)
 
     def _write(self, *, finished: bool) -> None:
-        told = {"units": "SI, times in ms", "judging": [asdict(each) for each in self.collision_costs]}
+        told = {"units": "SI, times in ms", COSTS: [asdict(each) for each in self.collision_costs]}
         self.kept.write(told, [asdict(each) for each in self.points], finished=finished)
 
 

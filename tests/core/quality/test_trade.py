@@ -24,7 +24,7 @@ from ssilk_core.quality.evaluation.solver_errors import solver_errors
 from ssilk_core.quality.evaluation.takes import takes_of, within
 from ssilk_core.quality.kept_rows import GO_ON
 from ssilk_core.quality.reduction import ModelSize, Reducer
-from ssilk_core.quality.trade.collision_cost import measure_collisions
+from ssilk_core.quality.trade.collision_cost import CollisionCost, measure_collisions
 from ssilk_core.quality.trade.measure import VariantMeter
 from ssilk_core.quality.trade.plot import trade_panels
 from ssilk_core.quality.trade.point import TradePoint, front
@@ -38,6 +38,7 @@ from ssilk_core.scene.kinematics import deform, resample, sample_motion
 pytestmark = pytest.mark.usefixtures("few_contacts")
 
 FPS = 30.0
+COST = CollisionCost("triangles", 9, 1.0, 0.1, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -276,6 +277,32 @@ def test_a_sweep_that_was_stopped_goes_on(meter, points, tmp_path, monkeypatch):
     older.resume(said.append)
     what = "another version measured its figures ('shown_skin.bare' is missing)"
     assert not older.points and said[-1].text == f"{path}: begun anew, {what}" and said[-1].level == "warning"
+
+
+@pytest.mark.parametrize(
+    ("cost", "what"),
+    [
+        ({"body": "triangles", "vertices": 9, "milliseconds": 1.0, "collision": 0.1}, "'inside' is missing"),
+        ({**asdict(COST), "surface": True}, "'surface' is no field"),
+    ],
+)
+def test_costs_of_an_older_version_are_measured_again_with_all_rows(points, tmp_path, cost, what):
+    path, said = tmp_path / "trade.json", []
+    results = Results(path, {}, [COST])
+    results.add(points["int16"])
+    again = Results(path, {})
+    again.resume(said.append)
+    assert again.collision_costs == [COST] and len(again.points) == 1
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps({**document, "judging": [cost]}))
+    older = Results(path, {})
+    older.resume(said.append)
+    assert not older.points and not older.collision_costs
+    begun = f"{path}: begun anew, another version measured its figures"
+    assert [event.text for event in said[1:]] == [f"{begun} ({what})"]
+    path.write_text(json.dumps({**document, "points": [{**document["points"][0], "shown_skin": 0.5}]}))
+    older.resume(said.append)
+    assert not older.points and said[-1].text == f"{begun} ('shown_skin', '0.5' has no fields)"
 
 
 def test_a_variant_that_fails_is_told_and_the_others_are_measured(meter, points, monkeypatch):
