@@ -11,7 +11,7 @@ import numpy as np
 
 from ...scene.assets import Floats
 from ...scene.kinematics import slerp
-from .file import GlbFile
+from .file import GlbFile, listed
 
 LINEAR, STEP, CUBIC = "LINEAR", "STEP", "CUBICSPLINE"
 SAME = 1e-6  # share of a time by which a key may miss it, since keys are float32
@@ -41,7 +41,8 @@ class NodeChannel:
         Raises:
             KeyError, IndexError, TypeError, ValueError: the document is malformed.
         """
-        sampler, target = animation["samplers"][item["sampler"]], item["target"]
+        sampler, target = listed(animation["samplers"], item["sampler"]), item["target"]
+        listed(file.document["nodes"], target["node"])
         between = sampler.get("interpolation", LINEAR)
         if between not in (LINEAR, STEP, CUBIC):
             raise ValueError(f"interpolation {between}")
@@ -50,7 +51,7 @@ class NodeChannel:
             raise ValueError(f"keys of {target['path']} that do not follow each other")
         values = file.array(sampler["output"]).astype(np.float64)
         shape = (len(times), 3, -1) if between == CUBIC else (len(times), -1)
-        return cls(int(target["node"]), str(target["path"]), times, values.reshape(shape), between)
+        return cls(target["node"], str(target["path"]), times, values.reshape(shape), between)
 
     def at(self, time: float) -> Floats:
         """Return the value at a time [s], shape (width,); before and after its keys it stays as they are."""

@@ -44,6 +44,20 @@ def understood(name: str, found: str, allowed: str, todo: str) -> Iterator[None]
         fail(name, f"{found} ({type(error).__name__}: {error})", allowed, todo)
 
 
+def listed(items: Any, index: Any) -> Any:
+    """Return an item of a list of a document.
+
+    Raises:
+        IndexError: the index is negative, which Python would count from the end, or behind the last item.
+        TypeError: it is no number, or there is no list.
+    """
+    if isinstance(index, bool) or not isinstance(index, int) or not isinstance(items, list):
+        raise TypeError(f"{index!r} is no index")
+    if not 0 <= index < len(items):
+        raise IndexError(f"item {index} of {len(items)}")
+    return items[index]
+
+
 class GlbFile:
     """A glb that was read.
 
@@ -96,7 +110,7 @@ class GlbFile:
         Raises:
             KeyError, IndexError, TypeError, ValueError: the document is malformed.
         """
-        item = self.document["accessors"][index]
+        item = listed(self.document["accessors"], index)
         count, width, kind = item["count"], WIDTHS[item["type"]], COMPONENTS[item["componentType"]]
         if not (isinstance(count, int) and 0 <= count * width * max(kind.itemsize, 4) <= MAX_READ):
             raise ValueError(f"an accessor of {count} values")
@@ -108,13 +122,15 @@ class GlbFile:
             few, of, new = sparse["count"], sparse["indices"], sparse["values"]
             numbers = COMPONENTS[of["componentType"]]
             rows = self._rows(of["bufferView"], of.get("byteOffset", 0), few, 1, numbers)[:, 0]
+            if not (rows >= 0).all():
+                raise IndexError("a sparse value of an element below zero")
             values = values.copy()
             values[rows] = self._rows(new["bufferView"], new.get("byteOffset", 0), few, width, kind)
         return _normalized(values) if item.get("normalized") else values
 
     def _rows(self, view: int, start: int, count: int, width: int, kind: np.dtype[Any]) -> np.ndarray:
         """Return the elements of a buffer view from a byte on, shape (count, width), interleaved or not."""
-        item = self.document["bufferViews"][view]
+        item = listed(self.document["bufferViews"], view)
         size = width * kind.itemsize
         stride, begin = item.get("byteStride", size), item.get("byteOffset", 0)
         if not (stride >= size and count >= 0 and start >= 0 and begin >= 0):
@@ -126,7 +142,7 @@ class GlbFile:
 
     def _buffer(self, index: int) -> bytes:
         if index not in self._buffers:
-            uri = self.document["buffers"][index].get("uri")
+            uri = listed(self.document["buffers"], index).get("uri")
             if uri is None and index == 0:
                 self._buffers[index] = self._binary
             elif str(uri).startswith("data:"):

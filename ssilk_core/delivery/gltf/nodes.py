@@ -10,9 +10,24 @@ import numpy as np
 
 from ...scene.assets import Floats
 from ...scene.kinematics import matrix_from_quaternion
+from .file import listed
 
 USUAL = {"rotation": (0, 0, 0, 1), "translation": (0, 0, 0), "scale": (1, 1, 1)}
 Values = Mapping[tuple[int, str], Floats]  # of a channel's node and path
+
+
+def node_parents(nodes: list[dict[str, Any]]) -> dict[int, int]:
+    """Return the parents of the nodes that have one.
+
+    Raises:
+        IndexError, TypeError: a child is no node of the document.
+    """
+    parents: dict[int, int] = {}
+    for above, item in enumerate(nodes):
+        for child in item.get("children", ()):
+            listed(nodes, child)
+            parents[child] = above
+    return parents
 
 
 def node_transform(
@@ -27,7 +42,7 @@ def node_transform(
         world: transforms that are known, to which this one and those of the nodes above are added.
     """
     if node not in world:
-        item, above = nodes[node], parents.get(node)
+        item, above = listed(nodes, node), parents.get(node)
         own = np.array(item.get("matrix", np.eye(4)), dtype=np.float64).reshape(4, 4).T
         if "matrix" not in item:
             turn, place, scale = (

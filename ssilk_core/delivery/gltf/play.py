@@ -15,8 +15,8 @@ from ...errors import fail
 from ...scene.assets import Floats, Ints
 from .channel import NodeChannel
 from .container import GENERATOR
-from .file import GlbFile, understood
-from .nodes import node_transform
+from .file import GlbFile, listed, understood
+from .nodes import node_parents, node_transform
 from .shot import GARMENT
 
 WRITTEN = "a .glb that 'ssilk bake' wrote is needed"
@@ -81,9 +81,7 @@ class GlbShot:
             channels = [NodeChannel.of(self._file, animation, item) for item in animation["channels"]]
             # What scales nodes above all joints hides them.
             self._channels = [each for each in channels if each.path != "scale" or each.node in joints]
-            self._parents = {
-                child: node for node, item in enumerate(self._nodes) for child in item.get("children", ())
-            }
+            self._parents = node_parents(self._nodes)
             drawn = [node for node, item in enumerate(self._nodes) if "mesh" in item]
             self._surfaces = [_SkinnedSurface(self._file, self._nodes[node], node) for node in drawn]
             self._count = round(max(float(each.times[-1]) for each in channels) * self._rate) + 1
@@ -121,7 +119,7 @@ class GlbShot:
             world: dict[int, Floats] = {}
             found = []
             for surface in surfaces:
-                skin = self._skins[surface.skin]
+                skin = listed(self._skins, surface.skin)
                 placed = [node_transform(joint, self._nodes, self._parents, values, world) for joint in skin.joints]
                 weights = values.get((surface.node, "weights"), surface.weights)
                 found.append(surface.posed(weights, np.stack(placed) @ skin.binds))
@@ -159,18 +157,22 @@ class _SkinnedSurface:
     """A mesh with its morph targets and skinning weights."""
 
     def __init__(self, file: GlbFile, holder: Mapping[str, Any], node: int) -> None:
-        item = file.document["meshes"][holder["mesh"]]
+        item = listed(file.document["meshes"], holder["mesh"])
         (primitive,) = item["primitives"]
         attributes, count = primitive["attributes"], int(item["extras"]["points"])
         if primitive.get("mode", TRIANGLES) != TRIANGLES:
             raise ValueError(f"primitives of mode {primitive['mode']}")
-        self.node, self.skin = node, int(holder["skin"])
+        if count < 0:
+            raise ValueError(f"{count} points")
+        self.node, self.skin = node, holder["skin"]
         rest = file.array(attributes["POSITION"])[:count].astype(np.float64)
         targets = [file.array(target["POSITION"])[:count] for target in primitive.get("targets", ())]
         self.offsets = np.array(targets, dtype=np.float64).reshape(len(targets), *rest.shape)
         self.weights = np.array(item.get("weights", ()), dtype=np.float64)
         sets = [name.partition("_")[2] for name in attributes if name.startswith("JOINTS_")]
         self.joints = np.concatenate([file.array(attributes[f"JOINTS_{each}"])[:count] for each in sets], axis=1)
+        if not (self.joints >= 0).all():
+            raise IndexError("a vertex of a joint below zero")
         self.influences = np.concatenate([file.array(attributes[f"WEIGHTS_{each}"])[:count] for each in sets], axis=1)
         self.rest = rest
         self.mesh = GlbMesh(item["name"], self._faces(file, primitive, attributes), item["extras"]["kind"] == GARMENT)

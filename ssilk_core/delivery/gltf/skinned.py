@@ -13,8 +13,8 @@ import numpy as np
 from ...errors import fail
 from ...scene.assets import Floats
 from .channel import NodeChannel
-from .file import GlbFile, understood
-from .nodes import node_transform
+from .file import GlbFile, listed, understood
+from .nodes import node_parents, node_transform
 
 
 class SkinnedGlb:
@@ -38,9 +38,7 @@ class SkinnedGlb:
         with self._understood():
             document = self._file.document
             self._nodes: list[dict[str, Any]] = document["nodes"]
-            self._parents = {
-                child: above for above, item in enumerate(self._nodes) for child in item.get("children", ())
-            }
+            self._parents = node_parents(self._nodes)
             found = [index for index, item in enumerate(self._nodes) if item.get("name") == node and "skin" in item]
             animations = document.get("animations", [])
             if len(found) != 1 or len(animations) != 1:
@@ -54,7 +52,7 @@ class SkinnedGlb:
             self._read_mesh(document)
 
     def _read_mesh(self, document: Mapping[str, Any]) -> None:
-        item = document["meshes"][self._nodes[self._node]["mesh"]]
+        item = listed(document["meshes"], self._nodes[self._node]["mesh"])
         parts = item["primitives"]
         self.rest = self._joined(part["attributes"]["POSITION"] for part in parts)
         targets = range(len(parts[0].get("targets", ())))
@@ -69,7 +67,9 @@ class SkinnedGlb:
             for kind in both
         )
         self._joints, self._shares = joints.astype(np.int64), shares
-        skin = document["skins"][self._nodes[self._node]["skin"]]
+        if not (self._joints >= 0).all():
+            raise IndexError("a vertex of a joint below zero")
+        skin = listed(document["skins"], self._nodes[self._node]["skin"])
         self._skin: list[int] = list(skin["joints"])
         self._binds = self._file.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2).astype(float)
 
