@@ -15,7 +15,7 @@ import bpy
 
 from ..errors import SetupError
 
-LENT = "ssilk_shot"  # custom property of a mesh that this file owns for an overridden object
+LENT = "ssilk_shot"  # of a mesh that this file owns for an overridden object: the mesh override that it had, or True
 
 
 def origin(thing: bpy.types.ID) -> bpy.types.ID:
@@ -58,7 +58,7 @@ def give_own_mesh(thing: bpy.types.Object) -> None:
     if not is_override(thing) or not (thing.data.library or thing.data.override_library):
         return
     own = own_copy(thing.data)
-    own.name, own[LENT] = f"{thing.name} shot", True
+    own.name, own[LENT] = f"{thing.name} shot", thing.data if thing.data.override_library else True
     thing.data = own
     animation = own.shape_keys.animation_data if own.shape_keys else None
     here = overriding(thing)
@@ -81,8 +81,12 @@ def has_lent_mesh(thing: bpy.types.Object) -> bool:
 
 
 def give_back_mesh(thing: bpy.types.Object) -> None:
-    """Let an overridden object show the linked mesh again; the one that it had here goes."""
-    own, thing.data = thing.data, origin(thing).data
+    """Let an overridden object show the mesh again that it had: the shot's override of one, or the linked one.
+
+    The copy that it had here goes.
+    """
+    own, before = thing.data, thing.data[LENT]
+    thing.data = before if isinstance(before, bpy.types.Mesh) else origin(thing).data
     if not own.users:
         bpy.data.meshes.remove(own)
 

@@ -96,6 +96,32 @@ def test_a_linked_garment_cannot_be_changed_and_says_so(ready, skirt, tmp_path):
         ready.ops.ssilk.paint_classes()
 
 
+@pytest.mark.parametrize("overridden", [False, True])
+def test_a_garment_gets_the_mesh_back_that_it_had(ready, skirt, tmp_path, overridden):
+    """The linked one, or the shot's own override of it, in the file that was opened again as well."""
+    from blender_addon.scene.linked import give_back_mesh, give_own_mesh, has_lent_mesh
+
+    path, shot = str(tmp_path / "garment.blend"), str(tmp_path / "shot.blend")
+    ready.data.libraries.write(path, {skirt})
+    ready.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with ready.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.objects = ["Skirt"]
+    garment = wanted.objects[0].override_create()
+    ready.context.scene.collection.objects.link(garment)
+    if overridden:
+        garment.data = garment.data.override_create()
+        garment.data.name = "Skirt of the shot"
+    before = garment.data.name
+    give_own_mesh(garment)
+    assert garment.data.name == "Skirt shot" and has_lent_mesh(garment)
+    ready.ops.wm.save_as_mainfile(filepath=shot)
+    ready.ops.wm.open_mainfile(filepath=shot)
+    (garment,) = ready.context.scene.objects
+    give_back_mesh(garment)
+    assert garment.data.name == before and bool(garment.data.override_library) == overridden
+    assert "Skirt shot" not in ready.data.meshes and not has_lent_mesh(garment)
+
+
 def test_classes_survive_linking(ready, skirt, tmp_path):
     from blender_addon.scene.classes import read_classes
 
