@@ -111,7 +111,7 @@ def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     assert again.returncode == 0 and again.stdout.count("current True") == 2, again.stdout
     assert "Session ended successfully" in again.stdout and "openjd_progress: 100.0" in again.stdout, again.stdout
     assert set(layers("bundle/layers")) == {
-        "assets/model/asset.usda", "assets/model/geometry.usdc",
+        "assets/model/asset.usda", "assets/model/geometry.usdc", "assets/model/info.usda",
         *(f"shots/{shot}/{name}" for shot in SHOTS for name in ("shot.usda", "model/anim.usdc")),
     }  # fmt: skip
 

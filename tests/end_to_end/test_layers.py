@@ -75,7 +75,7 @@ def garment_points(path: Path | Usd.Stage, times: list[float] | None = None) -> 
 def test_an_asset_that_stays_and_a_small_layer_for_each_shot(world):
     folder = world / "layers"
     assert set(hashes(folder)) == {
-        "assets/skirt/asset.usda", "assets/skirt/geometry.usdc", "assets/skirt/used.json",
+        *(f"assets/skirt/{name}" for name in ("asset.usda", "geometry.usdc", "info.usda", "used.json")),
         *(f"shots/{shot}/shot.usda" for shot in ("walk", "run")),
         *(f"shots/{shot}/skirt/{name}" for shot in ("walk", "run") for name in SHOT_FILES),
     }  # fmt: skip
@@ -302,6 +302,27 @@ def test_assets_say_who_they_are_and_of_which_version(copy, capsys):
     capsys.readouterr()
     assert bake("--motion walk.usda --asset-version 'v\x1b[1m' -o odd.usdc") == 2
     assert "1 to 1000 printable characters are allowed" in capsys.readouterr().err
+
+
+def test_a_version_is_of_the_asset_and_bakes_no_other_shot_again(copy, capsys):
+    before = hashes(Path("layers"))
+    assert bake("--motion walk.usda --points -o layers --asset-version v012") == 0
+    after = hashes(Path("layers"))
+    changed = {name for name in after if before.get(name) != after[name]}
+    own = {f"shots/walk/skirt/{name}" for name in SHOT_FILES}
+    assert {"assets/skirt/info.usda", "assets/skirt/used.json"} == changed - own
+    for words in ("", "--asset-version v012"):  # nothing is to be done, and nothing is taken back
+        events = said(capsys, f"--motion walk.usda run.usda --points -o layers {words}")
+        assert [event["detail"].get("current") for event in events if event["event"] == "result"] == [True, True]
+        assert hashes(Path("layers")) == after
+    for words in ("bake {} -o layers", "farm {} -o layers --bundle job"):
+        command = words.format("skirt.safetensors --stage rigged.usda --motion run.usda --asset-version v013")
+        assert main(shlex.split(command)) == 2
+        told = "the garment 'skirt' was baked with --asset-version 'v012', not 'v013'; all its shots share one asset"
+        assert told in capsys.readouterr().err and hashes(Path("layers")) == after
+    assert bake("--motion run.usda --points -o layers --asset-version v013 --replace") == 0
+    stage = Usd.Stage.Open("layers/shots/run/shot.usda")
+    assert Usd.ModelAPI(stage.GetPrimAtPath("/Shot/skirt")).GetAssetVersion() == "v013"
 
 
 def test_a_package_is_what_arkit_takes(copy, capsys):

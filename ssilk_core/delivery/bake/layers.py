@@ -19,7 +19,7 @@ from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
 from .levels import need_levels
 from .load import LoadedGarment, load_garment
-from .names_used import GarmentUse, UsedNames, need_distinct_case, write_use
+from .names_used import GarmentUse, UsedNames, need_distinct_case, says, write_use
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
@@ -131,10 +131,13 @@ class LayerFolder:
 
     def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
         """Return whether a task is done with inputs that hold this, and its files are as they were written."""
-        return (
-            has_possible_names(task)
-            and current_record(self._home(task), task_key(task, contents), self._files.sha256) is not None
-        )
+        return self._done(task, contents) is not None
+
+    def _done(self, task: BakeTask, contents: InputHashes) -> TaskRecord | None:
+        """Return the record of a task that is done, with an asset that says of itself what the task asks for."""
+        if not (has_possible_names(task) and says(self.path, task) and self.layout(task).info.is_file()):
+            return None
+        return current_record(self._home(task), task_key(task, contents), self._files.sha256)
 
     def need_names(self, tasks: Iterable[BakeTask], *, complete: bool = True) -> None:
         """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
@@ -169,7 +172,7 @@ class LayerFolder:
         need_possible_names(task)
         layout, home = self.layout(task), self._home(task)
         wanted = task.pinned or self.inputs.hashes(task.request)
-        if not again and (record := current_record(home, task_key(task, wanted), self._files.sha256)):
+        if not again and (record := self._done(task, wanted)):
             return replace(record.result, current=True)
         need_levels(self.path, [task], complete=False)
         self._need_inputs([task])
@@ -181,8 +184,9 @@ class LayerFolder:
         rollout.tell(report)
         check_influences(rollout.influences, request.target, request.model)
         key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
-        write_use(self.path, task.garment, GarmentUse(inputs["model"], request.root))  # no asset is without it
-        asset = self._asset(task, garment, layout, report)
+        use = GarmentUse.of(task, inputs["model"], self.path)
+        write_use(self.path, task.garment, use)  # no asset is without it
+        asset = self._asset(task, garment, use, report)
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
         record = TaskRecord(
@@ -195,11 +199,13 @@ class LayerFolder:
         """Return the folder of the files that a task alone writes."""
         return self.layout(task).animation.parent
 
-    def _asset(self, task: BakeTask, garment: LoadedGarment, layout: Layout, report: Reporter) -> WrittenAsset:
+    def _asset(self, task: BakeTask, garment: LoadedGarment, use: GarmentUse, report: Reporter) -> WrittenAsset:
         """Return the asset of a task, written unless the last task left the same."""
-        asked = (garment, task.include_body, layout.asset)
-        if self._written is None or self._written[0] != asked or not self._is_there(self._written[1]):
-            self._written = (asked, _write_asset(layout, garment, task, report))
+        layout = self.layout(task)
+        asked = (garment, task.include_body, layout.asset, use)
+        there = layout.info.is_file() and self._written is not None and self._is_there(self._written[1])
+        if self._written is None or self._written[0] != asked or not there:
+            self._written = (asked, _write_asset(layout, garment, task, use, report))
         return self._written[1]
 
     def _is_there(self, asset: WrittenAsset) -> bool:
@@ -252,17 +258,20 @@ def _as_one(errors: Sequence[SsilkError], shots: int) -> SsilkError:
     return SsilkError(f"{len(errors)} of {shots} shots have no current stage; the first: {errors[0]}")
 
 
-def _write_asset(layout: Layout, garment: LoadedGarment, task: BakeTask, report: Reporter) -> WrittenAsset:
+def _write_asset(
+    layout: Layout, garment: LoadedGarment, task: BakeTask, use: GarmentUse, report: Reporter
+) -> WrittenAsset:
     """Write the asset of a task where it is not there already; warn of changes that layers above may rely on."""
     from ssilk_usd.shots import layers
 
+    version, identifier = use.asset_version or garment.info.version, use.asset_identifier or ""
     written = layers.write_asset(
         layout,
         garment.deformer,
         garment.units,
         include_body=task.include_body,
         record=garment.record,
-        info=garment.info,
+        info=replace(garment.info, version=version, identifier=identifier),
         lean=task.request.receiver.lean,
     )
     for change in written.changes:

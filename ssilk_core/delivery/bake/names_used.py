@@ -15,20 +15,40 @@ from ...files import replacing, split_location
 from ...scene.plain import from_plain
 from .inputs import InputContents, model_contents, stage_contents
 from .record import RECORD, RecordedInput, TaskRecord, portable, read_record
-from .task import BakeTask
+from .task import OF_ASSET, BakeTask
 
 USED = "used.json"
 
 
 @dataclass(frozen=True)
 class GarmentUse:
-    """What the name of a garment was used for: its model, and the SkelRoot, where one was named.
+    """What the name of a garment was used for.
 
     It lies beside the asset, so that a task need not look for the garment in all shots.
+
+    Attributes:
+        model: of the garment.
+        root: the SkelRoot, where one was named.
+        asset_version, asset_identifier: of the asset, where they were given.
     """
 
     model: RecordedInput
     root: str | None
+    asset_version: str | None = None
+    asset_identifier: str | None = None
+
+    @classmethod
+    def of(cls, task: BakeTask, model: RecordedInput, folder: Path) -> GarmentUse:
+        """Return what a task uses its garment's name for in a folder: what it does not say of the asset stays, as
+        long as the model is the same."""
+        before = _stated(_place(folder, task.garment))
+        same = before is not None and before.model.sha256 == model.sha256
+        told = {name: getattr(task, name) or (getattr(before, name) if same else None) for name in OF_ASSET}
+        return cls(model, task.request.root, **told)
+
+    def says(self, task: BakeTask) -> bool:
+        """Return whether the asset says of itself what a task asks for."""
+        return all(getattr(task, name) in (None, getattr(self, name)) for name in OF_ASSET)
 
 
 def write_use(folder: Path, garment: str, use: GarmentUse) -> None:
@@ -59,6 +79,14 @@ def read_use(folder: Path, garment: str) -> GarmentUse | None:
             "name this garment with --garment-name, or use the name all the same with --replace",
         )
     return found
+
+
+def says(folder: Path, task: BakeTask) -> bool:
+    """Return whether the asset of a task says of itself what the task asks for; True where it asks for nothing."""
+    if all(getattr(task, name) is None for name in OF_ASSET):
+        return True
+    use = _stated(_place(folder, task.garment))
+    return use is not None and use.says(task)
 
 
 def _stated(path: Path) -> GarmentUse | None:
@@ -112,8 +140,9 @@ class UsedNames:
         self._garments: dict[str, GarmentUse | None] = {}
 
     def check(self, task: BakeTask) -> None:
-        """Raise `SsilkError` where the names of a task were used for another motion, model or SkelRoot, or where it
-        would replace a garment of which no record tells what it was baked from."""
+        """Raise `SsilkError` where the names of a task were used for another motion, model or SkelRoot, where it
+        would replace a garment of which no record tells what it was baked from, or where it asks for another version
+        or identifier than the asset of the same model has."""
         request, shot = task.request, self._shot(task.shot)
         motions = [record.inputs["motion"] for record in shot.values() if record]
         for motion in motions:
@@ -135,6 +164,21 @@ class UsedNames:
         if used.root != request.root:
             roots = (f"{request.model}:{root}" if root else request.model for root in (used.root, request.root))
             self._fail("garment", task.garment, *roots)
+        self._check_info(task)
+
+    def _check_info(self, task: BakeTask) -> None:
+        stated = _stated(_place(self.folder, task.garment))
+        if stated is None:
+            return
+        for name, option in OF_ASSET.items():
+            before, now = getattr(stated, name), getattr(task, name)
+            if before and now and before != now and stated.model.sha256 == model_contents(task.request.model).digest:
+                fail(
+                    str(_place(self.folder, task.garment)),
+                    f"the garment '{task.garment}' was baked with {option} '{before}', not '{now}'",
+                    "all its shots share one asset",
+                    f"leave {option} out, or give its asset another one with --replace",
+                )
 
     def _shot(self, name: str) -> dict[str, TaskRecord | None]:
         """Return the records of the garments in a shot; None for one that is damaged."""

@@ -117,5 +117,5 @@ def _is_baked(file: Path, shot: Path) -> bool:
     """
     of_garment = (file.parent / RECORD).is_file()
     of_shot = file.name == "shot.usda" and any(file.parent.glob(f"*/{RECORD}"))
-    of_asset = file.name in ("asset.usda", "geometry.usdc") and file.parent.parent.name == "assets"
+    of_asset = file.name in ("asset.usda", "geometry.usdc", "info.usda") and file.parent.parent.name == "assets"
     return file.samefile(shot) or of_garment or of_shot or of_asset

@@ -17,7 +17,7 @@ from ...work_record import Hash, WorkRecord, request_key
 from .inputs import InputHashes
 from .request import INPUTS, BakeRequest
 from .result import BakeResult
-from .task import BakeTask
+from .task import OF_ASSET, BakeTask
 
 RECORD = "bake.json"
 
@@ -63,7 +63,8 @@ def task_key(task: BakeTask, contents: InputHashes) -> str:
         contents: what the request's inputs hold.
     """
     options = asdict(task)
-    del options["pinned"], options["replace"]
+    for name in ("pinned", "replace", *OF_ASSET):
+        del options[name]
     for name in INPUTS:
         del options["request"][name]
     return request_key({"ssilk": __version__, "options": options}, [*asdict(contents).items()])

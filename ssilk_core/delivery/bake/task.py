@@ -15,6 +15,7 @@ from .naming import file_name, location_stem, need_unique, prim_leaf, prim_name
 from .request import BakeRequest, need_body
 
 LONGEST_NAME = 255  # [bytes] of a file or folder
+OF_ASSET = {"asset_version": "--asset-version", "asset_identifier": "--asset-identifier"}  # and their options
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +32,8 @@ class BakeTask:
         pinned: what its inputs have to hold, as they did when its job was submitted; None for whatever they hold.
         replace: bake even where one of the names was used for another input.
         level_of: name of the garment of its shot that it is a level of quality of; None for one of its own.
+        asset_version, asset_identifier: as the request asks for them. They are of the asset, which shots share, and
+            none of them is baked again for another version.
     """
 
     garment: str
@@ -42,6 +45,8 @@ class BakeTask:
     pinned: InputHashes | None = None
     replace: bool = False
     level_of: str | None = None
+    asset_version: str | None = None
+    asset_identifier: str | None = None
 
     @property
     def name(self) -> str:
@@ -67,8 +72,8 @@ def plan_layers(
         replace_names: bake even where a name was used for another input before.
 
     Raises:
-        SsilkError: two garments or two shots would have one name, or a request is not for layers: its target takes
-            none, or all shots of a garment could not share one asset.
+        SsilkError: two garments or two shots would have one name, a garment two versions or identifiers, or a request
+            is not for layers: its target takes none, or all shots of a garment could not share one asset.
     """
     requests = list(requests)
     _need_for_layers(requests, include_body)
@@ -76,12 +81,16 @@ def plan_layers(
         BakeTask(
             garment=_garment_name(request),
             shot=_shot_name(request),
-            request=replace(request, garment=None, shot=None, level_of=None),
+            request=replace(
+                request, garment=None, shot=None, level_of=None, asset_version=None, asset_identifier=None
+            ),
             include_body=include_body,
             points=points or request.writes_points,
             verify=verify,
             replace=replace_names,
             level_of=prim_name(request.level_of) if request.level_of else None,
+            asset_version=request.asset_version,
+            asset_identifier=request.asset_identifier,
         )
         for request in requests
     ]
@@ -91,6 +100,7 @@ def plan_layers(
             fail(task.request.model, found, allowed, "name it with --garment-name")
     need_unique([(task.garment, _worn(task.request)) for task in tasks], "MODEL", "garment", "--garment-name")
     need_unique([(task.shot, task.request.motion) for task in tasks], "--motion", "shot", "--shot-name or --shots")
+    _need_one_info(tasks)
     order = list(dict.fromkeys(task.garment for task in tasks))
     seen: set[str] = set()
     for task in tasks:
@@ -98,6 +108,16 @@ def plan_layers(
             fail(task.request.model, f"'{task.name}' is to be baked twice", "a garment is baked once in a shot")
         seen.add(task.name)
     return sorted(tasks, key=lambda task: order.index(task.garment))
+
+
+def _need_one_info(tasks: Iterable[BakeTask]) -> None:
+    """Check that the shots of each garment ask for one version and one identifier of its asset."""
+    first: dict[tuple[str, str], str] = {}
+    for task in tasks:
+        for name, option in OF_ASSET.items():
+            if (asked := getattr(task, name)) and first.setdefault((task.garment, name), asked) != asked:
+                both = f"'{first[task.garment, name]}' and '{asked}' for the garment '{task.garment}'"
+                fail(option, both, "all its shots share one asset", "give one of them")
 
 
 def has_possible_names(task: BakeTask) -> bool:

@@ -98,6 +98,14 @@ def test_requests_that_cannot_share_an_asset_are_refused(change, says):
         plan_layers([replace(REQUEST, **change)])
 
 
+def test_shots_of_one_garment_ask_for_one_version():
+    asked = [replace(REQUEST, motion=name, asset_version=version) for name, version in (("a", "v1"), ("b", "v2"))]
+    with pytest.raises(SsilkError, match="--asset-version: 'v1' and 'v2' for the garment 'cape'; all"):
+        plan_layers(asked)
+    (task,) = plan_layers(asked[:1])
+    assert task.asset_version == "v1" and task.request.asset_version is None
+
+
 def test_refined_points_are_written_beside_the_joints():
     assert [task.points for task in plan_layers([replace(REQUEST, refine=2, refined_output="points")])] == [True]
     assert [task.points for task in plan_layers([replace(REQUEST, refine=2)])] == [False]
@@ -126,6 +134,7 @@ def test_a_key_is_of_all_that_decides_what_is_written():
     assert len({key, *others}) == len(others) + 1
     moved = replace(TASK, request=replace(REQUEST, model="/elsewhere/cape.safetensors"))
     assert task_key(moved, CONTENTS) == key
+    assert task_key(replace(TASK, asset_version="v1", asset_identifier="studio:/cape"), CONTENTS) == key
 
 
 def result(path: Path) -> BakeResult:

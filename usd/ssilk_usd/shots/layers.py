@@ -3,6 +3,7 @@
 
     FOLDER/assets/cape/asset.usda        component; payload and variants
     FOLDER/assets/cape/geometry.usdc     the payload: meshes, skeleton, blendshapes
+    FOLDER/assets/cape/info.usda         a sublayer of the component: what it says of itself, such as its version
     FOLDER/assets/cape/used.json         what the name is used for; `ssilk_core.delivery.bake.names_used` writes it
     FOLDER/shots/walk/cape/anim.usdc     what moves; opens by itself
     FOLDER/shots/walk/cape/points.usdc   a point cache, where one is asked for
@@ -63,6 +64,10 @@ class Layout:
         return self.asset.with_name("geometry.usdc")
 
     @property
+    def info(self) -> Path:
+        return self.asset.with_name("info.usda")
+
+    @property
     def animation(self) -> Path:
         return self.folder / "shots" / self.shot / self.garment / "anim.usdc"
 
@@ -82,7 +87,7 @@ class WrittenAsset:
     Attributes:
         asset: the paths of its prims.
         changes: that may break stronger layers.
-        digests: path and SHA-256 of each file.
+        digests: path and SHA-256 of each file that shots depend on: not of what the asset says of itself.
     """
 
     asset: Asset
@@ -105,7 +110,8 @@ def write_asset(
     Args:
         include_body: with the body meshes.
         record: how the garment was made, kept on its mesh.
-        info: of the asset; its identifier is the asset's own layer where none is given.
+        info: of the asset, in a layer of its own, so that another version makes no shot stale; its identifier is the
+            asset's own layer where none is given.
         lean: with the translation of the SkelRoot by which lean shots move it (see `samples.Samples`), so that they
             are value clips of the asset alone.
 
@@ -124,9 +130,11 @@ def write_asset(
         box = _extent(stage, asset)
         del stage
         geometry = sha256(temporary)
+    _write_info(layout, asset, info or AssetInfo())
     with replacing(layout.asset, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
-        _define_component(stage, asset, layout, box, info or AssetInfo())
+        stage.GetRootLayer().subLayerPaths.append(f"./{layout.info.name}")
+        _define_component(stage, asset, layout, box)
         if lean:
             _define_path(stage.GetDefaultPrim()).Set(Gf.Vec3d(0))
         free_when_closed(stage.GetUsedLayers())
@@ -135,6 +143,16 @@ def write_asset(
         component = sha256(temporary)
     changes = unknown if before is None else asset_facts(layout.asset).changes_since(before)
     return WrittenAsset(asset, changes, ((layout.geometry, geometry), (layout.asset, component)))
+
+
+def _write_info(layout: Layout, asset: Asset, info: AssetInfo) -> None:
+    """Write what an asset says of itself."""
+    with replacing(layout.info, keep_same=True) as temporary:
+        stage = Usd.Stage.Open(Sdf.Layer.CreateNew(str(temporary)), None)
+        identifier = info.identifier or f"./{layout.asset.name}"
+        author_asset_info(stage.OverridePrim(asset.root), layout.garment, replace(info, identifier=identifier))
+        save(stage.GetRootLayer(), layout.info)
+        del stage
 
 
 def _facts_before(layout: Layout) -> tuple[AssetFacts | None, tuple[str, ...]]:
@@ -154,15 +172,11 @@ def _extent(stage: Usd.Stage, asset: Asset) -> Vt.Vec3fArray:
     return extent_array(corners[:, 0].min(axis=0), corners[:, 1].max(axis=0))
 
 
-def _define_component(
-    stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray, info: AssetInfo
-) -> None:
+def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Vec3fArray) -> None:
     """Define the SkelRoot over its payload, with bounds that need no payload, and the variants."""
     root = UsdSkel.Root.Define(stage, asset.root).GetPrim()
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    identifier = info.identifier or f"./{layout.asset.name}"
-    author_asset_info(root, layout.garment, replace(info, identifier=identifier))
     UsdGeom.Boundable(root).CreateExtentAttr(box)
     root.GetPayloads().AddPayload(f"./{layout.geometry.name}", asset.root)
     with _variant(root, DEFORMATION, "rest"):
