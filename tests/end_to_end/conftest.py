@@ -136,6 +136,17 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
     return Toy(folder, TRAINING, write_clip)
 
 
+@pytest.fixture(scope="session")
+def glb_world(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy, sway.usda of six frames, and all.glb, a verified bake of it that nobody writes to."""
+    folder = toy.copy(tmp_path_factory.mktemp("glb"))
+    toy.write_clip(folder / "sway.usda", frames=6)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert run("bake model.safetensors --stage rigged.usda --motion sway.usda --target glb -o all.glb") == 0
+    return folder
+
+
 @pytest.fixture
 def copy(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the module's `world`, the current folder."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import struct
 from pathlib import Path
 
@@ -116,14 +117,13 @@ def run(words: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def world(toy, tmp_path_factory):
+def world(glb_world, tmp_path_factory):
     """Bakes of the toy as glb (five influences in two sets), as glb4, and the same as stages of USD."""
-    folder = toy.copy(tmp_path_factory.mktemp("glb"))
-    toy.write_clip(folder / "sway.usda", frames=6)
+    folder = shutil.copytree(glb_world, tmp_path_factory.mktemp("glb"), dirs_exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         bake = "bake model.safetensors --stage rigged.usda --motion sway.usda"
-        assert run(f"{bake} --target glb -o all.glb") == 0 and run(f"{bake} --target glb4 -o four.glb") == 0
+        assert run(f"{bake} --target glb4 -o four.glb") == 0
         assert run(f"{bake} -o all.usdc --no-verify") == 0
         assert run(f"{bake} --target game4 -o four.usdc --no-verify") == 0
     return folder

@@ -39,13 +39,6 @@ def world(toy, tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def copy(world, tmp_path, monkeypatch):
-    shutil.copytree(world, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def bake(models: str, words: str) -> int:
     return main(shlex.split(f"bake {models} --stage rigged.usda --no-verify {words}"))
 
