@@ -67,7 +67,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
     from ssilk_usd.reading.facts import animated
-    from ssilk_usd.reading.shapes import tell_animated_shapes
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
@@ -76,8 +75,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
-    paths = [motion.path for motion in motions]
-    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
+    shared.tell_shapes(options, motions, report)
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,

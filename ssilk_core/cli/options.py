@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from ..delivery.bake import BakeRequest, naming
 from ..delivery.bake.request import (
+    ALL_ELEMENTS,
     LATENT_ELEMENTS,
     MAX_HANDLES,
     MAX_PRE_ROLL,
@@ -29,7 +31,7 @@ from ..scene.kinematics import MAX_FPS, MIN_FPS
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
-    from ..scene.assets import Character, Garment, ProxyRig, Scene, SurfaceMaterial
+    from ..scene.assets import Character, Garment, Motion, ProxyRig, Scene, SurfaceMaterial
 
 
 STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
@@ -222,7 +224,7 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--latent-elements",
         choices=LATENT_ELEMENTS,
-        default=LATENT_ELEMENTS[0],
+        default=ALL_ELEMENTS,
         help="that solver sums the energy over the whole garment (default), or over few of its elements: five "
         "times as fast, less exact in wild motion",
     )
@@ -341,6 +343,14 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     if not options.stage.exists():
         fail(str(options.stage), "there is no such file", "a USD stage with a character is needed")
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
+
+
+def tell_shapes(options: argparse.Namespace, motions: Iterable[Motion], report: Reporter) -> None:
+    """Warn of motions that change the character's shape, in which cloth does not meet it; options as `load_scene`."""
+    from ssilk_usd.reading.shapes import tell_animated_shapes
+
+    paths = [motion.path for motion in motions]
+    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
 
 
 def load_scene(

@@ -82,7 +82,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Simulate and write."""
     from ssilk_usd.reading.frame_range import read_in_range
     from ssilk_usd.reading.motion import motion_files
-    from ssilk_usd.reading.shapes import tell_animated_shapes
 
     from ..devices import select_device
     from ..physics.simulate import SimulationOptions
@@ -104,8 +103,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
-    paths = [motion.path for motion in motions]
-    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
+    shared.tell_shapes(options, motions, report)
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric))
         for output, motion, path in zip(outputs, motions, options.motion)

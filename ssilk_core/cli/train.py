@@ -128,7 +128,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
     """Read everything that the options name; return it as a `TrainJob` on a device."""
     from ssilk_usd.reading.motion import motion_files, read_motions
-    from ssilk_usd.reading.shapes import tell_animated_shapes
 
     from ..files import sha256
     from ..network.checkpoint import load_model
@@ -144,8 +143,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
-    paths = [motion.path for motion in (*motions, *held)]
-    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
+    shared.tell_shapes(options, (*motions, *held), report)
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))

@@ -17,7 +17,8 @@ from ..targets import TARGETS, Target
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
-LATENT_ELEMENTS = ("all", "few")
+ALL_ELEMENTS, FEW_ELEMENTS = "all", "few"
+LATENT_ELEMENTS = (ALL_ELEMENTS, FEW_ELEMENTS)
 MAX_SAMPLES_PER_FRAME = 64
 MAX_PRE_ROLL = 600.0  # [s]
 MAX_REFINE = 10_000
@@ -80,7 +81,7 @@ class BakeRequest:
     refine: int = 0
     feedback: bool = False
     latent_iterations: int = 0
-    latent_elements: str = LATENT_ELEMENTS[0]
+    latent_elements: str = ALL_ELEMENTS
     refined_output: str = "joints"
     hide_covered: bool = False
     keep: ModelSize | None = None
@@ -142,6 +143,11 @@ class BakeRequest:
     def writes_points(self) -> bool:
         """Whether the garment is refined and written as points instead of joints."""
         return self.refine != 0 and self.refined_output == "points"
+
+    @property
+    def samples_elements(self) -> bool:
+        """Whether the solver in latents sums its energy over a sample of the garment's elements."""
+        return self.latent_elements == FEW_ELEMENTS
 
     @property
     def receiver(self) -> Target:

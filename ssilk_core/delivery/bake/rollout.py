@@ -149,7 +149,7 @@ class BakeRollout:
 
         assert self.model is not None
         request = self.request
-        options = LatentOptions(iterations=request.latent_iterations, sampled=request.latent_elements == "few")
+        options = LatentOptions(iterations=request.latent_iterations, sampled=request.samples_elements)
         return LatentRoller(self.model, self.fabric, options, pre_roll=self.request.pre_roll, advanced=advanced)
 
     def latent_frames(self) -> int:

@@ -69,6 +69,10 @@ def test_values_out_of_range_are_refused(change, says):
         BakeRequest(**INPUTS, **change)
 
 
+def test_few_elements_are_sampled():
+    assert CHANGED.samples_elements and not BakeRequest(**INPUTS).samples_elements
+
+
 def test_paths_are_as_good_as_text():
     assert BakeRequest(**{name: Path(value) for name, value in INPUTS.items()}) == BakeRequest(**INPUTS)
 
