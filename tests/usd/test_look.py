@@ -260,6 +260,20 @@ def test_a_package_holds_its_textures(hero, tmp_path):
     assert not UsdUtils.ComputeAllDependencies(str(tmp_path / "shot.usdz"))[2]
 
 
+def test_a_texture_that_is_not_found_is_told_and_what_only_metadata_names_is_not(hero, tmp_path):
+    (tmp_path / "assets" / "textures" / "linen.png").unlink()
+    said = []
+    with packaged(tmp_path / "temporary.usdz", said.append, name="shot.usdz") as layer:
+        shoot(worn(hero), layer)
+        stage = Usd.Stage.Open(str(layer))
+        Usd.ModelAPI(stage.GetDefaultPrim()).SetAssetIdentifier(Sdf.AssetPath("studio:/cape"))
+        stage.Save()
+        del stage
+    (told,) = said
+    assert told.level == "warning" and told.text.startswith("shot.usdz: the texture '")
+    assert "textures/linen.png' is not found, and not in the package" in told.text
+
+
 @pytest.mark.parametrize("tiles", [("linen.png",), ("linen.1001.png", "linen.1002.png")])
 def test_a_package_holds_textures_that_came_in_another_package(hero, tmp_path, tiles):
     for tile in tiles:

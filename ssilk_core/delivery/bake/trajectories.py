@@ -126,7 +126,7 @@ def skin_trajectories(
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
     verification: Verification | None = None
     with replacing(path) as unverified:
-        with packaged(unverified) as layer:
+        with packaged(unverified, report, name=path) as layer:
             common: dict[str, Any] = {
                 "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said
             }  # fmt: skip

@@ -124,7 +124,7 @@ def _write_verified(
     from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
-        with packaged(unverified) as layer:
+        with packaged(unverified, report, name=output) as layer:
             summary = _write(layer, rollout, output, include_body, hidden)
             shown = state_rollout_skin(layer, rollout)
         if not verify:

@@ -16,6 +16,7 @@ from pathlib import Path
 from pxr import Ar, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.errors import fail
+from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.files import replacing
 
 from ..names import LAYER_SUFFIXES
@@ -67,8 +68,12 @@ def export(layer: Sdf.Layer, out: str | Path) -> None:
 
 
 @contextmanager
-def packaged(out: str | Path) -> Iterator[Path]:
+def packaged(out: str | Path, report: Reporter = silent, *, name: str | Path = "") -> Iterator[Path]:
     """Yield the path of a layer to write: `out`, or for .usdz a temporary layer that is then packed into `out`.
+
+    Args:
+        report: is told which textures are not found, and are not in the package.
+        name: what messages call `out`, where that is not its name yet.
 
     Raises:
         OSError: the package cannot be written.
@@ -80,15 +85,22 @@ def packaged(out: str | Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir=out.parent) as folder:
         layer = Path(folder) / PACKED
         yield layer
-        _pack(layer, out)
+        if lost := _pack(layer, out):
+            more = f" and {len(lost) - 1} more are" if len(lost) > 1 else " is"
+            text = f"the texture '{lost[0]}'{more} not found, and not in the package; viewers elsewhere show none"
+            report(Message(f"{name or out}: {text}; correct the path in the stage, and bake again", "warning"))
 
 
-def _pack(layer: Path, out: Path) -> None:
+def _pack(layer: Path, out: Path) -> list[str]:
     """Write a package of a layer and its textures: a zip without compression, data 64 bytes aligned, as USD maps it.
 
     USD's own function stores times of day, so that no two packages are alike.
+
+    Returns:
+        The paths of textures that are not found.
     """
-    files = {layer.name: layer, **_gathered(layer)}
+    found, lost = _gathered(layer)
+    files = {layer.name: layer, **found}
     with zipfile.ZipFile(out, "w") as package:
         for name, file in files.items():
             entry = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
@@ -97,20 +109,23 @@ def _pack(layer: Path, out: Path) -> None:
             entry.extra = struct.pack("<HH", EXTRA_FIELD, padding) + bytes(padding)
             with file.open("rb") as source, package.open(entry, "w") as target:
                 shutil.copyfileobj(source, target)
+    return lost
 
 
-def _gathered(path: Path) -> dict[str, Path]:
-    """Rename the textures of a layer to their names in a package; return these with their files.
+def _gathered(path: Path) -> tuple[dict[str, Path], list[str]]:
+    """Rename the textures of a layer to their names in a package; return these with their files, and those not found.
 
     Textures in other packages are unpacked into the layer's folder, which is temporary.
     """
     layer, found, folders = Sdf.Layer.FindOrOpen(str(path)), dict[str, Path](), dict[str, str]()
+    missing: set[str] = set()
 
     def packaged_name(name: str) -> str:
         file = _unpacked(name, path.parent) if Ar.IsPackageRelativePath(name) else path.parent / name
         tiles = sorted(file.parent.glob(file.name.replace(UDIM, "[0-9]" * 4))) if UDIM in name else [file]
         tiles = [tile for tile in tiles if name and tile.is_file()]
         if not tiles:
+            missing.add(name)
             return name
         folder = folders.setdefault(str(file.parent.resolve()), f"textures/{len(folders)}")
         found.update({f"{folder}/{tile.name}": tile for tile in tiles})
@@ -119,7 +134,20 @@ def _gathered(path: Path) -> dict[str, Path]:
     UsdUtils.ModifyAssetPaths(layer, packaged_name)
     if found:
         save(layer, path)
-    return found
+    return found, sorted(missing.intersection(_files_of_attributes(layer)))
+
+
+def _files_of_attributes(layer: Sdf.Layer) -> set[str]:
+    """Return the files that attributes name, as shaders name textures; metadata may name what nobody opens."""
+    names: set[str] = set()
+
+    def visit(path: Sdf.Path) -> None:
+        spec = layer.GetAttributeAtPath(path) if path.IsPropertyPath() else None
+        if spec and spec.typeName == Sdf.ValueTypeNames.Asset and spec.default:
+            names.add(spec.default.path)
+
+    layer.Traverse(Sdf.Path.absoluteRootPath, visit)
+    return names - {""}
 
 
 def _unpacked(name: str, home: Path) -> Path:
