@@ -18,7 +18,7 @@ from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
 from ..motions.sources import FILE, TIMELINE, Source, sources
 from ..outside import jobs
-from ..outside.wording import remember
+from ..outside.wording import BONES, remember
 from ..outside.work import Work
 from ..playback import models, playing
 from ..playback.bake import need_bakeable
@@ -185,6 +185,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         folder = jobs.create(trainings_folder(), identifiers([name])[0])
         given = hand_over(self.scene, self.pair, folder)
         remember(folder, {**given.words, **self.chosen.words, jobs.MODEL: f"the model of '{name}'"})
+        remember(folder, given.scene.joints.bones, BONES)
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         files = [beside(path, folder) for path in self.chosen.files]
         command = train_command(garment, given.prim, self.chosen.names, files)

@@ -18,7 +18,7 @@ from typing import Any
 from ..errors import SetupError
 from .process import environment
 from .runner import BEAT, CANCEL, ORDER, STATE
-from .wording import recall, reworded
+from .wording import BONES, recall, reworded, with_bones
 
 MODEL, TRAINING_STATE = "model.safetensors", "model.resume.safetensors"  # both as `ssilk train` writes them
 OWNER = "training.json"  # what is trained, as `own` wrote it
@@ -198,8 +198,8 @@ def read_state(folder: Path) -> JobState | None:
     if "state" not in known:
         return None
     if said := {name: known[name] for name in ("text", "error") if known.get(name)}:
-        names = recall(folder)
-        known.update({name: reworded(sentence, folder, names) for name, sentence in said.items()})
+        names, bones = recall(folder), recall(folder, BONES)
+        known.update({name: with_bones(reworded(text, folder, names), bones) for name, text in said.items()})
     known["cancelled"] = (folder / CANCEL).exists()
     state = JobState(**known)
     if state.alive and time.time() - state.beat > SILENCE:

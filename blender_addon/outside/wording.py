@@ -12,19 +12,19 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-NAMES = "names.json"  # in a folder that outlives Blender
+NAMES, BONES = "names.json", "bones.json"  # in a folder that outlives Blender
 PRIMS = r"(?::(?:/\w+)+)?"  # any prim of a file
 
 
-def remember(folder: Path, names: Mapping[str, str]) -> None:
-    """Keep names of what lies in a folder."""
-    (folder / NAMES).write_text(json.dumps(dict(names)), encoding="utf-8")
+def remember(folder: Path, names: Mapping[str, str], kind: str = NAMES) -> None:
+    """Keep names of what lies in a folder, or with `BONES` those of bones by the paths of their joints."""
+    (folder / kind).write_text(json.dumps(dict(names)), encoding="utf-8")
 
 
-def recall(folder: Path) -> dict[str, str]:
+def recall(folder: Path, kind: str = NAMES) -> dict[str, str]:
     """Return the names that were kept in a folder; none where there are none."""
     try:
-        document = json.loads((folder / NAMES).read_text(encoding="utf-8"))
+        document = json.loads((folder / kind).read_text(encoding="utf-8"))
     except (OSError, ValueError):  # nothing was kept, or it is gone
         return {}
     return {str(made): str(name) for made, name in document.items()} if isinstance(document, dict) else {}

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from blender_addon.outside import jobs
+from blender_addon.outside.wording import BONES as OF_BONES
 from blender_addon.outside.wording import recall, remember, reworded, with_bones
 
 NAMES = {
@@ -56,5 +58,10 @@ def test_names_are_kept_with_a_training_and_read_with_its_state(tmp_path):
     assert recall(tmp_path) == NAMES
     (tmp_path / "state.json").write_text('{"state": "failed", "error": "motions/Walk.usdc: too short."}')
     assert jobs.read_state(tmp_path).error == "'Walk': too short."
+    odd = "motions/Walk.usdc: joint 'Hips/Arm_L' jumps, and Hips/Arm_L/handslot_l."
+    (tmp_path / "state.json").write_text(json.dumps({"state": "running", "text": odd}))
+    remember(tmp_path, BONES, OF_BONES)
+    assert jobs.read_state(tmp_path).text == "'Walk': joint 'Arm.L' jumps, and handslot.l."
+    (tmp_path / "state.json").write_text('{"state": "failed", "error": "motions/Walk.usdc: too short."}')
     (tmp_path / "names.json").write_text("[")
     assert jobs.read_state(tmp_path).error == "motions/Walk.usdc: too short."
