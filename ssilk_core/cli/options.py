@@ -190,12 +190,13 @@ def _add_names(verb: argparse.ArgumentParser) -> None:
                        help="these are levels of quality of a garment of the shot: variants of its prim")  # fmt: skip
     names.add_argument("--asset-version", metavar="PATTERN",
                        help="of the garment, in the assetInfo of what is written, such as v012, or '{parent}' "
-                            "(default: a hash of the model)")  # fmt: skip
+                            "(default: what the asset has, else a hash of the model)")  # fmt: skip
     names.add_argument("--asset-identifier", metavar="PATTERN",
-                       help="likewise, such as 'studio:/cloth/{stem}' (default: the asset's own layer; none in a "
-                            "file)")  # fmt: skip
+                       help="likewise, such as 'studio:/cloth/{stem}' (default: what the asset has, else its own "
+                            "layer; none in a file)")  # fmt: skip
     names.add_argument("--replace", action="store_true",
-                       help="bake even where a name was used for another input before")  # fmt: skip
+                       help="bake even where a name was used for another input, or an asset has another "
+                            "version")  # fmt: skip
 
 
 def _add_output(verb: argparse.ArgumentParser) -> None:

@@ -19,8 +19,9 @@ from ssilk_usd.opening.garment_api import SCHEMA, read_garment_record
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
-from ssilk_core.delivery.bake import BakeRequest, load_rollout, shot_bytes
+from ssilk_core.delivery.bake import BakeRequest, LayerFolder, load_rollout, plan_layers, shot_bytes
 from ssilk_core.delivery.targets import GLB, TARGETS, Target, cap_influences
+from ssilk_core.errors import SsilkError
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.scene.kinematics import deform
@@ -320,6 +321,9 @@ def test_a_version_is_of_the_asset_and_bakes_no_other_shot_again(copy, capsys):
         assert main(shlex.split(command)) == 2
         told = "the garment 'skirt' was baked with --asset-version 'v012', not 'v013'; all its shots share one asset"
         assert told in capsys.readouterr().err and hashes(Path("layers")) == after
+    request = BakeRequest(model="skirt.safetensors", stage="rigged.usda", motion="run.usda", asset_version="v014")
+    with pytest.raises(SsilkError, match="'v012', not 'v014'"):  # as a worker of another job finds it
+        LayerFolder("layers").bake(*plan_layers([request], points=True))
     assert bake("--motion run.usda --points -o layers --asset-version v013 --replace") == 0
     stage = Usd.Stage.Open("layers/shots/run/shot.usda")
     assert Usd.ModelAPI(stage.GetPrimAtPath("/Shot/skirt")).GetAssetVersion() == "v013"

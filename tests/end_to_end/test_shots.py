@@ -115,6 +115,9 @@ def test_levels_are_of_a_garment_that_is_there_and_no_level(copy, capsys):
     LayerFolder("new").need_names(plan_layers([late]), complete=False)  # and a farm the other one with another job
     with pytest.raises(SsilkError, match=r"'overalls' has a level itself, 'hero'; .*; name this garment with"):
         LayerFolder("layers").need_names(plan_layers([base, replace(request, level_of="hat")]))
+    capsys.readouterr()
+    assert main(shlex.split("remove layers walk/overalls")) == 0
+    assert "'hero' is a level of 'overalls', which is not in this shot" in capsys.readouterr().err
 
 
 def test_a_body_is_shown_whichever_levels_are_selected(copy, capsys):
