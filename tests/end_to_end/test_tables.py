@@ -105,8 +105,8 @@ def test_totals_are_of_whole_clips_and_the_simulator_of_sequences():
 
 def test_everything_is_what_evaluate_tells(made, world):
     _, figures = made(f"evaluate models/2.safetensors {WORLD} --loop 1")
-    # Energies, skin, motion, closed loop, stops, loops.
-    assert (world / "shown.md").read_text().count("| garment |") == 6
+    # Energies, skin, intersections, motion, closed loop, stops, loops.
+    assert (world / "shown.md").read_text().count("| garment |") == 7
     assert figures[-1]["figures"]["settling"]["stops"] == 2 and figures[-1]["figures"]["loop_drift"]["clips"] == 1
 
 
