@@ -8,6 +8,10 @@ from dataclasses import dataclass
 EVERY = 4  # of so many frames one is counted, as libigl takes some 30 ms for one; cloth hardly crosses itself in less
 
 
+SHARE = "triangles that intersect others"
+NOT_COUNTED = "not counted, libigl 2.6.3 or newer is missing"  # in place of figures
+
+
 @dataclass(frozen=True, kw_only=True)
 class SelfIntersections:
     """The share of a garment's triangles that intersect others of it, over frames.
@@ -38,7 +42,7 @@ class SelfIntersections:
         """Return figures for people; `clock` is what `frame` counts. No frame is the worst where all have none."""
         worst = {"most in one frame": f"{self.worst:.2%}, {self.clip} at {clock} {self.frame:g}"}
         return {
-            "triangles that intersect others": f"{self.mean:.3%}, in {self.frames} frames",
+            SHARE: f"{self.mean:.3%}, in {self.frames} frames",
             **(worst if self.worst else {}),
             **({"mostly at": self.where} if self.where else {}),
         }

@@ -7,10 +7,17 @@ edge of one that is opposite to it meets the other, and with a common edge where
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.assets import Floats, Ints
+
+
+def can_find() -> bool:
+    """Return whether libigl is installed, of a version that has these predicates (2.6.3)."""
+    return find_spec("igl") is not None and find_spec("igl.predicates") is not None
 
 
 def self_intersections(points: Floats, faces: Ints) -> NDArray[np.int64]:
