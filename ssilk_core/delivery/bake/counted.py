@@ -172,4 +172,4 @@ def _covered_skin(scene: Scene, device: torch.device) -> CoveredSkin | None:
 def _cloth(scene: Scene) -> ClothIntersections:
     from ...physics.intersections.cloth import ClothIntersections
 
-    return ClothIntersections(scene)
+    return ClothIntersections.of(scene)

@@ -56,18 +56,23 @@ class ClothIntersections:
 
     Attributes:
         mesh: the garment in the bind pose.
-        regions: the joint with the largest weight at each triangle in linear blend skinning, shape (F,).
+        regions: the joint with the largest weight at each triangle in linear blend skinning, shape (F,); None where
+            that is not known.
         joint_names: names of the character's joints.
     """
 
-    def __init__(self, scene: Scene) -> None:
-        self.mesh, skin = scene.garment.mesh, scene.lbs_skin
-        self.joint_names = scene.character.skeleton.joint_names
-        self.regions = skin.dense(len(self.joint_names))[self.mesh.faces].sum(axis=1).argmax(axis=1)
+    def __init__(self, mesh: Mesh, regions: Ints | None = None, joint_names: Sequence[str] = ()) -> None:
+        self.mesh, self.regions, self.joint_names = mesh, regions, joint_names
         self._first = _first_places(self.mesh.points)
         self._is_doubled = bool((self._first != np.arange(self.mesh.vertex_count)).any())
         allowed = [self._keys(self._pairs(self.mesh.points)), self._keys(_stitched_pairs(self.mesh))]
         self._allowed = np.unique(np.concatenate(allowed))
+
+    @classmethod
+    def of(cls, scene: Scene) -> ClothIntersections:
+        """Return those of the garment of a scene, by the joints of its character."""
+        mesh, names = scene.garment.mesh, scene.character.skeleton.joint_names
+        return cls(mesh, scene.lbs_skin.dense(len(names))[mesh.faces].sum(axis=1).argmax(axis=1), names)
 
     def pairs(self, points: Floats) -> NDArray[np.int64]:
         """Return the pairs of triangles that count in a frame, shape (P, 2).
@@ -115,6 +120,8 @@ class ClothIntersections:
 
     def _regions(self, triangles: Ints) -> dict[str, float]:
         """Return the shares of what intersects at the joints with the largest ones."""
+        if self.regions is None:
+            return {}
         found = np.bincount(self.regions, triangles, len(self.joint_names))
         largest = Counter(dict(enumerate(found.tolist()))).most_common(NAMED_REGIONS)
         return {self.joint_names[joint].rpartition("/")[2]: n / float(found.sum()) for joint, n in largest if n}

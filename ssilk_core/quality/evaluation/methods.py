@@ -106,7 +106,7 @@ class EvaluationScene:
     @cached_property
     def intersections(self) -> ClothIntersections:
         """What finds triangles of the garment that intersect others of it."""
-        return ClothIntersections(self.scene)
+        return ClothIntersections.of(self.scene)
 
     @cached_property
     def simulator(self) -> Simulator:

@@ -114,7 +114,7 @@ def dressed_in(scene: Scene, points: np.ndarray, faces: np.ndarray) -> Scene:
 def test_figures_are_of_frames_with_the_worst_and_where(scene):
     points, faces = sheet(4)
     points = points + 0.01 * np.random.default_rng(1).normal(size=points.shape)
-    cloth = ClothIntersections(dressed_in(scene, points, faces))
+    cloth = ClothIntersections.of(dressed_in(scene, points, faces))
     through = points.copy()
     through[-2:] = [0.3, 0.36, 0.1], [0.31, 0.3, -0.1]  # a corner, pulled through the sheet
     share = len(set(np.ravel(slow_pairs(through, faces)))) / len(faces)
@@ -124,6 +124,8 @@ def test_figures_are_of_frames_with_the_worst_and_where(scene):
     found = cloth.figures([("calm", calm), ("turn", cloth.counts([points, through], [100, 104]))])
     assert (found.frames, found.triangles, found.clip, found.frame) == (4, len(faces), "turn", 104)
     assert found.worst == pytest.approx(share) and found.mean == pytest.approx(share / 4)
+    unknown = ClothIntersections(cloth.mesh)  # of no joints
+    assert unknown.figures([("a", unknown.counts([through], [0]))]).regions == {}
     hit = cloth.triangles(through)
     turned = cloth.regions[hit].mean()
     assert found.regions == pytest.approx({"Hips": 1 - turned, "Spine": turned}) and turned > 0
@@ -141,7 +143,7 @@ def test_figures_are_of_frames_with_the_worst_and_where(scene):
 
 def test_nothing_counts_at_rest_and_what_crosses_there_counts_elsewhere(scene):
     points, faces = crossing(4)
-    cloth = ClothIntersections(dressed_in(scene, points, faces))
+    cloth = ClothIntersections.of(dressed_in(scene, points, faces))
     assert len(self_intersections(points, faces)) and not cloth.triangles(points).any()
     half = len(points) // 2
     moved = np.concatenate([points[:half], points[half:] + [0, -0.25, 0]])  # on to the next row
@@ -160,7 +162,7 @@ def slit(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def test_a_seam_of_doubled_vertices_is_one_as_long_as_it_is_closed(scene):
     points, faces = slit(*sheet(4))
     assert len(self_intersections(points, faces))  # triangles touch, and have no vertex in common
-    cloth = ClothIntersections(dressed_in(scene, points, faces))
+    cloth = ClothIntersections.of(dressed_in(scene, points, faces))
     for angle in (0.0, 1.0, 3.1):
         assert not cloth.triangles(folded(points, angle)).any()
     for gap, crossed in ((0.9 * TOGETHER, False), (0.05, True)):
@@ -171,7 +173,7 @@ def test_a_seam_of_doubled_vertices_is_one_as_long_as_it_is_closed(scene):
 
 
 def test_what_a_stitch_joins_does_not_count(patched_scene):
-    cloth, mesh = ClothIntersections(patched_scene), patched_scene.garment.mesh
+    cloth, mesh = ClothIntersections.of(patched_scene), patched_scene.garment.mesh
     patch = np.unique(mesh.faces[-8:])
     assert not cloth.triangles(mesh.points).any()
     sunk = mesh.points.copy()
