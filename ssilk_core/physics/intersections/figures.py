@@ -17,7 +17,8 @@ class SelfIntersections:
     """The share of a garment's triangles that intersect others of it, over frames.
 
     Attributes:
-        frames: that were counted: of each clip, or part without cuts, the first and every `EVERY`-th after it.
+        frames: that were counted: of each clip, or part without cuts, the first and every `EVERY`-th after it; of a
+            validation in training a few, spread evenly over all clips.
         triangles: of the garment.
         mean, worst: mean share over these frames, and that of the worst one.
         clip, frame: the worst frame, of several equal ones the first; it is told as that of `ShownSkin` is.
