@@ -259,9 +259,11 @@ def test_a_learning_curve_marks_its_best(tmp_path):
     }
     for point in points:
         point["validation"]["shown_skin"] = shown
+        point["validation"]["intersections"] = POINT["intersections"]
     path.write_text(json.dumps({"lbs": score, "points": points}))
     (section,) = learning_of(path)
     assert section.body.count(">best</text>") == 4
+    assert "At the best, 10.000% of the triangles intersect others" in section.body
     assert (
         "1.000% of the covered skin shows, 2.00% in the worst frame (walk, frame 3; most at Hips 100%)"
         in section.body
