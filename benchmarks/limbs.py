@@ -32,14 +32,14 @@ def measure(subject: Subject, options: Namespace) -> dict[str, Any]:
     skin = CoveredSkin(subject.scene, device=subject.device)
 
     def figures(take: NetworkTake, points: Floats) -> dict[str, Any]:
-        counts, stretch = seen(subject, skin, take.blocks(points))
-        assert counts.pierced is not None
-        return {"through": int(counts.pierced.any(0).sum()), "stretch": float(stretch.mean())}
+        own = seen(subject, skin, take.blocks(points))
+        assert own.skin.pierced is not None
+        return {"through": int(own.skin.pierced.any(0).sum()), "stretch": float(own.stretch.mean())}
 
     found: dict[str, Any] = {}
     for clip in options.clips:
         whole = NetworkTake.of(subject, clip_of(options, clip, subject))
-        counts, _ = seen(subject, skin, whole.blocks(whole.points))
+        counts = seen(subject, skin, whole.blocks(whole.points)).skin
         assert counts.pierced is not None
         through = np.convolve(counts.pierced.any(0), np.ones(options.frames), mode="valid")
         first = int(through.argmax())

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.rollout import decode, garment_poses
+from ssilk_core.physics.intersections.figures import EVERY
 from ssilk_core.physics.refine import RefineOptions, Refiner
 from ssilk_core.physics.simulate import SimulationOptions, simulate
 from ssilk_core.physics.skin.covered_skin import ShownCounts
@@ -82,11 +83,13 @@ class NetworkTake:
         changes = list(self.refiner(1, True).changes(self.motion, points, points))
         skin = self.subject.dressed.covered
         counts = ShownCounts.joined([ShownCounts.of(skin.states(*block)) for block in self.blocks(points)])
+        cloth = self.subject.dressed.intersections
         return {
             "energy": float(np.mean([change.after for change in changes])),
             "inside": float(np.mean([change.inside_after for change in changes])),
             "shows": float(counts.shares.max()),
             "limbs": counts.pierced_share or 0.0,
+            "intersect": float(cloth.counts(list(points[::EVERY]), range(0, len(points), EVERY)).shares.mean()),
             "moved": rms(points - self.points),
             "jitter": rms(np.diff(points, 3, axis=0)),
         }

@@ -57,6 +57,11 @@ COLUMNS: Columns = {
     "L_tot excess [J]": (("reference", "total_excess"), ".4g"),
     "gravity excess [m g L]": (("reference", "gravity_excess"), "+.1%"),
 }
+WHOLE_CLIPS: Columns = {
+    **COLUMNS,
+    "triangles that intersect others": (("intersections", "mean"), ".2%"),
+    "in the worst frame": (("intersections", "worst"), ".1%"),
+}
 DYNAMICS: Columns = {
     **COLUMNS,
     "RMS velocity error [m/s]": (("reference", "velocity_error"), ".3g"),
@@ -77,9 +82,10 @@ def methods_table(found: Mapping[tuple[str, str, str], Cell], shown: Columns = C
 
 
 def figures_of(found: Mapping[tuple[str, str, str], Cell], shown: Columns = COLUMNS) -> list[dict[str, Any]]:
-    """Return the figures of each cell, a list with the values of all seeds under the last name of each path."""
+    """Return the figures of each cell: the values of all seeds under the names of a path, less "reference"."""
     names = ("garment", "method", "split")
-    values = {key: {path[-1]: cell.values(path) for path, _ in shown.values()} for key, cell in found.items()}
+    paths = {"_".join(name for name in path if name != "reference"): path for path, _ in shown.values()}
+    values = {key: {name: cell.values(path) for name, path in paths.items()} for key, cell in found.items()}
     return [
         dict(zip(names, key)) | {name: seeds for name, seeds in of.items() if seeds} for key, of in values.items()
     ]
@@ -123,7 +129,8 @@ def table1(options: argparse.Namespace) -> tuple[str, Any]:
             )
         )
     ]
-    return methods_table(found) + notes + "\n", {"figures": figures_of(found), "trainings": trainings}
+    figures = {"figures": figures_of(found, WHOLE_CLIPS), "trainings": trainings}
+    return methods_table(found, WHOLE_CLIPS) + notes + "\n", figures
 
 
 def table2(options: argparse.Namespace) -> tuple[str, Any]:

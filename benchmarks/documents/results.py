@@ -23,24 +23,33 @@ def cells(name: str) -> dict[tuple[str, str, str], dict[str, Any]]:
 
 
 def overview() -> str:
-    """Energy, skin that shows, limbs through the cloth and bare skin: as trained, refined, and skinned."""
-    energies, rows = cells("table1"), []
+    """Energy, skin that shows, limbs through cloth, bare skin, cloth through cloth: trained, refined, and skinned."""
+    energies, rows, names = cells("table1"), [], ("network", REFINED, LBS)
+    crossed = any("intersections" in at for own in result("shown_skin").values() for split in SPLITS
+                  for at in own[split].values())  # fmt: skip
     for name, words in GARMENTS.items():
         for split in SPLITS:
-            own = [result("shown_skin")[name][split][method] for method in ("network", REFINED, LBS)]
+            own = [result("shown_skin")[name][split][method] for method in names]
             pairs = (energies[IN_RESULTS[name], method, split]["total"] for method in ("ssilk", "LBS"))
             row = [words if split == "valid" else "", split, *(digits(mean(each)) for each in pairs)]
             row += [f"{percent(at['mean'], 3)}, {percent(at['worst'])}" for at in own]
             row += [percent(at["pierced"]) for at in own]
-            rows.append([*row, *(percent(at["bare"]) for at in (own[0], own[2]))])
+            row += [percent(at["bare"]) for at in (own[0], own[2])]
+            rows.append([*row, *(intersecting(at.get("intersections")) for at in own if crossed)])
     header = ("garment", "clips", "energy [J]", "LBS", "shows", "refined", "LBS", "limbs", "refined", "LBS", "bare",
-              "LBS")  # fmt: skip
+              "LBS", *(("intersect", "refined", "LBS") if crossed else ()))  # fmt: skip
     return table(header, rows, 2)
 
 
+def intersecting(figures: dict[str, Any] | None) -> str:
+    """Return the mean and the worst share of triangles that intersect others [%]; nothing where none is known."""
+    return f"{percent(figures['mean'], 2)}, {percent(figures['worst'])}" if figures else ""
+
+
 def other_methods() -> str:
-    """Energies of all methods, and their excess and velocities beside the simulator."""
+    """Energies of all methods, cloth through cloth, and their excess and velocities beside the simulator."""
     energies, dynamics, rows = cells("table1"), cells("table2"), []
+    crossed = any("intersections_mean" in row for row in energies.values())
     iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
     for name, words in GARMENTS.items():
         for number, (method, shown) in enumerate(METHODS.items()):
@@ -52,9 +61,13 @@ def other_methods() -> str:
             for key in keys[1:]:
                 found = dynamics.get(key, {}).get("velocity_error")
                 row.append(fixed(mean(found), 2) if found else "")
+            for key in keys[1:] if crossed else ():
+                own = {name: energies[key].get(f"intersections_{name}", ()) for name in ("mean", "worst")}
+                row.append(intersecting({name: mean(each) for name, each in own.items()} if own["mean"] else None))
             rows.append(row)
     header = ("garment", "method", "iterations", "`valid` [J]", "`test` [J]", "flips [J]", "excess, `test` [J]",
-              "flips [J]", "velocity, `test` [m/s]", "flips [m/s]")  # fmt: skip
+              "flips [J]", "velocity, `test` [m/s]", "flips [m/s]",
+              *(("intersect, `test` [%]", "flips [%]") if crossed else ()))  # fmt: skip
     return table(header, rows, 2)
 
 
@@ -131,7 +144,7 @@ def rest() -> str:
 
 def refinement() -> str:
     """What iterations of the solver buy in a jump."""
-    rows = []
+    rows, crossed = [], any("intersect" in at for own in result("refine").values() for at in own.values())
     ways = {"0": "network", "4 network": "`--refine 4`", "8 refined": "`hero`", "simulator": "simulator"}
     for clip, found in result("refine").items():
         for key, way in ways.items():
@@ -140,17 +153,19 @@ def refinement() -> str:
             words = GARMENTS[clip.split()[0]] if key == "0" else ""
             away = fixed(at["apart"], 0, 1e-3), fixed(at["jitter"], 1, 1e-3)
             skin = percent(at["shows"], 2), percent(at["limbs"], 0)
-            rows.append([words, way, seconds, digits(at["energy"]), *skin, *away])
+            cloth = [percent(at["intersect"], 2) if "intersect" in at else ""] if crossed else []
+            rows.append([words, way, seconds, digits(at["energy"]), *skin, *cloth, *away])
     header = ("garment", "", "s a frame", "energy [J]", "shows, worst [%]", "limbs [%]",
-              "apart [mm]", "jitter [mm]")  # fmt: skip
+              *(["intersect [%]"] if crossed else []), "apart [mm]", "jitter [mm]")  # fmt: skip
     return table(header, rows, 2)
 
 
 def levels() -> str:
     """What each quality level costs and loses."""
     on_cpu = {(at["model"], at["variant"]): at["solving"] for at in document("trade_cpu")["points"]}
-    rows = []
-    for at in document("trade_cuda")["points"]:
+    rows, points = [], document("trade_cuda")["points"]
+    crossed = any("intersections" in at for at in points)
+    for at in points:
         if at["variant"] in ("1 iterations", "film"):
             continue
         variant, skin = at["variant"], at["shown_skin"]
@@ -159,10 +174,11 @@ def levels() -> str:
         name = f"`{variant}`" if at["swept"] == "level" else variant
         rows.append([GARMENTS[at["model"]] if variant == "as trained" else "", name,
                      fixed(at["milliseconds"], 2), *solver, fixed(at["total"], 3), percent(skin["mean"], 3),
+                     *([intersecting(at.get("intersections"))] if crossed else []),
                      digits(1000 * at["position"], 2), fixed(at["model_bytes"], 1, 1e6),
                      fixed(at["shot_bytes"], 1, 1e6)])  # fmt: skip
     header = ("garment", "variant", "play [ms]", "solver, GPU [ms]", "one thread [ms]", "energy [J]", "shows [%]",
-              "off [mm]", "model, 32 bits [MB]", "shot [MB]")  # fmt: skip
+              *(["intersect [%]"] if crossed else []), "off [mm]", "model, 32 bits [MB]", "shot [MB]")  # fmt: skip
     return table(header, rows, 2)
 
 

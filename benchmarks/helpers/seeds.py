@@ -65,7 +65,7 @@ class Cell:
         for row in self.rows:
             value = row["figures"]
             for name in path:
-                value = value and value[name]
+                value = value and value.get(name)  # records of before lack what is new
             found += [] if value is None else [value]
         return found
 

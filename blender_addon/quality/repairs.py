@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ssilk_core.authoring.preflight.mesh import SAME_PLACE
+from ssilk_core.scene.mesh.topology import SAME_PLACE
 
 from ..errors import SetupError
 from ..scene.garment import rest_world

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
 from ..files import replacing
+from ..physics.intersections.figures import SelfIntersections
 from ..physics.skin.figures import ShownSkin
 from ..scene.fabrics import Fabric
 from .options import check_output
@@ -65,6 +66,8 @@ def _told(figures: dict[str, Any]) -> dict[str, object]:
     for name, own in figures.items():
         skin = own.get("shown_skin")
         found[name] = str(ShownSkin(**skin)) if skin else "it covers no skin"
+        if crossed := own.get("intersections"):
+            found[f"{name}: cloth through cloth"] = str(SelfIntersections(**crossed))
         if own.get("non-finite frames"):
             found[f"{name}: frames that are not finite"] = own["non-finite frames"]
     return found

@@ -53,8 +53,12 @@ def write_curve(path: Path, curve: list[CurvePoint], lbs: Score) -> None:
 
 
 def summary(score: Score) -> dict[str, Any]:
-    """Return a score by name: terms and total [J], collisions, dynamics [m], and skin and steps, where measured."""
-    parts = {"shown_skin": score.shown_skin, "step_errors": score.step_errors}
+    """Return a score by name: terms and total [J], collisions, dynamics [m], skin, cloth, steps where measured."""
+    parts = {
+        "shown_skin": score.shown_skin,
+        "intersections": score.intersections,
+        "step_errors": score.step_errors,
+    }
     measured = {name: asdict(part) for name, part in parts.items() if part}
     return {
         **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **measured

@@ -18,6 +18,9 @@ from ..files import split_location
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
 from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
+from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
+from ..physics.intersections.figures import SelfIntersections
+from ..physics.intersections.pairs import can_find
 from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
@@ -30,6 +33,7 @@ from .step_errors import StepErrors
 # On a CPU and on a GPU. Rays and Hessians take long on a CPU.
 SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted
 MEASURED_STEPS = 16, 64
+CROSSED_FRAMES = 8  # in which triangles that intersect others are counted: a quarter of a second in all
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class Score:
         dynamics: RMS distance between the rollout and the quasi-static states of the same poses [m].
         shown_skin: share of the covered skin that shows, in `SHOWN_FRAMES` spread evenly over all clips; None where
             the garment covers nothing.
+        intersections: share of the triangles that intersect others, in `CROSSED_FRAMES` spread likewise; None without
+            libigl.
         step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
     """
 
@@ -49,13 +55,19 @@ class Score:
     collisions: float
     dynamics: float = 0.0
     shown_skin: ShownSkin | None = None
+    intersections: SelfIntersections | None = None
     step_errors: StepErrors | None = None
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
         """Return a score from its JSON document."""
         shown, steps = document["shown_skin"], document["step_errors"]
-        parts = {"shown_skin": shown and ShownSkin(**shown), "step_errors": steps and StepErrors(**steps)}
+        crossed = document.get("intersections")  # files of before lack it
+        parts = {
+            "shown_skin": shown and ShownSkin(**shown),
+            "intersections": crossed and SelfIntersections(**crossed),
+            "step_errors": steps and StepErrors(**steps),
+        }
         return cls(**{**document, **parts})
 
     @property
@@ -88,6 +100,7 @@ class Validator:
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
+        self.cloth = ClothIntersections.of(scene) if can_find() else None
         self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -120,8 +133,9 @@ class Validator:
         scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
         terms = {name: joined[name] for name in TERMS}
-        shown, steps = self._shown(model, states), self._step_errors(model, states)
-        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, steps)
+        shown, crossed = self._shown(model, states), self._crossed(model, states)
+        steps = self._step_errors(model, states)
+        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps)
 
     @torch.no_grad()
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
@@ -132,15 +146,39 @@ class Validator:
             clip, chosen = self.clips[number], spread[number]
             if not chosen:
                 continue
-            frames = torch.tensor(chosen, device=self.rest.device)
-            character = self.bank.character(clip.start + frames)
-            x = self.lbs_vertices(character)
-            if model is not None and latents is not None:
-                x = model.vertices(latents[frames], character)
+            x, character = self._posed(model, latents, clip, chosen)
             numbers = [self.first[number] + frame for frame in chosen]
             counts[number] = ShownCounts.of(self.covered.states(x, character), numbers)
         joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
         return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
+
+    @torch.no_grad()
+    def _crossed(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> SelfIntersections | None:
+        """Return how many triangles intersect others; all processes of the group get the same."""
+        if self.cloth is None:
+            return None
+        own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
+        spread = self._spread(CROSSED_FRAMES)
+        for number, latents in zip(own, states):
+            if not (chosen := spread[number]):
+                continue
+            x, _ = self._posed(model, latents, self.clips[number], chosen)
+            numbers = [self.first[number] + frame for frame in chosen]
+            counts[number] = self.cloth.counts(list(x.permute(2, 0, 1).double().cpu().numpy()), numbers)
+        joined: dict[int, IntersectionCounts] = {}
+        for part in self.group.gather(counts):
+            joined |= part
+        return self.cloth.figures([(self.names[number], joined[number]) for number in sorted(joined)])
+
+    def _posed(
+        self, model: LatentModel | None, latents: Tensor | None, clip: range, chosen: Sequence[int]
+    ) -> tuple[Tensor, Tensor]:
+        """Return positions (V, 3, N) of some frames of a clip [m], and its skinning matrices there."""
+        frames = torch.tensor(chosen, device=self.rest.device)
+        character = self.bank.character(clip.start + frames)
+        if model is None or latents is None:
+            return self.lbs_vertices(character), character
+        return model.vertices(latents[frames], character), character
 
     def _step_errors(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> StepErrors | None:
         """Return what single steps of a model miss; all processes of the group get the same."""

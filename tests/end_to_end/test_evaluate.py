@@ -39,7 +39,7 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
     (world / "index.json").write_text(json.dumps([*INDEX, {"clip": "brief", "split": "train", "tags": []}]))
     assert evaluated(f"{WORLD} --index index.json -o out/figures.json") == 0
     shown = capsys.readouterr()
-    assert shown.out.count("| garment") == 7 and shown.out.count("| ssilk ") == 21  # no simulator was named
+    assert shown.out.count("| garment") == 8 and shown.out.count("| ssilk ") == 24  # no simulator was named
     document = json.loads((world / "out" / "figures.json").read_text())
     assert document["models"] == {"model.safetensors": sha256("model.safetensors")} and document["units"] == "SI"
     rows = {(row["method"], row["split"]): row["figures"] for row in document["figures"]}

@@ -16,6 +16,8 @@ from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.cli import main
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.physics.intersections.cloth import ClothIntersections
+from ssilk_core.physics.intersections.figures import EVERY, NOT_COUNTED
 from ssilk_core.physics.skin.covered_points import SEED, SKIN_POINTS, spread_points
 from ssilk_core.scene.assets import PINNED, Mesh
 
@@ -105,5 +107,22 @@ def test_the_figure_is_that_of_the_written_file(folder, monkeypatch, capsys, wor
     for name, figure in (("covered skin that shows", "mean"), ("bare", "bare")):
         told = re.search(rf"^ *{name}: ([0-9.]+)%$", printed, re.MULTILINE)
         assert float(told[1]) == pytest.approx(100 * said[figure], rel=1e-3, abs=0.01)
+    crossed = read_provenance("shot.usdc")["intersections"]
+    (_, skirt), _, skirts = posed_by_usd("shot.usdc")
+    expected = ClothIntersections(skirt).counts(list(skirts[::EVERY]), range(0, FRAMES, EVERY))
+    assert (crossed["frames"], crossed["triangles"]) == (len(expected.frames), len(skirt.faces))
+    one = 1 / len(skirt.faces)  # a pair that merely touches may part where float32 rounds
+    assert crossed["mean"] == pytest.approx(expected.shares.mean(), abs=2 * one, rel=1e-3)
+    assert re.search(r"^ *triangles that intersect others: [0-9.]+%, in 2 frames$", printed, re.MULTILINE)
     _, others, _ = counted("shot.usdc", 12_000, SEED + 1)
     assert others.mean() == pytest.approx(shows.mean(), rel=0.1, abs=1e-3)  # few points show
+
+
+def test_a_bake_without_libigl_says_that_cloth_was_not_counted(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("ssilk_core.delivery.bake.counted.can_find", lambda: False)
+    bake = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda", "-o", "bare.usdc"]
+    assert main(bake) == 0
+    said = read_provenance("bare.usdc")
+    assert said["intersections"] == {"none": NOT_COUNTED} and said["shown_skin"]["frames"] == FRAMES
+    assert f"triangles that intersect others: {NOT_COUNTED}" in capsys.readouterr().err

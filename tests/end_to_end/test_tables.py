@@ -65,12 +65,13 @@ def test_methods_stand_side_by_side_and_seeds_together(made, world):
     (header, *lines), figures = made(f"table1 models ncs.safetensors {WORLD}")
     assert (
         header[:4] == ["garment", "method", "valid: L_tot [J]", "valid: vertices inside the body"]
-        and len(header) == 8
+        and len(header) == 14
     )
     assert [line[:2] for line in lines] == [["Skirt", "LBS"], ["Skirt", "ssilk"], ["Skirt", "ncs*"]]
     assert "±" in lines[1][2] and "±" not in lines[2][2]  # two models are seeds of one method
     found = {(row["method"], row["split"]): row for row in figures["figures"]}
     assert len(found["ssilk", "flips"]["total"]) == 2 and len(found["ncs*", "flips"]["collisions"]) == 1
+    assert len(found["ssilk", "flips"]["intersections_mean"]) == 2 == len(found["ssilk", "valid"]["total"])
     assert "total_excess" not in found["ssilk", "flips"]  # there is no simulator
     assert Counter(training["method"] for training in figures["trainings"]) == {"ssilk": 2, "ncs*": 1}
     assert "- ssilk's total is lower than ncs*'s in" in (world / "shown.md").read_text()
@@ -105,8 +106,8 @@ def test_totals_are_of_whole_clips_and_the_simulator_of_sequences():
 
 def test_everything_is_what_evaluate_tells(made, world):
     _, figures = made(f"evaluate models/2.safetensors {WORLD} --loop 1")
-    # Energies, skin, motion, closed loop, stops, loops.
-    assert (world / "shown.md").read_text().count("| garment |") == 6
+    # Energies, skin, intersections, motion, closed loop, stops, loops.
+    assert (world / "shown.md").read_text().count("| garment |") == 7
     assert figures[-1]["figures"]["settling"]["stops"] == 2 and figures[-1]["figures"]["loop_drift"]["clips"] == 1
 
 

@@ -10,10 +10,10 @@ import numpy as np
 from ...events import format_count
 from ...scene.assets import Character, Floats, Ints, Mesh
 from ...scene.fabrics import FABRICS
-from ...scene.mesh.topology import edge_use, is_inside_out, vertex_mask
+from ...scene.mesh.topology import edge_use, is_inside_out, merged_places, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
 from .finding import Finding, Findings, format_joints, index_tuple
-from .mesh import distinct_faces, merged_places
+from .mesh import distinct_faces
 from .settle import DEEPEST, FARTHEST, Settled, settle
 
 COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]

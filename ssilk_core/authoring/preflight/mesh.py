@@ -7,10 +7,8 @@ import numpy as np
 
 from ...events import format_count
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas
+from ...scene.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas, merged_places
 from .finding import Finding, Findings, index_tuple
-
-SAME_PLACE = 1e-6  # [m] size of the cells in which vertices count as coincident
 
 
 def isolated_vertices(mesh: Mesh) -> Findings:
@@ -135,11 +133,6 @@ def shared_places(points: Floats) -> Ints:
     """Return which points coincide with another to a micrometre, shape (V,)."""
     place = merged_places(points)
     return np.bincount(place)[place] > 1
-
-
-def merged_places(points: Floats) -> Ints:
-    """Return a number for the place of each point, the same to a micrometre for those that coincide, shape (V,)."""
-    return np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _longest_edges(mesh: Mesh) -> Floats:

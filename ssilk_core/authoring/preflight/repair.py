@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ...events import format_count
 from ...scene.assets import Character, Floats, Garment, Ints, Mesh, ProxyRig
-from ...scene.mesh.topology import border_vertices, edge_use, edges
+from ...scene.mesh.topology import SAME_PLACE, border_vertices, edge_use, edges
 from .fit import describe_left, describe_move
-from .mesh import SAME_PLACE, distinct_faces
+from .mesh import distinct_faces
 from .settle import settle
 from .winding import outward_flips
 

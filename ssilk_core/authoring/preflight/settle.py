@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.topology import components, edges, vertex_mask
+from ...scene.mesh.topology import SAME_PLACE, components, edges, vertex_mask
 from .cloth_samples import ClothSamples, sample_cloth
 from .contact_planes import ContactPlanes, HeldSamples, covering_planes
-from .mesh import SAME_PLACE, distinct_faces
+from .mesh import distinct_faces
 from .shape_energy import ShapeEnergy
 from .sides import Facing, OuterSurface, find_facing
 

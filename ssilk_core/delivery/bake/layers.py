@@ -14,6 +14,7 @@ from ...events import Message, Reporter, Result, Started, silent
 from ...files import FileHashes, remove_unfinished_in, replacing, sha256
 from ...work_record import is_file
 from ..targets import check_influences
+from .counted import state_rollout_counts
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
@@ -27,7 +28,6 @@ from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
 from .shots import write_shot_stage
-from .shown_skin import state_rollout_skin
 from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -314,11 +314,11 @@ def _write_layer(
             path=unverified,
             points=task.points,
         )
-        shown = state_rollout_skin(unverified, rollout)
+        counts = state_rollout_counts(unverified, rollout)
         verification = verify_file(rollout, unverified, report) if task.verify else None
         digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file
     rollout.warn(report)
-    return result_of(rollout, layout.animation, summary, shown, verification, hidden), digests
+    return result_of(rollout, layout.animation, summary, counts, verification, hidden), digests
 
 
 def _outdated_shots(layout: Layout, current: Container[str]) -> Iterator[str]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ...physics.intersections.figures import NOT_COUNTED, SHARE, SelfIntersections
 from ...physics.skin.figures import ShownSkin
 from ...quality.levels import SizeReduction
 
@@ -209,6 +210,7 @@ class BakeResult:
         hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
         shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
+        intersections: the share of triangles that intersect others of the garment; None where it was not counted.
         current: the file was there already and nothing was baked; the other figures are those of its bake.
     """
 
@@ -227,6 +229,7 @@ class BakeResult:
     hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
     shown_skin: ShownSkin | None = None
+    intersections: SelfIntersections | None = None
     current: bool = False
 
     def figures(self, kind: str = "shot") -> dict[str, object]:
@@ -248,6 +251,7 @@ class BakeResult:
             **{f"refined: {name}": value for name, value in refined.items()},
             **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary("time code") if self.shown_skin else {}),
+            **(self.intersections.summary("time code") if self.intersections else {SHARE: NOT_COUNTED}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from ...scene.decomposition import Decomposition
 
-STATED = 2048  # bytes of what a shot says of its origin and of its skin, which an excerpt does not hold
+STATED = 2560  # bytes of what a shot says of its origin, its skin and its cloth, which an excerpt does not hold
 EXCERPT = 64  # frames that are written to estimate the bytes of a whole shot
 
 

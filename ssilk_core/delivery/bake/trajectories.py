@@ -18,11 +18,11 @@ from ...scene.assets import Deformer, Floats, Motion, Scene, Skeleton
 from ...scene.kinematics import held_at_cuts, sample_motion
 from ..targets import GLB
 from .character import on_character
+from .counted import state_counts
 from .glb import warn_of_sets, write_glb_shot
 from .nearness import need_near
 from .opened import open_shot
 from .result import SKINNED, BakeResult, ShotShapes, Verification
-from .shown_skin import state_shown_skin
 from .verification import compare_trajectories, need_valid
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def skin_trajectories(
             else:
                 summary = write_shot(layer, found.deformer, motion, found.poses, units=units, **common)
             name = Path(split_location(motion.path)[0]).stem
-            shown = state_shown_skin(layer, found.deformer.scene, motion, name=name, device=device)
+            counts = state_counts(layer, found.deformer.scene, motion, name=name, device=device)
         if verify:
             need_valid(unverified, report)
             verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
@@ -146,7 +146,8 @@ def skin_trajectories(
     return BakeResult(
         path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
         proxies=summary.proxy_count, blendshapes=summary.shape_count, size_bytes=path.stat().st_size,
-        verification=verification, shapes=shapes, shown_skin=shown,
+        verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
+        intersections=counts.intersections,
     )  # fmt: skip
 
 

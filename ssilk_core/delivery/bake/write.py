@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ...errors import fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import need_not_input, need_writable, replacing, split_location
-from ...physics.skin.figures import ShownSkin
 from ..targets import GLB
+from .counted import ShotCounts, state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
 from .latents import solved
@@ -20,7 +20,6 @@ from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
 from .rollout import BakeRollout
-from .shown_skin import state_rollout_skin
 from .sizing import load_sized
 from .verification import verify_file
 
@@ -65,10 +64,10 @@ def bake(
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    summary, shown, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
+    summary, counts, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
-    result = result_of(rollout, path, summary, shown, verification, hidden)
+    result = result_of(rollout, path, summary, counts, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
     return result
@@ -78,7 +77,7 @@ def result_of(
     rollout: BakeRollout,
     path: Path,
     summary: ShotSummary,
-    shown: ShownSkin | None,
+    counts: ShotCounts,
     verification: Verification | None,
     hidden: HiddenPolygons | None,
 ) -> BakeResult:
@@ -97,7 +96,8 @@ def result_of(
         latent=rollout.latents.summary if rollout.latents else None,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
-        shown_skin=shown,
+        shown_skin=counts.shown_skin,
+        intersections=counts.intersections,
     )
 
 
@@ -119,17 +119,17 @@ def _write_verified(
     hidden: HiddenPolygons | None,
     verify: bool,
     report: Reporter,
-) -> tuple[ShotSummary, ShownSkin | None, Verification | None]:
+) -> tuple[ShotSummary, ShotCounts, Verification | None]:
     """Write a file that appears once it is verified; return what it holds."""
     from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified, report, name=output) as layer:
             summary = _write(layer, rollout, output, include_body, hidden)
-            shown = state_rollout_skin(layer, rollout)
+            counts = state_rollout_counts(layer, rollout)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, shown, verify_file(rollout, unverified, report) if verify else None
+        return summary, counts, verify_file(rollout, unverified, report) if verify else None
 
 
 def _write(

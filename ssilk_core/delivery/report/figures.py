@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import SsilkError, fail
+from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.figures import ShownSkin
 from ...quality.charts import ChartPanel, svg_chart
 from ...quality.kept_rows import GO_ON, UNFINISHED
@@ -137,6 +138,8 @@ def learning(document: Mapping[str, Any]) -> Section:
     )
     if found[best]:
         words += f" At the best, {ShownSkin(**found[best])}."
+    if crossed := points[best]["validation"].get("intersections"):
+        words += f" At the best, {SelfIntersections(**crossed)}."
     if steps[best]:
         words += f" At the best, {StepErrors(**steps[best])}."
     return Section("Training", svg_chart("validations during training", rows) + f'<p class="note">{words}</p>')

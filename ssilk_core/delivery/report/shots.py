@@ -113,9 +113,10 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     if lost:
         said = f"The garment is not finite in {len(lost)} of {len(times)} frames, first in frame {lost[0]:g}."
         charts += f'<p class="note">{said} Energies leave these frames out; all covered skin counts as shown.</p>'
-    figures = {"shown_skin": asdict(found)} if found else {}
+    crossed = meter.intersections(name)
+    figures = {**({"shown_skin": asdict(found)} if found else {}), "intersections": asdict(crossed)}
     return [
-        verdict(name, values, found, player.frame_times, player.fps),
+        verdict(name, values, found, crossed, player.frame_times, player.fps),
         Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
         Section(f"{name}: over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
     ]

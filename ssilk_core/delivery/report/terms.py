@@ -12,6 +12,8 @@ from ...physics.collision import PosedBody, signed_distance
 from ...physics.constants import GRAVITY
 from ...physics.energy import TERMS, GarmentEnergy
 from ...physics.energy.stretch import deformation_gradient_operator
+from ...physics.intersections.cloth import ClothIntersections, IntersectionCounts
+from ...physics.intersections.figures import EVERY, SelfIntersections
 from ...physics.skin.covered_points import CoveredPoints
 from ...physics.skin.covered_skin import ShownCounts, shown_skin
 from ...physics.skin.figures import ShownSkin
@@ -23,7 +25,8 @@ from ...scene.mesh.topology import vertex_normals
 SHOT_TERMS = tuple(term for term in TERMS if term != "tether")
 SHARE, SHOWN, BARE = "inside the body", "covered skin that shows", "covered skin that is bare"
 STRETCH = "stretch of the cloth"
-UNITS = {**dict.fromkeys((SHOWN, BARE, STRETCH, SHARE), "%"), "total": "J", **dict.fromkeys(SHOT_TERMS, "J")}
+CROSSED = "triangles that intersect others"
+UNITS = {**dict.fromkeys((SHOWN, BARE, CROSSED, STRETCH, SHARE), "%"), "total": "J", **dict.fromkeys(SHOT_TERMS, "J")}
 STRETCHED_SHARE = 0.99  # of the triangles, which stretch no more
 
 
@@ -40,7 +43,8 @@ class TermsMeter:
         body: all body meshes at rest as one, or None.
         fps: frames per second.
         values: by name, one for each frame: energies [J], the shares of the covered skin that shows and that is
-            bare, the larger principal stretch that 99 triangles in 100 do not exceed, less one, and the share of
+            bare, the share of triangles that intersect others, as it was in the last of every `EVERY` frames, the
+            larger principal stretch that 99 triangles in 100 do not exceed, less one, and the share of
             vertices inside the body [%].
         finite: whether the garment of each frame is.
     """
@@ -56,6 +60,8 @@ class TermsMeter:
         self.columns = deformation_gradient_operator(self.garment, self.energy.mass.device, self.energy.mass.dtype)
         self.finite: list[bool] = []
         self.counts: list[ShownCounts] = []
+        self.cloth = ClothIntersections(self.garment)
+        self.crossed: list[IntersectionCounts] = []
         self.past: deque = deque(maxlen=2)
         import torch
 
@@ -84,6 +90,7 @@ class TermsMeter:
             "gravity": self._height(points, body) - self.rest,
             "stitch": float(self.energy.stitch(x)),
             "inertia": self._inertia(points),
+            CROSSED: self._crossed(points, time),
             STRETCH: 100 * (float(largest) - 1),
             **self._collision(x, None if body is None else body - origin, time),
         }
@@ -94,6 +101,16 @@ class TermsMeter:
     def shown_skin(self, name: str) -> ShownSkin | None:
         """Return the share of the covered skin that shows in the shot `name`; None where nothing is covered."""
         return shown_skin([(name, ShownCounts.joined(self.counts))]) if self.covered else None
+
+    def intersections(self, name: str) -> SelfIntersections:
+        """Return the share of the triangles that intersect others in the shot `name`."""
+        return self.cloth.figures([(name, IntersectionCounts.joined(self.crossed))])
+
+    def _crossed(self, points: Floats, time: float) -> float:
+        """Return the share of triangles that intersect others [%], in this frame or in the last that was counted."""
+        if len(self.values[CROSSED]) % EVERY == 0:
+            self.crossed.append(self.cloth.counts([points], [time]))
+        return 100 * float(self.crossed[-1].shares[0])
 
     def _height(self, points: Floats, body: Floats | None) -> float:
         """Return the garment's weight times its height above the middle of the body, or above y = 0 [J]."""

@@ -8,6 +8,7 @@ from html import escape
 
 import numpy as np
 
+from ...physics.intersections.figures import EVERY, SelfIntersections
 from ...physics.skin.figures import MOST_MEAN, MOST_WORST, ShownSkin
 from ...scene.assets import Floats
 from .page import Section
@@ -25,13 +26,19 @@ INSIDE = 10.0  # share of the vertices inside the body in one frame [%]
 
 
 def verdict(
-    name: str, values: Mapping[str, Floats], shown_skin: ShownSkin | None, frame_times: Sequence[float], fps: float
+    name: str,
+    values: Mapping[str, Floats],
+    shown_skin: ShownSkin | None,
+    intersections: SelfIntersections,
+    frame_times: Sequence[float],
+    fps: float,
 ) -> Section:
     """Return the section of a garment.
 
     Args:
         values: of each frame, by the names of `terms.UNITS`.
         shown_skin: None where the garment covers nothing.
+        intersections: of the same frames.
     """
 
     def when(frame: int) -> str:
@@ -53,6 +60,10 @@ def verdict(
         words.append(f"{seen if shown[worst] else 'No covered skin shows'}; {bare}")
     else:
         words.append("Skin was not measured, because the garment covers none.")
+    if intersections.worst:
+        most = f"{intersections.worst:.1%} in frame {intersections.frame:g}".replace("%", " %")
+        share = f"{100 * intersections.mean:.2f} % of its triangles intersect others of it on average, and {most}"
+        words.append(f"{share}. One frame in {EVERY} is counted.")
     if len(lost) < len(frame_times):
         worst = int(np.nanargmax(values[STRETCH]))
         if values[STRETCH][worst] > STRETCHED:

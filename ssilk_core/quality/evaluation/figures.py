@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.figures import ShownSkin
 
 
@@ -170,6 +171,7 @@ class Figures:
         total: the paper's L_tot [J], the sum of `terms`; gravity is relative to linear blend skinning.
         collisions: share of vertices inside the body.
         shown_skin: share of the covered skin that shows; None where the garment covers nothing.
+        intersections: share of the triangles that intersect others of the garment.
         clip_totals: smallest, median and largest total of a clip [J].
         gravity_excess: gravity energy above that of linear blend skinning [m g L].
         kinetic_energy: [J].
@@ -192,6 +194,7 @@ class Figures:
     jerk: float
     jerk_ratio: float
     stretch_quantiles: tuple[float, ...]
+    intersections: SelfIntersections
     shown_skin: ShownSkin | None = None
     reference: ReferenceErrors | None = None
     solver: SolverErrors | None = None

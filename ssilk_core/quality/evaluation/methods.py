@@ -20,6 +20,7 @@ from ...physics.collision import CollisionBody, Contacts, limb_axes
 from ...physics.constants import GRAVITY
 from ...physics.energy import GarmentEnergy
 from ...physics.energy.stretch import deformation_gradient_operator
+from ...physics.intersections.cloth import ClothIntersections
 from ...physics.simulate import SimulationOptions, Simulator, simulate
 from ...physics.skin.covered_skin import CoveredSkin
 from ...physics.skinning import Skinning
@@ -101,6 +102,11 @@ class EvaluationScene:
     def covered(self) -> CoveredSkin:
         """The skin that the garment covers in the bind pose."""
         return CoveredSkin(self.scene, device=self.device)
+
+    @cached_property
+    def intersections(self) -> ClothIntersections:
+        """What finds triangles of the garment that intersect others of it."""
+        return ClothIntersections.of(self.scene)
 
     @cached_property
     def simulator(self) -> Simulator:

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from ...physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
+from ...physics.intersections.cloth import IntersectionCounts
+from ...physics.intersections.figures import EVERY
 from ...physics.skin.covered_skin import ShownCounts
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import BINS, derivative, kinetic_energy, mean_square, principal_stretches, stretch_histogram
@@ -27,11 +29,13 @@ class TakeRecord:
             method's own static state, and of `ERRORS`. NaN where a take has too short a past.
         stretches: histogram of the larger principal stretch of all triangles.
         shown: the covered skin that shows, by time codes of the clip's motion.
+        intersections: the triangles that intersect others, by time codes too, in every `EVERY`-th frame.
     """
 
     values: dict[str, Tensor]
     stretches: Tensor
     shown: ShownCounts
+    intersections: IntersectionCounts
 
 
 @torch.no_grad()
@@ -39,7 +43,7 @@ def recorded(
     dressed: EvaluationScene, take_set: TakeSet, method: Method, take: int, reference: Method | None = None
 ) -> TakeRecord:
     """Measure a method over a take, and its errors where there is a `reference`."""
-    parts, shown, stretches = [], [], torch.zeros(BINS, dtype=torch.float64)
+    parts, shown, crossed, stretches = [], [], [], torch.zeros(BINS, dtype=torch.float64)
     ours, theirs = _Past(method, take), _Past(reference, take) if reference else None
     count, codes = take_set.takes[take].frame_count, take_set.takes[take].codes
     for start in range(0, count, FRAMES_PER_CHUNK):
@@ -50,6 +54,7 @@ def recorded(
         stretches += stretch_histogram(stretch)
         states = dressed.covered.states(x, take_set.character(take, frames))
         shown.append(ShownCounts.of(states, codes[frames.start : frames.stop].tolist()))
+        crossed.append(_intersections(dressed, x, frames, codes.tolist()))
         values = {
             **frame_energies(dressed, take_set, take, frames, path),
             **_moving(dressed, path, len(frames)),
@@ -59,7 +64,7 @@ def recorded(
         }
         parts.append({name: value.double().cpu() for name, value in values.items()})
     joined = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
-    return TakeRecord(joined, stretches, ShownCounts.joined(shown))
+    return TakeRecord(joined, stretches, ShownCounts.joined(shown), IntersectionCounts.joined(crossed))
 
 
 def frame_energies(
@@ -70,6 +75,13 @@ def frame_energies(
     body, joined = dressed.body.pose(character, exact=dressed.exact, limbs=False), path[..., -len(frames) - 2 :]
     down = x.new_tensor([0.0, -1.0, 0.0])
     return energy_terms(dressed.energy, x, dressed.lbs(character), dressed.contacts, body, joined, dressed.fps, down)
+
+
+def _intersections(dressed: EvaluationScene, x: Tensor, frames: range, codes: list[float]) -> IntersectionCounts:
+    """Count in those frames of positions (V, 3, N) that are so many from the take's first, told by its time codes."""
+    chosen = [frame for frame in frames if frame % EVERY == 0]
+    points = x[..., [frame - frames.start for frame in chosen]].permute(2, 0, 1).double().cpu().numpy()
+    return dressed.intersections.counts(list(points), [codes[frame] for frame in chosen])
 
 
 class _Past:

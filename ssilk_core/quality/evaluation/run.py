@@ -145,7 +145,9 @@ class _Run:
 
     def _base(self, method: str, split: str) -> Figures:
         """Return the figures that every method has."""
-        return figures(self._tally(method, split), self._lbs_jerk(split), self.dressed.weight, self.dressed.covered)
+        dressed = self.dressed
+        tally, jerk = self._tally(method, split), self._lbs_jerk(split)
+        return figures(tally, jerk, dressed.weight, dressed.covered, dressed.intersections)
 
     def _lbs_jerk(self, split: str) -> float:
         """Return the RMS jerk of linear blend skinning on a split [m/s3]."""

@@ -8,6 +8,7 @@ from math import degrees, isfinite
 from typing import Any
 
 from ...physics.energy import TERMS
+from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.figures import ShownSkin
 from .figures import (
     ClosedLoop,
@@ -58,6 +59,8 @@ ENERGIES = ("frames", "L_tot [J]", *(f"{name} [J]" for name in TERMS), "vertices
             "gravity excess over LBS [% m g L]", "L_tot of a clip, min / median / max [J]")  # fmt: skip
 SHOWN_SKIN = ("covered points", "covered skin that shows [%]", "in the worst frame [%]", "clip", "time code",
               "where, share of what shows", "bare, mean / worst [%]")  # fmt: skip
+INTERSECTIONS = ("frames counted", "triangles", "triangles that intersect others [%]", "in the worst frame [%]",
+                 "clip", "time code", "where, share of what intersects")  # fmt: skip
 MOTION = ("kinetic energy [J]", "RMS distance to static state [mm]", "RMS jerk [m/s3]", "RMS jerk / LBS",
           "larger principal stretch, 50 / 95 / 99 / 100 %")  # fmt: skip
 REFERENCE = ("frames", "L_tot excess over simulator [J]", "simulator L_tot [J]",
@@ -89,6 +92,11 @@ def _shown_skin(f: ShownSkin) -> list[str]:
     bare = " / ".join(_percent(share) for share in (f.bare, f.worst_bare))
     worst = (f.clip, f"{f.frame:g}") if f.worst else ("", "")
     return [str(f.covered), _percent(f.mean, 3), _percent(f.worst), *worst, f.where, bare]
+
+
+def _intersections(f: SelfIntersections) -> list[str]:
+    worst = (f.clip, f"{f.frame:g}") if f.worst else ("", "")
+    return [str(f.frames), str(f.triangles), _percent(f.mean, 3), _percent(f.worst), *worst, f.where]
 
 
 def _motion(f: Figures) -> list[str]:
@@ -151,6 +159,7 @@ def _millimetres(value: float) -> str:
 KINDS: tuple[tuple[Callable[[Figures], Any], Sequence[str], Callable[[Any], list[str]]], ...] = (
     (lambda figures: figures, ENERGIES, _energies),
     (lambda figures: figures.shown_skin, SHOWN_SKIN, _shown_skin),
+    (lambda figures: figures.intersections, INTERSECTIONS, _intersections),
     (lambda figures: figures.reference, REFERENCE, _reference),
     (lambda figures: figures.solver, SOLVER, _solver),
     (lambda figures: figures, MOTION, _motion),

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from ...physics.energy import TERMS
+from ...physics.intersections.cloth import ClothIntersections
+from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.covered_skin import CoveredSkin
 from ...physics.skin.figures import ShownSkin
 from .figures import Figures, PoseNovelty, ReferenceErrors
@@ -51,6 +53,10 @@ class Tally:
         """Return the share of the covered skin that shows; None where nothing is covered."""
         return covered.figures([(self.clips[take], record.shown) for take, record in self.records.items()])
 
+    def intersections(self, cloth: ClothIntersections) -> SelfIntersections:
+        """Return the share of triangles that intersect others of the garment."""
+        return cloth.figures([(self.clips[take], record.intersections) for take, record in self.records.items()])
+
     def clip_totals(self) -> tuple[float, float, float]:
         """Return the smallest, the median and the largest mean total of a clip [J]."""
         names = dict.fromkeys(self.clips[take] for take in self.records)
@@ -63,13 +69,16 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
     return [take for take, clip in clips.items() if clip in names]
 
 
-def figures(tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin) -> Figures:
+def figures(
+    tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin, cloth: ClothIntersections
+) -> Figures:
     """Return the figures of a method.
 
     Args:
         lbs_jerk: RMS jerk of linear blend skinning on the same takes [m/s3].
         weight: m g L of the garment [J].
         covered: the skin that it covers.
+        cloth: what counts its triangles that intersect others.
     """
     jerk = tally.root("jerk")
     stretches = sum((record.stretches for record in tally.records.values()), torch.zeros(()))
@@ -81,6 +90,7 @@ def figures(tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin) 
         terms={name: tally.mean(name) for name in TERMS},
         collisions=tally.mean("collisions"),
         shown_skin=tally.shown_skin(covered),
+        intersections=tally.intersections(cloth),
         clip_totals=tally.clip_totals(),
         gravity_excess=ratio(tally.mean("gravity"), weight),
         kinetic_energy=tally.mean("kinetic energy"),

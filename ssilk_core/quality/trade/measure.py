@@ -113,6 +113,7 @@ class VariantMeter:
             excess=total - float(self.base),
             collisions=tally.mean("collisions"),
             shown_skin=tally.shown_skin(self.dressed.covered),
+            intersections=tally.intersections(self.dressed.intersections),
             position=tally.root("position error"),
             velocity=tally.root("velocity error"),
         )

@@ -21,8 +21,10 @@ ERRORS = {
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
     "total": ("energy above the lowest [J]", 1.0, 1e-3),
     "mean_shown_skin": ("covered skin that shows [%]", 1e2, 1e-2),
+    "mean_intersections": ("triangles that intersect others [%]", 1e2, 1e-2),
 }
-ACROSS_MODELS = ("total", "mean_shown_skin")  # errors that compare networks; a distance is from one's own whole model
+# Errors that compare networks; a distance is from one's own whole model.
+ACROSS_MODELS = ("total", "mean_shown_skin", "mean_intersections")
 NAMED = (WHOLE, "level", "refinement", SIMULATOR)  # sweeps whose points are all labelled
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 from math import nan
 from typing import Any
 
+from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.figures import ShownSkin
 from ...scene.plain import from_plain
 
@@ -33,6 +34,7 @@ class TradePoint:
         excess: difference of `total` from the model as trained [J].
         collisions: share of the vertices inside the body.
         shown_skin: share of the covered skin that shows; None where the garment covers nothing.
+        intersections: share of the triangles that intersect others of the garment.
         position, velocity: RMS errors against the full model [m], [m/s].
     """
 
@@ -59,6 +61,7 @@ class TradePoint:
     position: float
     velocity: float
     shown_skin: ShownSkin | None
+    intersections: SelfIntersections
     solving: float | None
 
     @classmethod
@@ -74,6 +77,11 @@ class TradePoint:
     def making(self) -> float:
         """Time to make a frame [ms]: that of playing it, and of the solver on the device."""
         return self.milliseconds + (self.solving or 0.0)
+
+    @property
+    def mean_intersections(self) -> float:
+        """Mean share of the triangles that intersect others of the garment."""
+        return self.intersections.mean
 
     @property
     def mean_shown_skin(self) -> float:

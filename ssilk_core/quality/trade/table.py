@@ -11,7 +11,7 @@ from .point import SECONDS, TradePoint, front
 
 HEADER = ("garment", "model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "solver", "memory [MB]",
           "model [MB]", f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
-          "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
+          "intersect", "most", "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
 MARKS = {"making": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
@@ -64,6 +64,8 @@ def _cells(p: TradePoint, best: list[str]) -> list[str]:
         f"{p.shown_skin.mean:.3%}" if p.shown_skin else "",
         f"{p.shown_skin.worst:.2%}" if p.shown_skin else "",
         f"{p.shown_skin.bare:.2%}" if p.shown_skin else "",
+        f"{p.intersections.mean:.2%}",
+        f"{p.intersections.worst:.2%}",
         f"{1000 * p.position:.3g}",
         f"{1000 * p.velocity:.3g}",
         ", ".join(best),

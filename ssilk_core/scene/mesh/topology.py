@@ -10,6 +10,7 @@ from ..assets import Floats, Ints, Mesh
 
 NO_AREA = 1e-7  # ratio of twice a triangle's area to its longest edge squared; the limit of single precision
 SLIVER = 50.0  # ratio of a triangle's longest edge to its height; clean cloth stays below 15
+SAME_PLACE = 1e-6  # [m] size of the cells in which vertices count as coincident
 
 
 def edges(faces: Ints) -> NDArray[np.int64]:
@@ -141,6 +142,11 @@ def _face_crosses(points: Floats, faces: Ints) -> Floats:
 def _unit(vectors: Floats) -> Floats:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def merged_places(points: Floats) -> Ints:
+    """Return a number for the place of each point, the same to a micrometre for those that coincide, shape (V,)."""
+    return np.unique(np.round(points / SAME_PLACE), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def subdivision_middles(n: int) -> Floats:

@@ -3,7 +3,7 @@
 
 import json
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,6 +17,7 @@ from ssilk_core.delivery.report.shots import ShotGarment, joined, shot_sections
 from ssilk_core.delivery.report.terms import BARE, SHARE, SHOWN, STRETCH, TermsMeter, worst_frames
 from ssilk_core.delivery.report.verdict import verdict
 from ssilk_core.errors import SsilkError
+from ssilk_core.physics.intersections.figures import SelfIntersections
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.quality.charts import ChartPanel, svg_chart
 from ssilk_core.quality.kept_rows import UNFINISHED
@@ -113,14 +114,20 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
     values = {SHOWN: np.array([0.0, 0.0, 0.8]), STRETCH: np.array([3.0, 21.0, 4.0]), SHARE: np.zeros(3)}
     skin = ShownSkin(frames=3, covered=100, mean=0.0027, worst=0.008, bare=0.12, worst_bare=0.2, clip="c", frame=13,
                      regions={"LeftArm": 1.0})  # fmt: skip
-    body = verdict("Cape", values, skin, [11, 12, 13], 30.0).body
+    crossed = SelfIntersections(
+        frames=1, triangles=9, mean=0.031, worst=0.25, clip="c", frame=11, regions={"LeftArm": 1.0}
+    )
+    body = verdict("Cape", values, skin, crossed, [11, 12, 13], 30.0).body
     assert "Look at Cape: skin shows through and the cloth stretches." in body
     assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
     assert "; 12.0 % is bare, 20.0 % at most." in body
     assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "At most" not in body
-    calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, [11, 12, 13], 30.0).body
+    assert "3.10 % of its triangles intersect others of it on average, and 25.0 % in frame 11." in body
+    flat = replace(crossed, mean=0.0, worst=0.0)
+    calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, flat, [11, 12, 13], 30.0).body
     assert "Cape holds" in calm and "skin" not in calm
-    few = verdict("Cape", {**values, SHARE: np.array([0.0, 0.0368, 0.0])}, skin, [11, 12, 13], 30.0).body
+    assert "intersect" not in calm
+    few = verdict("Cape", {**values, SHARE: np.array([0.0, 0.0368, 0.0])}, skin, crossed, [11, 12, 13], 30.0).body
     assert "At most 0.04 % of its vertices are inside the body, in frame 12" in few
     assert "Frames are time codes of the shot." in few
     assert "skin that the cloth covers in the bind pose" in few and "Covered skin" not in calm
@@ -189,6 +196,8 @@ POINT = {
     "torch": None, "operations": 10, "memory": 10, "model_bytes": 1000, "shot_bytes": 1000.0,
     "total": 1.5, "excess": 0.0, "collisions": 0.0, "position": 0.002, "velocity": 0.0,
     "shown_skin": None, "solving": None,
+    "intersections": {"frames": 1, "triangles": 9, "mean": 0.1, "worst": 0.2, "clip": "a", "frame": 1.0,
+                      "regions": {}},
 }  # fmt: skip
 FIGURES = {
     "Extremes": ({"ssilk": "1", "outcomes": [OUTCOME]}, "breaks"),
@@ -250,9 +259,11 @@ def test_a_learning_curve_marks_its_best(tmp_path):
     }
     for point in points:
         point["validation"]["shown_skin"] = shown
+        point["validation"]["intersections"] = POINT["intersections"]
     path.write_text(json.dumps({"lbs": score, "points": points}))
     (section,) = learning_of(path)
     assert section.body.count(">best</text>") == 4
+    assert "At the best, 10.000% of the triangles intersect others" in section.body
     assert (
         "1.000% of the covered skin shows, 2.00% in the worst frame (walk, frame 3; most at Hips 100%)"
         in section.body

@@ -22,6 +22,7 @@ from ssilk_core.network.latent_solver import LatentOptions
 from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.physics.energy import TERMS
+from ssilk_core.physics.intersections.figures import EVERY, SelfIntersections
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.quality.evaluation.asked import EvaluationClips, EvaluationOptions
 from ssilk_core.quality.evaluation.figures import ResultRow
@@ -166,7 +167,7 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
         {0: recorded(dressed, take_set, Still(dressed, take_set, path), 0, LinearBlendSkinning(dressed, take_set))},
         {0: "sway"},
     )
-    simulator = figures(reference, reference.root("jerk"), dressed.weight, dressed.covered)
+    simulator = figures(reference, reference.root("jerk"), dressed.weight, dressed.covered, dressed.intersections)
     found = reference_errors(tally, simulator, dressed.weight)
     exact = [path, path.diff(dim=0) * FPS, path.diff(n=2, dim=0) * FPS**2]
     expected = [float(values[:, 1].square().mean()) ** 0.5 for values in exact]
@@ -175,7 +176,7 @@ def test_errors_against_a_reference_are_those_of_the_offset(dressed, take_set):
     mass = float(dressed.energy.mass.sum())
     lifted = mass * GRAVITY * float(path[:, 1].mean())
     assert found.gravity_excess == pytest.approx(lifted / dressed.weight, rel=1e-3)
-    own = figures(tally, simulator.jerk, dressed.weight, dressed.covered)
+    own = figures(tally, simulator.jerk, dressed.weight, dressed.covered, dressed.intersections)
     assert found.total_excess == pytest.approx(own.total - found.reference_total) and found.frames == 40
     assert own.static_distance == pytest.approx(expected[0], rel=1e-3)
     assert own.gravity_excess == pytest.approx(found.gravity_excess, rel=1e-3)
@@ -203,7 +204,32 @@ def test_skin_that_shows_is_counted_where_cloth_sinks_into_the_body(dressed, mot
     assert found.mean == pytest.approx(float(torch.cat(calm, dim=1).double().mean()))
     assert sum(found.regions.values()) == pytest.approx(1) and set(found.regions) <= {"Hips", "Spine", "Arm"}
     assert "sway" in tables([ResultRow("strip", "pushed", "valid", figures(Tally(records, {0: "sway", 1: "sway"}),
-                                       1.0, 1.0, dressed.covered))])  # fmt: skip
+                                       1.0, 1.0, dressed.covered, dressed.intersections))])  # fmt: skip
+
+
+class Folded(Still):
+    """The garment of linear blend skinning, pushed in one frame through itself: its loose end lies before its top."""
+
+    def vertices(self, take, frames):
+        x = super().vertices(take, frames)
+        for number, frame in enumerate(frames):
+            if frame == 12:
+                x[-5:, :, number] = x[:5, :, number] + torch.tensor([[0.0, -0.1, 0.03]])
+                x[-10:-5, :, number] = x[:5, :, number] + torch.tensor([[0.0, -0.1, -0.03]])
+        return x
+
+
+def test_triangles_that_intersect_are_counted_in_every_fourth_frame(dressed, motion, monkeypatch):
+    takes = takes_of("sway", replace(motion, start=100.0), dressed.scene.character.skeleton, FPS, longest=20)
+    take_set = build_take_set(takes, dressed, JOINTS)
+    still = torch.zeros(20, 3)
+    lbs, through = LinearBlendSkinning(dressed, take_set), Folded(dressed, take_set, still)
+    monkeypatch.setattr("ssilk_core.quality.evaluation.record.FRAMES_PER_CHUNK", 7)
+    records = {take: recorded(dressed, take_set, method, take) for take, method in enumerate((lbs, through))}
+    found = Tally(records, {0: "sway", 1: "sway"}).intersections(dressed.intersections)
+    crossed = dressed.intersections.triangles(through.vertices(1, range(12, 13))[..., 0].double().numpy())
+    assert (found.frames, found.clip, found.frame) == (2 * 20 // EVERY, "sway", 132) and found.worst > 0.1
+    assert found.worst == pytest.approx(crossed.mean()) and found.mean == pytest.approx(found.worst / found.frames)
 
 
 def test_collisions_can_be_with_the_whole_body(scene, dressed, take_set):
@@ -407,7 +433,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
-    assert text.count("| garment") == 9 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
+    assert text.count("| garment") == 10 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
 def leaves(value: object) -> tuple[list[object], list[float]]:
@@ -459,6 +485,7 @@ def test_an_index_says_which_clips_are_in_which_split(tmp_path):
 def test_a_written_row_is_read_again_and_what_was_not_finite_is_no_number():
     skin = {"frames": 2, "covered": 3, "mean": 0.1, "worst": 0.2, "clip": "a", "frame": 1.0, "regions": {"Hips": 1.0},
             "bare": 0.0, "worst_bare": 0.0, "pierced": None, "limbs": {}}  # fmt: skip
+    crossed = {"frames": 1, "triangles": 9, "mean": 0.1, "worst": 0.2, "clip": "a", "frame": 1.0, "regions": {}}
     stop = dict.fromkeys(("initial_kinetic_energy", "final_kinetic_energy", "settled_share", "static_distance",
                           "max_static_distance", "static_energy_excess", "gravity_excess"), 0.5)  # fmt: skip
     numbers = dict.fromkeys(("total", "collisions", "gravity_excess", "kinetic_energy", "jerk", "jerk_ratio"), 1.5)
@@ -466,11 +493,12 @@ def test_a_written_row_is_read_again_and_what_was_not_finite_is_no_number():
     written = {
         "garment": "Cape", "method": "ssilk", "split": "valid",
         "figures": {"clips": 1, "frames": 2, "terms": {"gravity": None}, "clip_totals": [1, 2.0, None],
-                    "stretch_quantiles": [1.0], "shown_skin": skin, **numbers, **others,
+                    "stretch_quantiles": [1.0], "shown_skin": skin, "intersections": crossed, **numbers, **others,
                     "settling": {"stops": 1, "settling_time": None, **stop},
                     "closed_loop": {"states": 3, "median_radius": 0.9, "max_radius": None}},
     }  # fmt: skip
     found = from_plain(ResultRow, written, figures=True)
+    assert found.figures.intersections == SelfIntersections(**crossed)
     assert found.figures.shown_skin == ShownSkin(**skin) and found.figures.reference is None
     assert math.isnan(found.figures.settling.settling_time) and found.figures.settling.stops == 1
     assert found.figures.clip_totals[:2] == (1, 2.0) and math.isnan(found.figures.clip_totals[2])

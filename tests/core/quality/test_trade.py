@@ -373,8 +373,8 @@ def test_garments_have_rows_of_their_own_and_networks_their_names(points):
     skirt = [replace(point, garment="Skirt", shown_skin=None) for point in cape]
     rows = trade_panels([*cape, light, *skirt], {"jump": 60, "flip": 40})
     titles = [f"{garment}, 100 frames, 2 clips" for garment in ("Cape", "Skirt")]
-    assert [row[0].title for row in rows] == titles[:1] * 2 + titles[1:] * 2
-    assert "RMS" not in rows[0][0].y and "RMS" in rows[2][0].y  # distances are from one's own whole model
+    assert [row[0].title for row in rows] == titles[:1] * 3 + titles[1:] * 3
+    assert "RMS" not in rows[0][0].y and "RMS" in rows[3][0].y  # distances are from one's own whole model
     (_, first, _), (_, second, words) = rows[0][0].points[WHOLE]
     assert words == "light" and second - first == pytest.approx(1)
     assert min(y for row in rows for group in row[0].points.values() for _, y, _ in group) == 0

@@ -787,6 +787,30 @@ def test_a_validation_counts_the_skin_that_shows_in_frames_spread_over_all_clips
     assert Score.of(document).shown_skin == found
 
 
+def test_a_validation_counts_triangles_that_intersect_in_frames_spread_over_its_clips(
+    scene, toy_motion, toy_model, monkeypatch
+):
+    monkeypatch.setattr("ssilk_core.training.validation.CROSSED_FRAMES", 5)
+    clips = [toy_motion(scene, count, path=f"/clips/{name}.usdc:/Anim") for count, name in ((20, "a"), (30, "b"))]
+    model, energy = toy_model(scene), GarmentEnergy(scene.garment.mesh, Fabric("toy"))
+    body = CollisionBody(scene.character.merged_body(), 3, device=torch.device("cpu"))
+    bank = build_bank(clips, scene.character.skeleton, model.joints, 30.0, torch.device("cpu"))
+    validator = Validator(bank, energy, body, scene, model.decoder.rest, 30.0, 50, spans=clips)
+    crumpled = 0.1 * torch.randn(scene.garment.mesh.vertex_count, 3, 1, generator=torch.Generator().manual_seed(1))
+    monkeypatch.setattr(model, "vertices", lambda z, character: validator.lbs_vertices(character) + crumpled)
+    score = validator.score(model)
+    x = validator.lbs_vertices(bank.character(torch.tensor([5, 15, 25, 35, 45]))) + crumpled
+    shares = [validator.cloth.triangles(frame).mean() for frame in x.permute(2, 0, 1).double().numpy()]
+    found = score.intersections
+    assert (found.frames, found.mean, found.worst) == (5, pytest.approx(np.mean(shares)), max(shares))
+    assert (found.clip, found.frame) == [("a", 5), ("a", 15), ("b", 5), ("b", 15), ("b", 25)][int(np.argmax(shares))]
+    assert found.mean > 0.1 > validator.lbs_score().intersections.mean
+    document = json.loads(json.dumps(asdict(score)))
+    assert Score.of(document).intersections == found
+    del document["intersections"]
+    assert Score.of(document).intersections is None
+
+
 def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goes_on(tmp_path, monkeypatch, capsys):
     skin = ShownSkin(
         frames=3, covered=100, mean=0.043, worst=0.102, bare=0.0, worst_bare=0.0, clip="c", frame=3, regions={}

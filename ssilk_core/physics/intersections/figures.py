@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The share of triangles that intersect others of the same garment, as figures; `intersections.cloth` counts it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+EVERY = 4  # of so many frames one is counted, as libigl takes some 30 ms for one; cloth hardly crosses itself in less
+
+
+SHARE = "triangles that intersect others"
+NOT_COUNTED = "not counted, libigl 2.6.3 or newer is missing"  # in place of figures
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelfIntersections:
+    """The share of a garment's triangles that intersect others of it, over frames.
+
+    Attributes:
+        frames: that were counted: of each clip, or part without cuts, the first and every `EVERY`-th after it; of a
+            validation in training a few, spread evenly over all clips.
+        triangles: of the garment.
+        mean, worst: mean share over these frames, and that of the worst one.
+        clip, frame: the worst frame, of several equal ones the first; it is told as that of `ShownSkin` is.
+        regions: share of what intersects, of all frames together, at the joints that carry most of it in the
+            garment's linear blend skinning, largest first.
+    """
+
+    frames: int
+    triangles: int
+    mean: float
+    worst: float
+    clip: str
+    frame: float
+    regions: dict[str, float]
+
+    @property
+    def where(self) -> str:
+        """The regions in words; empty where nothing intersects."""
+        return ", ".join(f"{joint} {share:.0%}" for joint, share in self.regions.items())
+
+    def summary(self, clock: str = "frame") -> dict[str, str]:
+        """Return figures for people; `clock` is what `frame` counts. No frame is the worst where all have none."""
+        worst = {"most in one frame": f"{self.worst:.2%}, {self.clip} at {clock} {self.frame:g}"}
+        return {
+            SHARE: f"{self.mean:.3%}, in {self.frames} frames",
+            **(worst if self.worst else {}),
+            **({"mostly at": self.where} if self.where else {}),
+        }
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return figures of four digits, as a shot stores them."""
+        rounded = {name: float(f"{value:.4g}") for name, value in vars(self).items() if isinstance(value, float)}
+        return {
+            **vars(self),
+            **rounded,
+            "regions": {joint: round(share, 4) for joint, share in self.regions.items()},
+        }
+
+    def __str__(self) -> str:
+        worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
+        most = f", {self.worst:.2%} in the worst of {self.frames} frames ({worst})" if self.worst else ""
+        return f"{self.mean:.3%} of the triangles intersect others{most}"
