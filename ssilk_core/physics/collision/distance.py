@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .. import kernels
+from .. import kernels, loops
 from .closest_point import bounding_spheres, closest_on_faces, frames_at_once
 from .limb_axes import PosedLimbs
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK, consecutive_blocks, nearest_vertex
@@ -111,7 +111,7 @@ def nearest_planes(
     """
     if patches is not None and body.rings is not None:
         body = replace(body, faces=None)
-    if kernels.supports(x) and _have_kernel(body, patches):
+    if (kernels.supports(x) or loops.supports(x)) and _have_kernel(body, patches):
         return _by_kernels(x, body, blocks, patches)
     index, normal, offset, search_radius = _at_vertices(x, body, blocks, patches)
     if body.faces is not None:
@@ -210,17 +210,22 @@ def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
 
 
 def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Tensor:
-    """Return the index of the nearest body vertex (V, N), int32 from the kernels and int64 elsewhere."""
-    if not kernels.supports(x):
+    """Return the index of the nearest body vertex (V, N), int32 from kernels and loops and int64 elsewhere."""
+    on_gpu = kernels.supports(x)
+    if not on_gpu and not loops.supports(x):
         return nearest_vertex(x, body.points, patches.vertices if patches else None)
     if patches is not None:
-        from ..kernels.candidates import nearest_candidate_kernel
-
-        return nearest_candidate_kernel(x, body.points, patches.vertices)
-    from ..kernels.nearest_vertex import nearest_vertex_kernel
-
+        if on_gpu:
+            from ..kernels.candidates import nearest_candidate_kernel as among
+        else:
+            from ..loops.nearest_vertex import nearest_candidate_loop as among
+        return among(x, body.points, patches.vertices)
+    if on_gpu:
+        from ..kernels.nearest_vertex import nearest_vertex_kernel as search
+    else:
+        from ..loops.nearest_vertex import nearest_vertex_loop as search
     groups = consecutive_blocks(len(body.points), BODY_GROUP, x.device) if body.groups is None else body.groups
-    return nearest_vertex_kernel(x, body.points, _in_blocks(x, blocks), groups)
+    return search(x, body.points, _in_blocks(x, blocks), groups)
 
 
 def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
@@ -231,16 +236,20 @@ def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
 def _by_kernels(
     x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None = None
 ) -> tuple[Tensor, Tensor]:
-    from ..kernels.closest_point import closest_point_kernel
-    from ..kernels.one_ring import one_ring_kernel
-
+    """Return the result of `nearest_planes` from fused kernels, or on a processor from compiled loops."""
+    if kernels.supports(x):
+        from ..kernels.closest_point import closest_point_kernel as on_surface
+        from ..kernels.one_ring import one_ring_kernel as around_vertex
+    else:
+        from ..loops.closest_point import closest_point_loop as on_surface
+        from ..loops.planes import one_ring_loop as around_vertex
     index = _nearest_vertex(x, body, blocks, patches)
     if body.faces is not None and body.patches is not None:
         limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
-        return closest_point_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
+        return on_surface(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
     on_triangles = body.rings is not None
-    return one_ring_kernel(
+    return around_vertex(
         x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE, _reach(patches), on_triangles
     )
 

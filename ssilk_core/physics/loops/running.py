@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How loops are compiled, and distributed over threads.
+
+Loops release Python's lock, so that ordinary threads run them side by side. numba's own threads are left out: they
+compile three times as long, differ between systems, and do not survive a fork. What a loop writes does not depend on
+how its range is split, so results are the same for any number of threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+LANES = 8  # frames that a loop processes at once, in one vector register
+
+# Sums keep their order, and values that are not finite stay so.
+compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+
+_pools: dict[int, ThreadPoolExecutor] = {}
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_pools.clear)  # a child has none of the threads
+
+
+def run_parts(loop: Callable[..., Any], count: int, *arguments: object) -> None:
+    """Call `loop(*arguments, start, stop)` for parts of range(count), one for each of PyTorch's threads."""
+    threads = min(torch.get_num_threads(), count)
+    if threads < 2:
+        loop(*arguments, 0, count)
+        return
+    if threads not in _pools:
+        _pools[threads] = ThreadPoolExecutor(threads - 1, "loops")
+    edges = [part * count // threads for part in range(threads + 1)]
+    others = [_pools[threads].submit(loop, *arguments, *edge) for edge in zip(edges[1:], edges[2:])]
+    loop(*arguments, *edges[:2])
+    for other in others:
+        other.result()
+
+
+def array(values: Tensor) -> np.ndarray:
+    """Return a tensor's values as a contiguous array, which shares its memory where it is contiguous itself."""
+    return values.detach().contiguous().numpy()
+
+
+def blocks_of(frames: int) -> int:
+    """Return how many blocks of `LANES` frames hold so many."""
+    return -(-frames // LANES)
