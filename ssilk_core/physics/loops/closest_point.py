@@ -71,7 +71,7 @@ def _part(part, whole):
 
 
 @compiled
-def _visit(triangle, place, px, py, pz, best, s_best, t_best, owner, corners, numbers):
+def _visit(triangle, px, py, pz, best, s_best, t_best, owner, corners, numbers):
     """Compare the nearest point of a triangle with the best so far of each query in a block."""
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     ax, ay, az = corners[0, triangle], corners[1, triangle], corners[2, triangle]
@@ -104,7 +104,7 @@ def _visit(triangle, place, px, py, pz, best, s_best, t_best, owner, corners, nu
         best[i] = square if closer else best[i]
         s_best[i] = s if closer else s_best[i]
         t_best[i] = t if closer else t_best[i]
-        owner[i] = place if closer else owner[i]
+        owner[i] = triangle if closer else owner[i]
 
 
 @compiled
@@ -127,7 +127,8 @@ def _search(x, index, points, normals, blocks, patches, normal, offset, max_dist
                 v = blocks[block, i]
                 first = index[v, frame]
                 px[i], py[i], pz[i] = x[v, 0, frame], x[v, 1, frame], x[v, 2, frame]
-                dx, dy, dz = px[i] - points[first, 0, frame], py[i] - points[first, 1, frame], pz[i] - points[first, 2, frame]
+                dx, dy = px[i] - points[first, 0, frame], py[i] - points[first, 1, frame]
+                dz = pz[i] - points[first, 2, frame]
                 height = dx * normals[first, 0, frame] + dy * normals[first, 1, frame] + dz * normals[first, 2, frame]
                 square = dx * dx + dy * dy + dz * dz
                 asked[i] = square < max_distance * max_distance or (height < zero and square < max_depth * max_depth)
@@ -146,7 +147,7 @@ def _search(x, index, points, normals, blocks, patches, normal, offset, max_dist
                     if gap[g] <= bound:
                         for lane in range(TRIANGLES):
                             place = g * TRIANGLES + lane
-                            _visit(place, place, px, py, pz, best, s_best, t_best, owner, corners, numbers)
+                            _visit(place, px, py, pz, best, s_best, t_best, owner, corners, numbers)
             for i in range(size):
                 v, s, t = blocks[block, i], s_best[i], t_best[i]
                 first = index[v, frame]
@@ -154,7 +155,8 @@ def _search(x, index, points, normals, blocks, patches, normal, offset, max_dist
                 j, k = first, first
                 if found:
                     row, lane = owner[i] // TRIANGLES, owner[i] % TRIANGLES
-                    first, j, k = patches[row, lane], patches[row, TRIANGLES + lane], patches[row, 2 * TRIANGLES + lane]
+                    first, j = patches[row, lane], patches[row, TRIANGLES + lane]
+                    k = patches[row, 2 * TRIANGLES + lane]
                 else:
                     s, t = zero, zero
                 r = one - s - t

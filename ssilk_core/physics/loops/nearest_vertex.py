@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The exact nearest body vertex; reference: `collision.nearest_vertex`.
 
-As in `kernels.nearest_vertex`, vertices of the garment come in compact blocks and those of the body in compact groups,
-each with its bounding box. A block first visits the group nearest to it, which bounds the distances, and then only
+As in `kernels.nearest_vertex`, vertices of the garment come in compact blocks and those of the body in compact
+groups, each with its bounding box. A block first visits the group nearest to it, which bounds the distances, and then only
 groups whose boxes are within this bound. Of equally near vertices the one visited first counts, so that results are
 deterministic.
 """
@@ -46,7 +46,7 @@ def nearest_candidate_loop(x: Tensor, points: Tensor, lists: Tensor) -> Tensor:
 
 @compiled
 def _pack(points, table, frame, packed, boxes):
-    """Copy a frame of points in the order of a table (rows, size) to (3, rows * size), and their boxes to (6, rows)."""
+    """Copy a frame of points in the order of a table (rows, size) to (3, rows * size), and boxes to (6, rows)."""
     rows, size = table.shape
     for row in range(rows):
         for axis in range(3):

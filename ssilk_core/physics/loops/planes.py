@@ -76,7 +76,7 @@ def _planes(x, index, points, normals, rings, normal, offset, max_square, reach,
 
 @compiled
 def _around(px, py, pz, ox, oy, oz, i, n, points, rings):
-    """Corners j and k, barycentric s and t, and |p - b|^2 - |p|^2 of the nearest point b on the triangles around i."""
+    """Corners j and k, s, t, and |p - b|^2 - |p|^2 of the nearest point b on the triangles around i."""
     zero = np.float32(0)
     best, s_best, t_best, j_best, k_best = zero, zero, zero, i, i
     k, wx, wy, wz = i, zero, zero, zero

@@ -14,6 +14,8 @@ from torch.autograd.function import once_differentiable
 
 from .running import LANES, array, blocks_of, compiled, run_parts
 
+PART = 64  # vertices that are added up before their sum is, so that rounding errors stay small
+
 
 def contact_loop(
     x: Tensor, area: Tensor, planes: tuple[Tensor, Tensor], stiffness: float, start: float, ramp: float
@@ -115,11 +117,15 @@ def _contact_gradient(x, area, normal, offset, stiffness, begin, ramp, upstream,
 @compiled
 def _inertia_and_drag(x, mass, last, before, shift, inertia, drag, energy, start, stop):
     half = np.float32(0.5)
-    thrown, blown = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
+    thrown, blown, total = (
+        np.empty(LANES, np.float32),
+        np.empty(LANES, np.float32),
+        np.empty((2, LANES), np.float32),
+    )
     for block in range(start, stop):
         first = block * LANES
         count = min(LANES, last.shape[2] - first)
-        thrown[:], blown[:] = 0, 0
+        thrown[:], blown[:], total[:] = 0, 0, 0
         for v in range(len(x)):
             for axis in range(3):
                 for n in range(count):
@@ -129,8 +135,12 @@ def _inertia_and_drag(x, mass, last, before, shift, inertia, drag, energy, start
                     relative = moved - shift[axis, at]
                     thrown[n] += mass[v] * turned * turned
                     blown[n] += mass[v] * relative * relative
-        energy[0, first : first + count] = half * inertia * thrown[:count]
-        energy[1, first : first + count] = half * drag * blown[:count]
+            if v % PART == PART - 1 or v == len(x) - 1:
+                total[0] += thrown
+                total[1] += blown
+                thrown[:], blown[:] = 0, 0
+        energy[0, first : first + count] = half * inertia * total[0, :count]
+        energy[1, first : first + count] = half * drag * total[1, :count]
 
 
 @compiled

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from typing import Any
 
 import numba
@@ -37,7 +38,7 @@ def run_parts(loop: Callable[..., Any], count: int, *arguments: object) -> None:
     if threads not in _pools:
         _pools[threads] = ThreadPoolExecutor(threads - 1, "loops")
     edges = [part * count // threads for part in range(threads + 1)]
-    others = [_pools[threads].submit(loop, *arguments, *edge) for edge in zip(edges[1:], edges[2:])]
+    others = [_pools[threads].submit(loop, *arguments, *edge) for edge in pairwise(edges[1:])]
     loop(*arguments, *edges[:2])
     for other in others:
         other.result()
