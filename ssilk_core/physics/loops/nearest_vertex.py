@@ -2,9 +2,9 @@
 """The exact nearest body vertex; reference: `collision.nearest_vertex`.
 
 As in `kernels.nearest_vertex`, vertices of the garment come in compact blocks and those of the body in compact
-groups, each with its bounding box. A block first visits the group nearest to it, which bounds the distances, and then only
-groups whose boxes are within this bound. Of equally near vertices the one visited first counts, so that results are
-deterministic.
+groups, each with its bounding box. A block first visits the group nearest to it, which bounds the distances, and then
+only groups whose boxes are within this bound. Of equally near vertices the one visited first counts, so that results
+are deterministic.
 """
 
 from __future__ import annotations
