@@ -100,7 +100,7 @@ def nearest_planes(
 
     With `body.faces` normals are the directions from b to x, which are the gradient of the distance; otherwise they
     are interpolated. Cloth that is far away (`MAX_QUERY_DISTANCE`, and `TIGHT_REACH` with `patches`) has the
-    direction from the nearest vertex.
+    direction from the nearest vertex, or on a processor from any that is as far away.
 
     Args:
         x: garment positions (V, 3, N).
@@ -209,8 +209,13 @@ def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
     return body.faces is None or (body.patches is not None and patches is None)
 
 
-def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Tensor:
-    """Return the index of the nearest body vertex (V, N), int32 from kernels and loops and int64 elsewhere."""
+def _nearest_vertex(
+    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None, enough: float = math.inf
+) -> Tensor:
+    """Return the index of the nearest body vertex (V, N), int32 from kernels and loops and int64 elsewhere.
+
+    Where all vertices are further than `enough` [m], it may be that of any: on a processor this saves time.
+    """
     on_gpu = kernels.supports(x)
     if not on_gpu and not loops.supports(x):
         return nearest_vertex(x, body.points, patches.vertices if patches else None)
@@ -220,12 +225,15 @@ def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: 
         else:
             from ..loops.nearest_vertex import nearest_candidate_loop as among
         return among(x, body.points, patches.vertices)
-    if on_gpu:
-        from ..kernels.nearest_vertex import nearest_vertex_kernel as search
-    else:
-        from ..loops.nearest_vertex import nearest_vertex_loop as search
     groups = consecutive_blocks(len(body.points), BODY_GROUP, x.device) if body.groups is None else body.groups
-    return search(x, body.points, _in_blocks(x, blocks), groups)
+    given = x, body.points, _in_blocks(x, blocks), groups
+    if on_gpu:
+        from ..kernels.nearest_vertex import nearest_vertex_kernel
+
+        return nearest_vertex_kernel(*given)
+    from ..loops.nearest_vertex import nearest_vertex_loop
+
+    return nearest_vertex_loop(*given, enough)
 
 
 def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
@@ -243,7 +251,8 @@ def _by_kernels(
     else:
         from ..loops.closest_point import closest_point_loop as on_surface
         from ..loops.planes import one_ring_loop as around_vertex
-    index = _nearest_vertex(x, body, blocks, patches)
+    enough = MAX_QUERY_DISTANCE if body.faces is None else MAX_DEPTH
+    index = _nearest_vertex(x, body, blocks, patches, enough)
     if body.faces is not None and body.patches is not None:
         limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
         return on_surface(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)

@@ -169,6 +169,11 @@ def _search(x, index, points, normals, blocks, patches, normal, offset, max_dist
                 length = max(sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-8))
                 nx, ny, nz = nx / length, ny / length, nz / length
                 dx, dy, dz = px[i] - bx, py[i] - by, pz[i] - bz
+                if found:  # along the edges, whose rounding errors are smaller than those of positions
+                    e = owner[i]
+                    dx = px[i] - corners[0, e] - s * corners[3, e] - t * corners[6, e]
+                    dy = py[i] - corners[1, e] - s * corners[4, e] - t * corners[7, e]
+                    dz = pz[i] - corners[2, e] - s * corners[5, e] - t * corners[8, e]
                 away = sqrt(dx * dx + dy * dy + dz * dz)
                 level = -deep_cosine * away * min(away / max_distance, one)
                 side = -one if found and dx * nx + dy * ny + dz * nz < level else one

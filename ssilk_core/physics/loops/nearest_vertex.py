@@ -9,6 +9,8 @@ are deterministic.
 
 from __future__ import annotations
 
+from math import inf
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -19,16 +21,19 @@ SAFE = np.float32(1 - 1e-5)  # bounds the relative rounding error of a gap, so t
 FAR = np.float32(np.inf)
 
 
-def nearest_vertex_loop(x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor) -> Tensor:
+def nearest_vertex_loop(
+    x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor, enough: float = inf
+) -> Tensor:
     """Return the index of the nearest body vertex, int32 of shape (V, N).
 
     Args:
         x, points: garment (V, 3, N) and body (B, 3, N), float32.
         blocks, groups: their vertices in compact blocks (`collision.nearest_vertex.compact_blocks`), int32.
+        enough: vertices of the garment further than this from every body vertex [m] get any of these.
     """
     found = torch.empty(len(x), x.shape[2], dtype=torch.int32)
     given = array(x), array(points), array(blocks), array(groups)
-    run_parts(_nearest, x.shape[2], *given, found.numpy())
+    run_parts(_nearest, x.shape[2], *given, np.float32(enough**2), found.numpy())
     return found
 
 
@@ -59,7 +64,7 @@ def _pack(points, table, frame, packed, boxes):
 
 
 @compiled
-def _nearest(x, points, blocks, groups, found, start, stop):
+def _nearest(x, points, blocks, groups, enough, found, start, stop):
     count, size = blocks.shape
     group_count, group_size = groups.shape
     cloth, cloth_boxes = np.empty((3, count * size), np.float32), np.empty((6, count), np.float32)
@@ -101,6 +106,7 @@ def _nearest(x, points, blocks, groups, found, start, stop):
                 bound = zero
                 for i in range(size):
                     bound = max(bound, best[i])
+                bound = enough if bound > enough else bound
             for i in range(size):
                 found[blocks[block, i], frame] = groups[owner[i] // group_size, owner[i] % group_size]
 
