@@ -9,8 +9,9 @@ how its range is split, so results are the same for any number of threads.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
@@ -25,13 +26,27 @@ LANES = 8  # frames that a loop processes at once, in one vector register
 compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
 
 _pools: dict[int, ThreadPoolExecutor] = {}
+_lent: list[int] = []  # threads that PyTorch leaves to loops
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pools.clear)  # a child has none of the threads
 
 
+@contextmanager
+def all_threads() -> Iterator[None]:
+    """Give all of PyTorch's threads to loops, and one to PyTorch: small operations are done sooner than shared."""
+    threads = torch.get_num_threads()
+    _lent.append(threads)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        _lent.pop()
+
+
 def run_parts(loop: Callable[..., Any], count: int, *arguments: object) -> None:
     """Call `loop(*arguments, start, stop)` for parts of range(count), one for each of PyTorch's threads."""
-    threads = min(torch.get_num_threads(), count)
+    threads = min(_lent[-1] if _lent else torch.get_num_threads(), count)
     if threads < 2:
         loop(*arguments, 0, count)
         return

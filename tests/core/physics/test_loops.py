@@ -128,6 +128,17 @@ def test_results_do_not_depend_on_the_number_of_threads(body, queries):
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
 
 
+def test_loops_take_the_threads_that_pytorch_leaves_to_them():
+    from ssilk_core.physics.loops.running import all_threads, run_parts
+
+    torch.set_num_threads(3)
+    parts: list[int] = []
+    with all_threads():
+        assert torch.get_num_threads() == 1
+        run_parts(lambda start, stop: parts.append(stop - start), 6)
+    assert parts == [2, 2, 2] and torch.get_num_threads() == 3
+
+
 def test_a_query_that_is_not_a_number_spoils_no_other(body, queries):
     broken = queries.clone()
     broken[3, 1, 2] = torch.nan
