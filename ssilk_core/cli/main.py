@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Collection, Sequence
 from importlib import import_module
@@ -65,6 +66,9 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
             "onnxscript")  # fmt: skip
 
 
+TRAINING = ("train", "wardrobe", "demo")  # verbs that train
+
+
 def module_of(verb: str) -> ModuleType:
     """Return the module of a verb."""
     return import_module(f".{verb}", __package__)
@@ -103,6 +107,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code: 0, 2 bad input, 3 not verified, 4 tasks failed, 130 interrupted."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     report: Reporter = JsonReporter() if "--json" in words else TextReporter()
+    if words[:1] and words[0] in TRAINING:
+        # PyTorch's threads otherwise keep cores busy while they wait. Those of `physics.loops` then lack them, and
+        # beside other programs a step takes several times as long. This is read when PyTorch is imported.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         options = parser(_asked(words)).parse_args(words)
         need_inputs(options)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Linear blend skinning: sparse in kernels where they serve, one dense matrix product over joints elsewhere.
+"""Linear blend skinning: sparse in kernels and loops where they serve, else one dense matrix product over joints.
 
 Layouts keep frames last: matrices (joints, 3, 4, N) take the bind pose to the posed world, positions are (V, 3, N).
 """
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..scene.assets import Ints, SkinWeights
-from . import kernels
+from . import kernels, loops
 
 PARTS = 16  # programs that share the gradient of a joint's matrix, so that few joints use a whole GPU
 
@@ -87,6 +87,11 @@ class Skinning(nn.Module):
 
             movers = (self.first_trainable, self.entries, self.starts)
             return skin_kernel(rest, offsets, weights, matrices, (self.joints, self.counts), movers)
+        if loops.supports(matrices):
+            from .loops.skinning import skin_loop
+
+            trained = self.first_trainable, self.first_trainable + len(self.starts)
+            return skin_loop(rest, offsets, weights, matrices, (self.joints, self.counts), trained)
         points = rest[:, :, None] if offsets is None else rest[:, :, None] + offsets
         return transform_points(blend_matrices(self.dense(weights), matrices[self.used]), points)
 
@@ -96,6 +101,10 @@ class Skinning(nn.Module):
             from .kernels.skinning import skin_surface_kernel
 
             return skin_surface_kernel(points, normals, self.weights, matrices, (self.joints, self.counts))
+        if loops.supports(matrices):
+            from .loops.skinning import skin_surface_loop
+
+            return skin_surface_loop(points, normals, self.weights, matrices, (self.joints, self.counts))
         affine = blend_matrices(self.dense(self.weights), matrices[self.used])
         direction = transform_directions(affine, normals[:, :, None])
         return transform_points(affine, points[:, :, None]), direction / direction.norm(

@@ -6,9 +6,10 @@ from __future__ import annotations
 from .settings import TrainConfig
 
 # Seconds per contact sample and frame in a complete optimiser step, and per step: a cape of 7,900 samples on two CPU
-# threads beside a window of Blender, validations included ("draft"), four garments of 7,300 to 10,000 on a GPU that
-# trained two at once. A GPU's small steps take as long as their launches. Only measured devices are listed.
-SECONDS_PER_SAMPLE = {"cpu": 2.6e-6, "cuda": 0.9e-9}
+# threads beside other programs, validations included ("draft", with `physics.loops`), four garments of 7,300 to
+# 10,000 on a GPU that trained two at once. A GPU's small steps take as long as their launches. Only measured devices
+# are listed.
+SECONDS_PER_SAMPLE = {"cpu": 5e-7, "cuda": 0.9e-9}
 SECONDS_PER_STEP = {"cpu": 0.0, "cuda": 8e-3}
 
 

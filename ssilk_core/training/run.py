@@ -18,11 +18,13 @@ from torch import Tensor
 from ..devices import busy_cores, select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
+from ..physics import loops
 from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
 from .budget import VALIDATION_SHARE, check_estimate, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
+from .first_steps import compile_loops
 from .job import TrainJob
 from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -87,6 +89,9 @@ class TrainingRun:
         self.parts = build_parts(job, self.device, group, report)
         if not job.resume:
             self._fit_batch()
+        if job.minutes and job.is_trainable and loops.available(self.device):
+            report(Message("loops are compiled for this processor, or read where they were before"))
+            compile_loops(self.parts, self.config)
         self.lbs = self._score_lbs()
         if job.minutes and job.is_trainable:
             if job.resume:

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from ..network.model.network import GarmentModel
+from ..physics import loops
+from .memory import decoded_frames
 from .muon import Muon
 from .objective import Objective, total
 from .settings import TrainConfig
@@ -20,6 +22,7 @@ from .skipped_steps import SkippedSteps
 from .windows import WindowSampler
 
 MIN_GRADIENT_NORM = 1e-30  # floor for the norm that gradients are divided by
+SMALL_PRODUCT = 1 << 24  # multiplications: 1 ms of one core
 EAGER_STEPS = 3  # before a CUDA graph is captured: allocators, handles and kernels settle
 
 
@@ -165,8 +168,19 @@ class Stepper:
         body = self.static_step if name == "static" else self.dynamic_step
         if self.device.type == "cuda":
             self._replay(name, body)
+        elif self._is_small and loops.available(self.device):
+            from ..physics.loops.running import all_threads
+
+            with all_threads():
+                body()
         else:
             body()
+
+    @property
+    def _is_small(self) -> bool:
+        """Whether the networks' products of a step are so small that threads would wait more than they compute."""
+        config, widest = self.config, max(self.model.config.widths)
+        return decoded_frames(config, config.batch) * widest**2 < SMALL_PRODUCT
 
     def _replay(self, phase: str, body: Callable[[], None]) -> None:
         """Do a step as a CUDA graph, captured in each phase after a few eager steps."""

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 HEAVY = ("torch", "pxr", "igl", "scipy", "trimesh", "PIL", "embreex", "imageio_ffmpeg", "anny", "bpy", "triton",
-         "matplotlib")  # fmt: skip
+         "matplotlib", "numba")  # fmt: skip
 
 
 def run_with_arguments(*arguments: str) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...physics import kernels
+from ...physics import kernels, loops
 from ...physics.skinning import Skinning
 from ...scene.assets import PINNED, Scene
 from ..parameters import IDENTITY, OUTPUT_SCALE
@@ -168,6 +168,10 @@ class Decoder(nn.Module):
             from ...physics.kernels.proxies import proxies_kernel
 
             return proxies_kernel(values, self.pivots, self.parents, character)
+        if loops.supports(character):
+            from ...physics.loops.proxies import proxies_loop
+
+            return proxies_loop(values, self.pivots, self.parents, character)
         return self.proxy_matrices(transform_of(values), character)
 
     def _offsets(self, activation: Tensor) -> Tensor | None:

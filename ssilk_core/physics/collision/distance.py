@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .. import kernels
+from .. import kernels, loops
 from .closest_point import bounding_spheres, closest_on_faces, frames_at_once
 from .limb_axes import PosedLimbs
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK, consecutive_blocks, nearest_vertex
@@ -100,7 +100,7 @@ def nearest_planes(
 
     With `body.faces` normals are the directions from b to x, which are the gradient of the distance; otherwise they
     are interpolated. Cloth that is far away (`MAX_QUERY_DISTANCE`, and `TIGHT_REACH` with `patches`) has the
-    direction from the nearest vertex.
+    direction from the nearest vertex, or on a processor from any that is as far away.
 
     Args:
         x: garment positions (V, 3, N).
@@ -111,7 +111,7 @@ def nearest_planes(
     """
     if patches is not None and body.rings is not None:
         body = replace(body, faces=None)
-    if kernels.supports(x) and _have_kernel(body, patches):
+    if (kernels.supports(x) or loops.supports(x)) and _have_kernel(body, patches):
         return _by_kernels(x, body, blocks, patches)
     index, normal, offset, search_radius = _at_vertices(x, body, blocks, patches)
     if body.faces is not None:
@@ -209,18 +209,31 @@ def _have_kernel(body: PosedBody, patches: Patches | None) -> bool:
     return body.faces is None or (body.patches is not None and patches is None)
 
 
-def _nearest_vertex(x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None) -> Tensor:
-    """Return the index of the nearest body vertex (V, N), int32 from the kernels and int64 elsewhere."""
-    if not kernels.supports(x):
+def _nearest_vertex(
+    x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None, enough: float = math.inf
+) -> Tensor:
+    """Return the index of the nearest body vertex (V, N), int32 from kernels and loops and int64 elsewhere.
+
+    Where all vertices are further than `enough` [m], it may be that of any: on a processor this saves time.
+    """
+    on_gpu = kernels.supports(x)
+    if not on_gpu and not loops.supports(x):
         return nearest_vertex(x, body.points, patches.vertices if patches else None)
     if patches is not None:
-        from ..kernels.candidates import nearest_candidate_kernel
-
-        return nearest_candidate_kernel(x, body.points, patches.vertices)
-    from ..kernels.nearest_vertex import nearest_vertex_kernel
-
+        if on_gpu:
+            from ..kernels.candidates import nearest_candidate_kernel as among
+        else:
+            from ..loops.nearest_vertex import nearest_candidate_loop as among
+        return among(x, body.points, patches.vertices)
     groups = consecutive_blocks(len(body.points), BODY_GROUP, x.device) if body.groups is None else body.groups
-    return nearest_vertex_kernel(x, body.points, _in_blocks(x, blocks), groups)
+    given = x, body.points, _in_blocks(x, blocks), groups
+    if on_gpu:
+        from ..kernels.nearest_vertex import nearest_vertex_kernel
+
+        return nearest_vertex_kernel(*given)
+    from ..loops.nearest_vertex import nearest_vertex_loop
+
+    return nearest_vertex_loop(*given, enough)
 
 
 def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
@@ -231,16 +244,21 @@ def _in_blocks(x: Tensor, blocks: Tensor | None) -> Tensor:
 def _by_kernels(
     x: Tensor, body: PosedBody, blocks: Tensor | None, patches: Patches | None = None
 ) -> tuple[Tensor, Tensor]:
-    from ..kernels.closest_point import closest_point_kernel
-    from ..kernels.one_ring import one_ring_kernel
-
-    index = _nearest_vertex(x, body, blocks, patches)
+    """Return the result of `nearest_planes` from fused kernels, or on a processor from compiled loops."""
+    if kernels.supports(x):
+        from ..kernels.closest_point import closest_point_kernel as on_surface
+        from ..kernels.one_ring import one_ring_kernel as around_vertex
+    else:
+        from ..loops.closest_point import closest_point_loop as on_surface
+        from ..loops.planes import one_ring_loop as around_vertex
+    enough = MAX_QUERY_DISTANCE if body.faces is None else MAX_DEPTH
+    index = _nearest_vertex(x, body, blocks, patches, enough)
     if body.faces is not None and body.patches is not None:
         limits = MAX_QUERY_DISTANCE, MAX_DEPTH, DEEP_COSINE, SURFACE_EPSILON
-        return closest_point_kernel(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
+        return on_surface(x, index, body.points, body.normals, _in_blocks(x, blocks), body.patches, *limits)
     rings = index.new_zeros(len(body.points), 1) if body.rings is None else body.rings
     on_triangles = body.rings is not None
-    return one_ring_kernel(
+    return around_vertex(
         x, index, body.points, body.normals, rings, MAX_QUERY_DISTANCE, _reach(patches), on_triangles
     )
 

@@ -11,7 +11,7 @@ from ...scene.assets import LOOSE, TIGHT, Floats, Ints, Mesh
 from ...scene.fabrics import Fabric
 from ...scene.mesh import topology
 from ...scene.mesh.topology import SLIVER
-from .. import kernels
+from .. import kernels, loops
 from ..collision import PosedBody, signed_distance, signed_distance_to_planes
 from ..collision.samples import ContactSamples, SampledCloth, contact_samples
 from ..kernels.corners import elastic_tables
@@ -125,12 +125,16 @@ class GarmentEnergy:
         return (self.cloth.area * self.law.energy(distance)).sum(0)
 
     def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return stretch and bending; this and the next two methods use fused kernels where available."""
-        if not kernels.supports(x):
-            return self.stretch(x), self.bending(x)
-        from ..kernels.elastic import elastic_kernel
+        """Return stretch and bending; this and the next two methods are fused where a device can."""
+        if kernels.supports(x):
+            from ..kernels.elastic import elastic_kernel
 
-        return elastic_kernel(x, self._tables, self.fabric)
+            return elastic_kernel(x, self._tables, self.fabric)
+        if loops.supports(x):
+            from ..loops.elastic import elastic_loop
+
+            return elastic_loop(x, self._tables, self.fabric)
+        return self.stretch(x), self.bending(x)
 
     def gravity_and_collision(
         self, x: Tensor, root: Tensor, gravity: Tensor, sampled: Tensor, normal: Tensor, offset: Tensor
@@ -142,16 +146,18 @@ class GarmentEnergy:
             normal, offset: unit normals (S, 3, N) and offsets (S, N) of the planes; they have no gradient.
         """
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
-        if not kernels.supports(x):
-            collision = self.collision_at(signed_distance_to_planes(sampled, normal, offset))
-            return self.gravity(x - root, gravity), collision
-        from ..kernels.pointwise import contact_kernel, gravity_kernel
-
         law = self.law.stiffness, self.law.start, self.law.ramp
-        return (
-            gravity_kernel(x, self.mass, root, gravity),
-            contact_kernel(sampled, self.cloth.area, (normal, offset), *law),
-        )
+        if kernels.supports(x):
+            from ..kernels.pointwise import contact_kernel, gravity_kernel
+
+            falling = gravity_kernel(x, self.mass, root, gravity)
+            return falling, contact_kernel(sampled, self.cloth.area, (normal, offset), *law)
+        falling = self.gravity(x - root, gravity)
+        if loops.supports(x):
+            from ..loops.pointwise import contact_loop
+
+            return falling, contact_loop(sampled, self.cloth.area, (normal, offset), *law)
+        return falling, self.collision_at(signed_distance_to_planes(sampled, normal, offset))
 
     def inertia_and_drag(
         self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float
@@ -162,13 +168,17 @@ class GarmentEnergy:
             last, before: positions one and two frames ago (V, 3, M).
             shift: displacement of the air, which moves with the character's root, since the last frame (3, M).
         """
-        if not kernels.supports(x):
-            moving = x[..., : last.shape[-1]]
-            return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
-        from ..kernels.pointwise import inertia_and_drag_kernel
-
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
-        return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
+        if kernels.supports(x):
+            from ..kernels.pointwise import inertia_and_drag_kernel
+
+            return inertia_and_drag_kernel(x, self.mass, last, before, shift, *weights)
+        if loops.supports(x):
+            from ..loops.pointwise import inertia_and_drag_loop
+
+            return inertia_and_drag_loop(x, self.mass, last, before, shift, *weights)
+        moving = x[..., : last.shape[-1]]
+        return self.inertia(moving, 2 * last - before, dt), self.drag(moving, last + shift, dt)
 
 
 def _stiffness_shares(

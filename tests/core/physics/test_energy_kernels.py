@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fused energies against their reference implementations in double precision, in values and in gradients."""
+"""Fused energies against their reference implementations in double precision, in values and in gradients.
 
-import importlib.util
+Triton's kernels, and the loops that numba compiles for a processor.
+"""
+
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ssilk_core.physics import kernels
+from ssilk_core.physics import kernels, loops
 from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 
-pytestmark = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="kernels need Triton")
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
 STVK = Fabric("stvk", bending=1e-4, margin=0.02)
 WOVEN = Fabric("woven", stretch_model="baraff_witkin", bending=1e-4)
@@ -22,16 +24,22 @@ FRAMES, MOVING = 20, 13  # all, and those with a past; no block of frames divide
 Found = list[tuple[np.ndarray, np.ndarray]]
 
 
-@pytest.fixture(autouse=True)
-def small_blocks(monkeypatch) -> None:
-    """Serve this device by kernels, with several blocks of frames and several shares of each sum."""
+@pytest.fixture(autouse=True, params=["kernels", "loops"])
+def fused(request, monkeypatch) -> str:
+    """Serve a device by one of both, kernels with several blocks of frames and several shares of each sum."""
+    pytest.importorskip({"kernels": "triton", "loops": "numba"}[request.param])
+    monkeypatch.setattr(kernels, "available", lambda device: request.param == "kernels")
+    monkeypatch.setattr(loops, "available", lambda device: request.param == "loops")
+    if request.param == "loops":
+        monkeypatch.setattr(sys.modules[__name__], "DEVICE", "cpu")
+        return request.param
     from ssilk_core.physics.kernels import elastic, pointwise
 
-    monkeypatch.setattr(kernels, "available", lambda device: True)
     for module in (elastic, pointwise):
         monkeypatch.setattr(module, "FRAMES", 16)
     monkeypatch.setattr(elastic, "ELEMENTS", 3)
     monkeypatch.setattr(pointwise, "VERTICES", 4)
+    return request.param
 
 
 @pytest.fixture(scope="module")

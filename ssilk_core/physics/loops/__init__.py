@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops that numba compiles for a processor: what the Triton kernels in `physics.kernels` are for a GPU.
+
+Each has the interface of its kernel and the same reference in PyTorch, which runs where numba is not installed. The
+modules with loops import numba, so they are imported only where `available` returns true. Compiled code is kept in
+numba's cache, which knows a loop by its own file: what a loop calls is defined beside it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import cache
+
+import torch
+from torch import Tensor
+
+
+def available(device: torch.device) -> bool:
+    """Return whether a device runs the loops: a processor with numba installed; not while a graph is exported."""
+    return device.type == "cpu" and _installed() and not torch.compiler.is_compiling()
+
+
+def supports(x: Tensor) -> bool:
+    """Return whether the loops support a tensor: float32 on such a device."""
+    return x.dtype == torch.float32 and available(x.device)
+
+
+@cache
+def _installed() -> bool:
+    return importlib.util.find_spec("numba") is not None
