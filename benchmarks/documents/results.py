@@ -102,9 +102,8 @@ def trainings() -> str:
 
 def beside_solver() -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield garment, split and figures of networks that the simulator went on from."""
-    for name in ("cape", "hooded_dress"):
-        source = "evaluate_cape" if name == "cape" else "evaluate_solver_hooded_dress"
-        for row in document(source)["figures"]:
+    for name in GARMENTS:
+        for row in document(f"evaluate_{name}")["figures"]:
             if row["method"] == "ssilk" and row["split"] in SPLITS:
                 yield name, row["split"], row["figures"]["solver"]
 
@@ -128,13 +127,15 @@ def own_start() -> str:
 def rest() -> str:
     """Whether garments come to rest after stops, and repeat themselves in loops."""
     rows: list[list[object]] = []
-    for name in ("cape", "fringe_skirt"):
+    named: set[str] = set()
+    for name in GARMENTS:
         for row in document(f"evaluate_{name}")["figures"]:
             if row["method"] == "ssilk" and row["split"] in SPLITS:
                 stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
                 time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
                 away = (fixed(stops[figure], 0, 1e-3) for figure in ("static_distance", "max_static_distance"))
-                words = "" if rows and name == "cape" else GARMENTS[name]
+                words = "" if name in named else GARMENTS[name]
+                named.add(name)
                 rows.append([words, row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
                              *away, fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
     header = ("garment", "clips", "stops", "settled [%]", "median time [s]", "distance to P [mm]", "largest",

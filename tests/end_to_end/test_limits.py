@@ -129,7 +129,7 @@ def test_the_same_inputs_give_the_same_bytes_wherever_they_lie(toy, tmp_path, mo
         assert run(f"bake {inputs} --points -o '{folder}/layers'") == 0
     one, other = tmp_path / "here/layers", tmp_path / "a studio/elsewhere/layers"
     files = sorted(path.relative_to(one) for path in one.rglob("*") if path.is_file())
-    assert len(files) == 7
+    assert len(files) == 8
     for file in files:
         assert (one / file).read_bytes() == (other / file).read_bytes(), file
         if file.suffix == ".usdc":
