@@ -53,7 +53,8 @@ class ClothPoints:
         self.size = feedback_size(file.scene, file.config)
         whole = tiles(file.scene, file.parameters)
         shapes = np.concatenate([tile.shapes.reshape(len(tile.shapes), 3, -1) for tile in whole], axis=2)
-        self.shapes = as_float32(shapes[:, :, rows].transpose(2, 1, 0))  # (M, 3, K + 1), the rest shape last
+        shapes = shapes[:, :, rows].transpose(0, 2, 1).reshape(len(shapes), -1)  # (K + 1, 3 M), the rest shape last
+        self.shapes, self.rest = as_float32(shapes[:-1]), as_float32(shapes[-1])
         weights = weights_of_joints(file.scene, file.parameters, rows)
         self.of_character, self.of_proxies = (as_float32(part) for part in np.split(weights, [self.joints], axis=1))
 
@@ -64,14 +65,14 @@ class ClothPoints:
         return BodyCourse(own, affine, as_float32(bend))
 
     def points(self, outputs: NDArray, course: BodyCourse, frames: slice) -> NDArray:
-        """Return points (M, 3, F) of outputs of D (outputs, F) in frames of a course, counted with the two before."""
+        """Return points (F, M, 3) of outputs of D (outputs, F) in frames of a course, counted with the two before."""
         activations, transforms = self.decoder.pose_of(outputs)
-        character = course.matrices[frames].transpose(1, 2, 3, 0)
-        proxies = self.kinematics.matrices(transforms, character)[self.joints :]
-        affine = np.tensordot(self.of_proxies, proxies, 1)
-        affine += course.affine[frames].transpose(1, 2, 3, 0)
-        rest = self.shapes[:, :, :-1] @ activations + self.shapes[:, :, -1:]
-        return (affine[:, :, :3] * rest[:, None]).sum(2) + affine[:, :, 3]
+        matrices = self.kinematics.matrices(transforms, course.matrices[frames].transpose(1, 2, 3, 0))
+        proxies = matrices[self.joints :].transpose(3, 0, 1, 2).reshape(outputs.shape[1], -1, 12)
+        affine = (self.of_proxies @ proxies).reshape(-1, self.count, 3, 4)
+        affine += course.affine[frames]
+        rest = (activations.T @ self.shapes + self.rest).reshape(-1, self.count, 3, 1)
+        return (affine[..., :3] @ rest)[..., 0] + affine[..., 3]
 
     def proxies(self, outputs: NDArray) -> NDArray:
         """Return the proxies (C P, F) of outputs of D (outputs, F), as S sees them."""
@@ -111,8 +112,8 @@ class SeenCloth:
     def _look_at_points(self, into: NDArray) -> None:
         both = np.stack([self.newer, 2 * self.newer - self.older], axis=1)
         if self.before is None:
-            self.before = self.points.points(self.older[:, None], self.course, self._past(0, 1))[..., 0]
-        now, carried = self.points.points(both, self.course, self._past(1, 3)).transpose(2, 0, 1)
+            self.before = self.points.points(self.older[:, None], self.course, self._past(0, 1))[0]
+        now, carried = self.points.points(both, self.course, self._past(1, 3))
         away = now + now
         away -= self.before
         away -= carried

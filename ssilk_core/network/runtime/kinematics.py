@@ -61,15 +61,15 @@ class ProxyKinematics:
             transforms: of the proxies, [R', t] in the axes of the bind pose (P, 3, 4, F).
             character: skinning matrices of the character's joints (J, 3, 4, F).
         """
-        kept = self.pivots[:, :, None] - sum(
-            transforms[:, :, axis] * self.pivots[:, None, axis, None] for axis in range(3)
-        )
-        placed = np.concatenate([transforms[:, :, :3], (kept + transforms[:, :, 3])[:, :, None]], axis=2)
-        whole = np.empty((self.joints + self.count, *character.shape[1:]), dtype=np.float32)
-        whole[: self.joints] = character
+        # Frames first, so that one product of many small matrices serves all joints of a generation.
+        turns, displacements = np.split(transforms.transpose(3, 0, 1, 2), [3], axis=3)
+        placed = self.pivots[:, :, None] - turns @ self.pivots[:, :, None] + displacements
+        local = np.concatenate([turns, placed], axis=3)
+        whole = np.empty((len(local), self.joints + self.count, 3, 4), dtype=np.float32)
+        whole[:, : self.joints] = character.transpose(3, 0, 1, 2)
         for proxies, parents in self.generations:
-            above, own = whole[parents], placed[proxies]
-            product = sum(above[:, :, axis, None] * own[:, None, axis] for axis in range(3))
-            product[:, :, 3] += above[:, :, 3]
-            whole[self.joints + proxies] = product
-        return whole
+            above = whole[:, parents]
+            product = above[..., :3] @ local[:, proxies]
+            product[..., 3] += above[..., 3]
+            whole[:, self.joints + proxies] = product
+        return whole.transpose(1, 2, 3, 0)
