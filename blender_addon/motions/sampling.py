@@ -149,9 +149,7 @@ def _sample_slice(armature: bpy.types.Object, joints: Joints, take: SampledTake)
                 return
 
 
-def _need_same_size(
-    armature: bpy.types.Object, evaluated: bpy.types.Object, motion: str, frame: int
-) -> None:
+def _need_same_size(armature: bpy.types.Object, evaluated: bpy.types.Object, motion: str, frame: int) -> None:
     """Raise `SetupError` if an armature has another scale in a frame than when its joints were read."""
     now, then = armature.matrix_world.median_scale, evaluated.matrix_world.median_scale
     if abs(then - now) > UNEVEN * now:

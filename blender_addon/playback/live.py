@@ -162,9 +162,7 @@ class Live:
             return False
         bones = armature.pose.bones
         lost = self._lost_shapes(garment) or any(name not in bones for name in self.joints.names)
-        return lost or not (
-            self.unkeyed or has_live_keys(garment, self._moved(garment, armature))
-        )
+        return lost or not (self.unkeyed or has_live_keys(garment, self._moved(garment, armature)))
 
     def dress_again(self) -> None:
         """Give the garment its shapes, weights and keys once more."""

@@ -77,9 +77,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     )
     live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"}, override=SHOTS)
     awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
-    heat: StringProperty(
-        description="What the heat map shows; empty for none", options={"HIDDEN"}, override=SHOTS
-    )
+    heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"}, override=SHOTS)
     heat_told: StringProperty(
         description="What the heat map shows in this frame, in words", options={"HIDDEN"}, override=SHOTS
     )

@@ -152,9 +152,7 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     names = [one.name for one in models]
     for told in (lambda path: path.stem, lambda path: path.with_suffix("")):
         count = Counter(names)
-        names = [
-            name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)
-        ]
+        names = [name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)]
     return [
         EvaluatedMethod(name, one.file.joints, one.on, one.file.config.descriptors)
         for name, one in zip(names, models)

@@ -69,7 +69,7 @@ class ModelConfig:
     feedback_points: int = 64
     feedback_proxies: bool = False
     stiffness: float = 0.2
-    velocity_allowance: float = 0.9
+    velocity_allowance: float = 0.05
     fps: float = 30.0
 
     def __post_init__(self) -> None:

@@ -179,8 +179,8 @@ class Stepper:
     @property
     def _is_small(self) -> bool:
         """Whether the networks' products of a step are so small that threads would wait more than they compute."""
-        config, widest = self.config, max(self.model.config.widths)
-        return decoded_frames(config, config.batch) * widest**2 < SMALL_PRODUCT
+        widest = max(min(matrix.shape) for matrix in self.model.parameters() if matrix.ndim == 2)
+        return decoded_frames(self.config, self.config.batch) * widest**2 < SMALL_PRODUCT
 
     def _replay(self, phase: str, body: Callable[[], None]) -> None:
         """Do a step as a CUDA graph, captured in each phase after a few eager steps."""

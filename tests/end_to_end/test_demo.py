@@ -130,7 +130,8 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     said = capsys.readouterr().err
     assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
     made = load_model(shipped.shipped_path("cape")).provenance
-    trained = f"{made['base']['iteration']:,} iterations, then {made['iteration']:,} of the stepper alone,"
+    last, middle, first = (f"{each['iteration']:,}" for each in (made, made["base"], made["base"]["base"]))
+    trained = f"{first} iterations, then {middle} and {last} of the stepper alone,"
     assert f"shipped cape: {trained} on {len(made['motions'])} motions, seed" in said
     assert {path.name for path in tmp_path.iterdir()} == {
         *("wardrobe", "motions", "shot.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")

@@ -92,9 +92,7 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
 
     def is_behind(other: TaskRecord) -> bool:
         return any(
-            other.wearer != one.wearer
-            and other.root == one.root
-            and other.inputs["stage"] == one.inputs["stage"]
+            other.wearer != one.wearer and other.root == one.root and other.inputs["stage"] == one.inputs["stage"]
             for one in ours
         )
 

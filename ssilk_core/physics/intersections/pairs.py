@@ -33,9 +33,7 @@ def self_intersections(points: Floats, faces: Ints) -> NDArray[np.int64]:
     return _in_order(np.sort(found.reshape(-1, 2), axis=1))
 
 
-def intersections_between(
-    first: Floats, first_faces: Ints, second: Floats, second_faces: Ints
-) -> NDArray[np.int64]:
+def intersections_between(first: Floats, first_faces: Ints, second: Floats, second_faces: Ints) -> NDArray[np.int64]:
     """Return which triangles of a mesh intersect which of another, each pair once in ascending order, shape (P, 2).
 
     Args:

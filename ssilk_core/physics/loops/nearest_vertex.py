@@ -21,9 +21,7 @@ SAFE = np.float32(1 - 1e-5)  # bounds the relative rounding error of a gap, so t
 FAR = np.float32(np.inf)
 
 
-def nearest_vertex_loop(
-    x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor, enough: float = inf
-) -> Tensor:
+def nearest_vertex_loop(x: Tensor, points: Tensor, blocks: Tensor, groups: Tensor, enough: float = inf) -> Tensor:
     """Return the index of the nearest body vertex, int32 of shape (V, N).
 
     Args:

@@ -94,9 +94,7 @@ class IncrementalPotential:
         """The sparsity pattern of its Hessian."""
         return self._hessian.pattern
 
-    def body_distance(
-        self, x: Tensor, inputs: StepInputs, allowance: float = math.inf
-    ) -> SmoothedDistance | None:
+    def body_distance(self, x: Tensor, inputs: StepInputs, allowance: float = math.inf) -> SmoothedDistance | None:
         """Return the distances of the samples of x to the body, to second order.
 
         Args:

@@ -69,9 +69,7 @@ def takes_in(clips: Mapping[int, str], names: Collection[str]) -> list[int]:
     return [take for take, clip in clips.items() if clip in names]
 
 
-def figures(
-    tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin, cloth: ClothIntersections
-) -> Figures:
+def figures(tally: Tally, lbs_jerk: float, weight: float, covered: CoveredSkin, cloth: ClothIntersections) -> Figures:
     """Return the figures of a method.
 
     Args:

@@ -50,7 +50,7 @@ class Sums(nn.Module):
 
 @torch.no_grad()
 def test_spring_verlet_pulls_towards_the_rest_state():
-    scheme, sums = spring_verlet(stiffness=0.5, **FREE), Sums()
+    scheme, sums = spring_verlet(stiffness=0.5, velocity_allowance=0.9, **FREE), Sums()
     scheme.beta.fill_(0.5)
     scheme.share.copy_(torch.logit(torch.tensor([0.2, 0.4])))
     # p = (3, 4), z = (1.5, 1), v = (0.5, -1): zbar = 1.5 + 0.25 and 1 - 0.5; k = (0.1, 0.2)

@@ -30,9 +30,7 @@ from ssilk_core.scene.fabrics import Fabric
 pytestmark = pytest.mark.usefixtures("few_contacts")
 
 CLOTH = Fabric("toy", bending=1e-4, margin=0.02)
-EXACT = LatentOptions(
-    iterations=200, first_iterations=200, tolerance=1e-6, exact_contact=True
-)
+EXACT = LatentOptions(iterations=200, first_iterations=200, tolerance=1e-6, exact_contact=True)
 KINDS = {
     "turning": {},
     "moving": {"translations": True},

@@ -189,9 +189,7 @@ def _is_beside(path: Sdf.Path, own: Sdf.Path) -> bool:
     return not (own.HasPrefix(path) or path.HasPrefix(own))
 
 
-def _copy_garment(
-    stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path
-) -> tuple[UsdGeom.Mesh, str]:
+def _copy_garment(stage: Usd.Stage, skel: SkelSource, garment: Garment, out: str | Path) -> tuple[UsdGeom.Mesh, str]:
     """Define the garment below the SkelRoot in the stage's bind space, and say what its look loses.
 
     An older copy is replaced.
