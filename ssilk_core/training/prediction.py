@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 from .settings import TrainConfig
 
 # Seconds per contact sample and frame in a complete optimiser step, and per step: a cape of 7,900 samples on two CPU
-# threads beside other programs, validations included ("draft", with `physics.loops`), four garments of 7,300 to
-# 10,000 on a GPU that trained two at once. A GPU's small steps take as long as their launches. Only measured devices
-# are listed.
-SECONDS_PER_SAMPLE = {"cpu": 5e-7, "cuda": 0.9e-9}
+# threads beside other programs, validations included ("draft", with `physics.loops` or without), four garments of
+# 7,300 to 10,000 on a GPU that trained two at once. A GPU's small steps take as long as their launches. Only measured
+# devices are listed.
+SECONDS_PER_SAMPLE = {"cpu": 5e-7 if importlib.util.find_spec("numba") else 2.6e-6, "cuda": 0.9e-9}
 SECONDS_PER_STEP = {"cpu": 0.0, "cuda": 8e-3}
 
 

@@ -185,8 +185,9 @@ class LayerFolder:
         check_influences(rollout.influences, request.target, request.model)
         key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
         use = GarmentUse.of(task, inputs["model"], self.path)
-        write_use(self.path, task.garment, use)  # no asset is without it
+        write_use(self.path, task.garment, use.untold(self.path, task.garment))  # no asset is without it
         asset = self._asset(task, garment, use, report)
+        write_use(self.path, task.garment, use)  # the asset says so now
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
         record = TaskRecord(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -45,6 +45,12 @@ class GarmentUse:
         same = before is not None and before.model.sha256 == model.sha256
         told = {name: getattr(task, name) or (getattr(before, name) if same else None) for name in OF_ASSET}
         return cls(model, task.request.root, **told)
+
+    def untold(self, folder: Path, garment: str) -> GarmentUse:
+        """Return this with what the asset of a garment says of itself until it is written."""
+        before = _stated(_place(folder, garment))
+        kept = before if before is not None and before.model == self.model else GarmentUse(self.model, self.root)
+        return replace(self, asset_version=kept.asset_version, asset_identifier=kept.asset_identifier)
 
     def says(self, task: BakeTask) -> bool:
         """Return whether the asset says of itself what a task asks for."""

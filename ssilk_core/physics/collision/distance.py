@@ -138,8 +138,8 @@ def smoothed_planes(
     `MAX_QUERY_DISTANCE`, or `TIGHT_REACH` with `patches`.
 
     Args:
-        within: distances that matter outside of the body [m]; what is further away has that to the nearest vertex.
-            On a processor a small one saves time.
+        within: distances that matter outside of the body [m]; what is further away has that to a vertex that is
+            further away, too. On a processor a small one saves time.
     """
     single = x.float()
     flat = single.new_zeros(len(x), 3, *x.shape[1:])

@@ -9,7 +9,7 @@ EVERY = 4  # of so many frames one is counted, as libigl takes some 30 ms for on
 
 
 SHARE = "triangles that intersect others"
-NOT_COUNTED = "not counted, libigl 2.6.3 or newer is missing"  # in place of figures
+NOT_COUNTED = "not counted, as libigl 2.6.3 or newer was missing"  # in place of figures
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,12 +3,13 @@
 
 Each has the interface of its kernel and the same reference in PyTorch, which runs where numba is not installed. The
 modules with loops import numba, so they are imported only where `available` returns true. Compiled code is kept in
-numba's cache, which knows a loop by its own file: what a loop calls is defined beside it.
+numba's cache, which knows a loop by its own file: what a loop calls, and constants, are defined beside it.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from functools import cache
 
 import torch
@@ -27,4 +28,11 @@ def supports(x: Tensor) -> bool:
 
 @cache
 def _installed() -> bool:
-    return importlib.util.find_spec("numba") is not None
+    if importlib.util.find_spec("numba") is None:
+        return False
+    try:
+        from . import running  # noqa: F401
+    except ImportError as error:  # with another numpy, say
+        warnings.warn(f"numba cannot be used, and PyTorch takes five times as long: {error}", stacklevel=3)
+        return False
+    return True

@@ -18,7 +18,9 @@ from torch.autograd.function import once_differentiable
 
 from ...scene.fabrics import Fabric
 from ..kernels.corners import ElasticTables
-from .running import LANES, array, blocks_of, compiled, run_parts
+from .running import array, blocks_of, compiled, run_parts
+
+LANES = 8  # frames that a loop processes at once, in one vector register
 
 PART = 64  # elements that are added up before their sum is, so that rounding errors stay small
 HALF_PI, PI, TWO_PI = np.float32(np.pi / 2), np.float32(np.pi), np.float32(2 * np.pi)
@@ -41,7 +43,7 @@ class _Elastic(Function):
         rest = (tables.faces, tables.face_numbers, tables.hinges, tables.hinge_numbers)
         numbers = (np.float32(modulus) for modulus in moduli)
         out = energy.numpy(), slopes.numpy()
-        run_parts(_elastic, blocks_of(frames), array(x), *map(array, rest), *numbers, woven, wanted, *out)
+        run_parts(_elastic, blocks_of(frames, LANES), array(x), *map(array, rest), *numbers, woven, wanted, *out)
         ctx.save_for_backward(slopes)
         return energy[0], energy[1]
 

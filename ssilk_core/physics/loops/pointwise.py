@@ -12,7 +12,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from .running import LANES, array, blocks_of, compiled, run_parts
+from .running import array, blocks_of, compiled, run_parts
+
+LANES = 8  # frames that a loop processes at once, in one vector register
 
 PART = 64  # vertices that are added up before their sum is, so that rounding errors stay small
 
@@ -47,7 +49,7 @@ class _Contact(Function):
     def forward(ctx, x, area, normal, offset, law):
         ctx.law, ctx.given = law, [array(values) for values in (x, area, normal, offset)]
         energy = torch.empty(x.shape[2])
-        run_parts(_contact, blocks_of(x.shape[2]), *ctx.given, *law, energy.numpy())
+        run_parts(_contact, blocks_of(x.shape[2], LANES), *ctx.given, *law, energy.numpy())
         return energy
 
     @staticmethod
@@ -64,7 +66,7 @@ class _InertiaAndDrag(Function):
     def forward(ctx, x, mass, last, before, shift, inertia, drag):
         ctx.given, ctx.weights = [array(values) for values in (x, mass, last, before, shift)], (inertia, drag)
         energy = torch.empty(2, last.shape[2])
-        run_parts(_inertia_and_drag, blocks_of(last.shape[2]), *ctx.given, *ctx.weights, energy.numpy())
+        run_parts(_inertia_and_drag, blocks_of(last.shape[2], LANES), *ctx.given, *ctx.weights, energy.numpy())
         return energy[0], energy[1]
 
     @staticmethod

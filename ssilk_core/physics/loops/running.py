@@ -20,15 +20,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
-LANES = 8  # frames that a loop processes at once, in one vector register
-
-# Sums keep their order, and values that are not finite stay so.
-compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "nsz"})
+# Sums keep their order, and values that are not finite stay so. Compiled code that is kept does not know of these.
+OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lent: list[int] = []  # threads that PyTorch leaves to loops
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pools.clear)  # a child has none of the threads
+
+
+def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a loop that numba compiles when it is called; it is kept where numba has a folder to write to."""
+    try:
+        kept: Callable[..., Any] = numba.njit(cache=True, **OPTIONS)(loop)
+    except RuntimeError:  # no folder that this user may write to
+        kept = numba.njit(**OPTIONS)(loop)
+    return kept
 
 
 @contextmanager
@@ -64,6 +71,6 @@ def array(values: Tensor) -> np.ndarray:
     return values.detach().contiguous().numpy()
 
 
-def blocks_of(frames: int) -> int:
-    """Return how many blocks of `LANES` frames hold so many."""
-    return -(-frames // LANES)
+def blocks_of(frames: int, lanes: int) -> int:
+    """Return how many blocks of so many `lanes` hold so many frames."""
+    return -(-frames // lanes)

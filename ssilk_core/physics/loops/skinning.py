@@ -14,7 +14,9 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from .running import LANES, array, blocks_of, compiled, run_parts
+from .running import array, blocks_of, compiled, run_parts
+
+LANES = 8  # frames that a loop processes at once, in one vector register
 
 
 def skin_loop(
@@ -44,7 +46,7 @@ def skin_surface_loop(
     frames = matrices.shape[3]
     posed, turned = matrices.new_empty(2, *points.shape, frames).unbind()
     given = (array(values) for values in (points, normals, *influences, weights, matrices.flatten(1, 2)))
-    run_parts(_surface, blocks_of(frames), *given, posed.numpy(), turned.numpy())
+    run_parts(_surface, blocks_of(frames, LANES), *given, posed.numpy(), turned.numpy())
     return posed, turned
 
 
@@ -55,7 +57,7 @@ class _Skin(Function):
         ctx.given, ctx.trainable = [array(values) for values in given], trainable
         frames = matrices.shape[3]
         posed = matrices.new_empty(*points.shape[:2], frames)
-        run_parts(_skin, blocks_of(frames), *ctx.given, posed.numpy())
+        run_parts(_skin, blocks_of(frames, LANES), *ctx.given, posed.numpy())
         return posed
 
     @staticmethod
@@ -64,7 +66,7 @@ class _Skin(Function):
         (points, _, _, weights, matrices), (first, end) = ctx.given, ctx.trainable
         frames = upstream.shape[2]
         grad_points = upstream.new_empty(upstream.shape)
-        shares = upstream.new_zeros(blocks_of(frames), *weights.shape)
+        shares = upstream.new_zeros(blocks_of(frames, LANES), *weights.shape)
         grad_matrices = upstream.new_zeros(matrices.shape)
         moved = ctx.needs_input_grad[2] and end > first
         out = array(upstream), grad_points.numpy(), shares.numpy(), grad_matrices.numpy()

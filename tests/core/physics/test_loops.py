@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import builtins
 import os
 import subprocess
 import sys
@@ -128,6 +129,20 @@ def test_results_do_not_depend_on_the_number_of_threads(body, queries):
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
 
 
+def test_a_step_does_not_depend_on_the_number_of_threads(scene, toy_model, toy_motion, toy_objective):
+    """Energies, contact, skinning and proxies, forward and backward."""
+    model = toy_model(scene, translations=True)
+    objective = toy_objective(scene, model, toy_motion(scene, 40))
+    frames, down = torch.arange(3, 36), torch.tensor([[0.0, -1.0, 0.0]]).expand(33, 3)
+    results = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        model.zero_grad()
+        sum(values.sum() for values in objective.static(frames, down).values()).backward()
+        results.append({name: value.grad.clone() for name, value in model.named_parameters() if value.grad is not None})
+    assert len(results[0]) > 5 and all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+
+
 def test_loops_take_the_threads_that_pytorch_leaves_to_them():
     from ssilk_core.physics.loops.running import all_threads, run_parts
 
@@ -178,3 +193,35 @@ def test_a_fault_in_any_part_is_raised():
     torch.set_num_threads(2)
     with pytest.raises(ValueError, match="the last part"):
         run_parts(work, 4)
+
+
+@pytest.mark.parametrize("problem", [ImportError("numba needs another numpy")])
+def test_a_numba_that_cannot_be_imported_is_told_and_left(problem, monkeypatch):
+    whole = builtins.__import__
+
+    def without(name, *words, **named):
+        if name == "numba":
+            raise problem
+        return whole(name, *words, **named)
+
+    for name in [name for name in sys.modules if name == "numba" or name.endswith("loops.running")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delattr(loops, "running", raising=False)
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.warns(UserWarning, match="numba cannot be used, and PyTorch takes five times as long: numba needs"):
+        assert not loops._installed.__wrapped__()
+
+
+def test_loops_are_compiled_where_nothing_can_be_kept(monkeypatch):
+    from ssilk_core.physics.loops import running
+
+    asked, whole = [], running.numba.njit
+
+    def njit(**options):
+        asked.append(options.pop("cache", False))
+        if asked[-1]:
+            raise RuntimeError("cannot cache function: no locator available")
+        return whole(**options)
+
+    monkeypatch.setattr(running.numba, "njit", njit)
+    assert running.compiled(lambda value: value + 1)(2) == 3 and asked == [True, False]
