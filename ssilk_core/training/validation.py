@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from math import isfinite
 from pathlib import PurePath
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -34,6 +34,9 @@ from .step_errors import StepErrors
 SHOWN_FRAMES = 32, 256  # in which the skin that shows is counted
 MEASURED_STEPS = 16, 64
 CROSSED_FRAMES = 8  # in which triangles that intersect others are counted: a quarter of a second in all
+
+
+Counts = TypeVar("Counts")
 
 
 @dataclass(frozen=True)
@@ -137,38 +140,45 @@ class Validator:
         steps = self._step_errors(model, states)
         return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps)
 
-    @torch.no_grad()
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
-        own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
-        spread = self._spread(SHOWN_FRAMES[self.rest.is_cuda])
-        for number, latents in zip(own, states):
-            clip, chosen = self.clips[number], spread[number]
-            if not chosen:
-                continue
-            x, character = self._posed(model, latents, clip, chosen)
-            numbers = [self.first[number] + frame for frame in chosen]
-            counts[number] = ShownCounts.of(self.covered.states(x, character), numbers)
-        joined = {number: found for part in self.group.gather(counts) for number, found in part.items()}
-        return self.covered.figures([(self.names[number], joined[number]) for number in sorted(joined)])
 
-    @torch.no_grad()
+        def count(x: Tensor, character: Tensor, numbers: list[int]) -> ShownCounts:
+            return ShownCounts.of(self.covered.states(x, character), numbers)
+
+        return self.covered.figures(self._counted(model, states, SHOWN_FRAMES[self.rest.is_cuda], count))
+
     def _crossed(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> SelfIntersections | None:
         """Return how many triangles intersect others; all processes of the group get the same."""
-        if self.cloth is None:
+        if (cloth := self.cloth) is None:
             return None
-        own, counts = range(self.group.rank, len(self.clips), self.group.size), {}
-        spread = self._spread(CROSSED_FRAMES)
+
+        def count(x: Tensor, character: Tensor, numbers: list[int]) -> IntersectionCounts:
+            return cloth.counts(list(x.permute(2, 0, 1).double().cpu().numpy()), numbers)
+
+        return cloth.figures(self._counted(model, states, CROSSED_FRAMES, count))
+
+    @torch.no_grad()
+    def _counted(
+        self,
+        model: LatentModel | None,
+        states: Sequence[Tensor | None],
+        frames: int,
+        count: Callable[[Tensor, Tensor, list[int]], Counts],
+    ) -> list[tuple[str, Counts]]:
+        """Return what `count` finds in so many frames spread over all clips, by clip, from all processes.
+
+        Args:
+            count: takes positions (V, 3, N), skinning matrices (J, 3, 4, N) and numbers of N frames of a clip.
+        """
+        own, found = range(self.group.rank, len(self.clips), self.group.size), dict[int, Counts]()
+        spread = self._spread(frames)
         for number, latents in zip(own, states):
-            if not (chosen := spread[number]):
-                continue
-            x, _ = self._posed(model, latents, self.clips[number], chosen)
-            numbers = [self.first[number] + frame for frame in chosen]
-            counts[number] = self.cloth.counts(list(x.permute(2, 0, 1).double().cpu().numpy()), numbers)
-        joined: dict[int, IntersectionCounts] = {}
-        for part in self.group.gather(counts):
-            joined |= part
-        return self.cloth.figures([(self.names[number], joined[number]) for number in sorted(joined)])
+            if chosen := spread[number]:
+                numbers = [self.first[number] + frame for frame in chosen]
+                found[number] = count(*self._posed(model, latents, self.clips[number], chosen), numbers)
+        joined = {number: each for part in self.group.gather(found) for number, each in part.items()}
+        return [(self.names[number], joined[number]) for number in sorted(joined)]
 
     def _posed(
         self, model: LatentModel | None, latents: Tensor | None, clip: range, chosen: Sequence[int]
