@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ssilk_usd.shots.points import PointCache
 
     from ..delivery.bake.result import ShotShapes
+    from ..physics.intersections.figures import SelfIntersections
     from ..physics.simulate import SimulationOptions
     from ..physics.simulate.simulator import SimulatedFrame
     from ..physics.skin.figures import ShownSkin
@@ -63,6 +64,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="largest residual acceleration of a vertex, in units of g (default 0.01)")  # fmt: skip
     verb.add_argument("--iterations", type=shared.NumberRange(1, 10**6, int), default=100, metavar="N",
                       help="most iterations of the solver in each frame (default 100)")  # fmt: skip
+    verb.add_argument("--self-contact", action="store_true",
+                      help="keep loose cloth from passing through the garment; takes longer")  # fmt: skip
     verb.add_argument(
         "--batch",
         type=shared.NumberRange(1, 10**6, int),
@@ -99,6 +102,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fps=options.fps,
         batch=options.batch,
         sequence=options.sequence,
+        self_contact=options.self_contact,
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
@@ -218,6 +222,7 @@ class _Caches:
         self.report = report
         self.fits: list[ShotShapes] = []
         self.shown: list[ShownSkin] = []
+        self.crossed: list[SelfIntersections] = []
 
     def write(self, shot: int, frame: int, points: Floats) -> None:
         """Write the garment's points (V, 3) [m] of one frame."""
@@ -234,11 +239,12 @@ class _Caches:
     def figures(self) -> dict[str, object]:
         """Return how far joints and blendshapes are from the points, at most, and what the points would take.
 
-        And how much covered skin shows, in the shot in which most does.
+        And how much covered skin shows, and how many triangles intersect others, in the shots in which most do.
         """
         if not self.fits:
             return {}
         most = max(self.shown, key=lambda shown: shown.mean, default=None)
+        crossed = max(self.crossed, key=lambda found: found.mean, default=None)
         where = "" if len(self.shots) == 1 else "most in a shot: "
         return {
             "shapes of a shot, at most": max(fit.count for fit in self.fits),
@@ -246,7 +252,11 @@ class _Caches:
             "joints lose, at most [mm]": float(f"{max(fit.largest_mm for fit in self.fits):.4g}"),
             "bytes": sum(shot.output.stat().st_size for shot in self.shots if shot.output.is_file()),
             "bytes of the points alone": sum(fit.point_bytes for fit in self.fits),
-            **{f"{where}{name}": value for name, value in (most.summary("time code") if most else {}).items()},
+            **{
+                f"{where}{name}": value
+                for found in (most, crossed)
+                for name, value in (found.summary("time code") if found else {}).items()
+            },
         }
 
     def _path(self, shot: int) -> Path:
@@ -285,6 +295,7 @@ class _Caches:
             assert result.shapes is not None
             self.fits.append(result.shapes)
             self.shown += [result.shown_skin] if result.shown_skin else []
+            self.crossed += [result.intersections] if result.intersections else []
         path.unlink()
 
     def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:
@@ -320,6 +331,7 @@ def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> di
         "sequence": options.sequence or 0,
         "fabric": fabric.name,
         **({"range": options.range} if options.range not in (None, "all") else {}),
+        **({"self_contact": "on"} if options.self_contact else {}),
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip

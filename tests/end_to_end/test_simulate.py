@@ -162,3 +162,12 @@ def test_what_cannot_be_done_is_refused_in_one_sentence(stage, capsys, words, co
     assert main(["simulate", "rigged.usda", *words.split()]) == 2
     assert complaint in capsys.readouterr().err
     assert not (stage / "one.usdc").exists() and not (stage / "caches").exists()
+
+
+def test_a_file_is_simulated_again_where_cloth_may_no_more_pass_through_cloth(stage, capsys):
+    words = [*SIMULATE, "short.usda", "-o", "shots"]
+    for more, is_current in ([], False), (["--self-contact"], False), (["--self-contact"], True):
+        assert main([*words, *more]) == 0
+        told = capsys.readouterr().err
+        assert ("current: 1" in told) is is_current
+        assert is_current or "triangles that intersect others" in told

@@ -8,6 +8,7 @@ the programs of the next kernel sum these in a fixed order. The host is not invo
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -43,6 +44,7 @@ def solve_kernel(
     reduction: float,
     iterations: int,
     check_every: int,
+    add_product: Callable[[Tensor, Tensor], None] | None = None,
 ) -> tuple[Tensor, int]:
     """Return the result of `simulate.conjugate_gradient.solve`, preconditioned with the inverse diagonal blocks.
 
@@ -50,6 +52,7 @@ def solve_kernel(
         blocks: as stored, shape (S, 3, 3, N), float32.
         inverse: shape (U, 3, 3, N); right: shape (U, 3, N).
         check_every: iterations between convergence checks, which synchronise with the GPU.
+        add_product: adds the product of another matrix with vectors (U, 3, N) to such vectors, or None.
     """
     rows, _, frames = right.shape
     tile = min(FRAMES, triton.next_power_of_2(frames))
@@ -65,7 +68,11 @@ def solve_kernel(
     for done in range(1, iterations + 1):
         _multiply[grid](blocks, table.columns, table.places, table.counts, step, image, along, table.columns.shape[1],
                         *size, num_warps=WARPS)  # fmt: skip
-        _descend[grid](z, residual, y, step, image, inverse, product, enough, along, left, grid[0], *size,
+        parts = grid[0]
+        if add_product is not None:
+            add_product(step, image)
+            along[0], parts = (step * image).sum((0, 1)), 1
+        _descend[grid](z, residual, y, step, image, inverse, product, enough, along, left, parts, *size,
                        num_warps=WARPS)  # fmt: skip
         _turn[grid](step, y, product, fresh, left, grid[0], *size, num_warps=WARPS)
         product, fresh = fresh, product

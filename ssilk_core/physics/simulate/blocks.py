@@ -20,6 +20,7 @@ from ...scene.assets import Ints
 from .. import kernels
 from ..operators import SparseOperator
 from .conjugate_gradient import CHECK_EVERY, inverse_blocks, solve
+from .contact_stiffness import ContactStiffness
 
 if TYPE_CHECKING:
     from ..kernels.conjugate_gradient import BlockTable
@@ -31,10 +32,12 @@ class BlockMatrix:
 
     Attributes:
         blocks: stored blocks, first those on the diagonal, shape (stored, 3, 3, N).
+        contacts: what is added for contacts of cloth with cloth, or None.
     """
 
     pattern: BlockPattern
     blocks: Tensor
+    contacts: ContactStiffness | None = None
 
     @cached_property
     def rows(self) -> Tensor:
@@ -43,7 +46,12 @@ class BlockMatrix:
 
     def __matmul__(self, vectors: Tensor) -> Tensor:
         """Multiply vectors (N, U, 3)."""
-        return torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
+        image = torch.mv(self.rows, vectors.reshape(-1)).reshape(vectors.shape)
+        if self.contacts is not None:
+            added = vectors.new_zeros(*vectors.shape[1:], len(vectors))
+            self.contacts.add_product(vectors.permute(1, 2, 0).contiguous(), added)
+            image += added.permute(2, 0, 1)
+        return image
 
     def solve(
         self, right: Tensor, reduction: float, iterations: int, check_every: int = CHECK_EVERY
@@ -55,13 +63,17 @@ class BlockMatrix:
         Args:
             check_every: iterations between checks of a GPU for convergence, which wait for it.
         """
-        diagonal = self.blocks[: self.pattern.count].permute(3, 0, 1, 2)
+        diagonal = self.blocks[: self.pattern.count]
+        if self.contacts is not None:
+            diagonal = diagonal + self.contacts.diagonal
+        diagonal = diagonal.permute(3, 0, 1, 2)
         inverse = inverse_blocks(diagonal.contiguous())
         if kernels.available(right.device):
             from ..kernels.conjugate_gradient import solve_kernel
 
             inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
-            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every)
+            added = None if self.contacts is None else self.contacts.add_product
+            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every, added)
         z, count = solve(
             lambda v: self @ v,
             lambda r: (inverse * r[..., None, :]).sum(-1),

@@ -14,7 +14,8 @@ smoothed on its creases (`collision.smoothed_distance`), so that the gradient va
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -24,10 +25,14 @@ from ...scene.fabrics import Fabric
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
+from ..self_contact import ClothContacts, ClothNeighbours, SelfContact
 from .blocks import BlockMatrix, BlockPattern
+from .contact_stiffness import ContactStiffness
 from .hessian import Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
+
+ROUNDS, ARRIVED = 16, 1e-3  # in which a garment goes towards a target, and how near it comes there [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +46,8 @@ class StepInputs:
         advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
         dt: time step [s]. For a quasi-static state it only damps the solver's steps.
         skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
+        neighbours: which cloth may touch which, or None where cloth may pass through cloth.
+        contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
     """
 
     body: PosedBody | None
@@ -49,6 +56,8 @@ class StepInputs:
     advected: Tensor | None = None
     dt: float = 0.1
     skinned: Tensor | None = None
+    neighbours: ClothNeighbours | None = None
+    contacts: ClothContacts | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
         """Return the inputs of the frames with indices (M,)."""
@@ -56,7 +65,11 @@ class StepInputs:
         predicted, advected, skinned = (
             v if v is None else v[..., frames] for v in (self.predicted, self.advected, self.skinned)
         )
-        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned)
+        neighbours = self.neighbours and self.neighbours.select(frames)
+        contacts = self.contacts and self.contacts.select(frames)
+        return StepInputs(
+            body, self.gravity[..., frames], predicted, advected, self.dt, skinned, neighbours, contacts
+        )
 
 
 class IncrementalPotential:
@@ -82,12 +95,18 @@ class IncrementalPotential:
         self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
         self.contacts = Contacts(scene, self.cloth.samples, device=device)
+        self._self_contact = partial(SelfContact, scene, fabric, device, dtype)
         self.use(Hessian.of(scene, energy))
 
     def use(self, hessian: Hessian) -> None:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
+
+    @cached_property
+    def self_contact(self) -> SelfContact:
+        """What knows where the garment touches itself; nothing is spent on it where nobody asks."""
+        return self._self_contact()
 
     @property
     def block_pattern(self) -> BlockPattern:
@@ -114,6 +133,40 @@ class IncrementalPotential:
         positions, within = self.cloth.positions, self.law.start
         return self.contacts.smoothed_nearby(positions(x), inputs.body, known, positions(at), within)
 
+    def with_contacts(self, x: Tensor, inputs: StepInputs, moved: bool = False) -> StepInputs:
+        """Return inputs with the contacts of cloth with cloth at x, where cloth may not pass through cloth.
+
+        Args:
+            moved: the garment has moved to x, which is not only tried.
+        """
+        if inputs.neighbours is None:
+            return inputs
+        contact = self.self_contact
+        neighbours = (contact.moved if moved else contact.around)(x, inputs.neighbours)
+        return replace(inputs, neighbours=neighbours, contacts=contact.contacts(x, neighbours))
+
+    def approach(
+        self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
+    ) -> tuple[Tensor, StepInputs]:
+        """Return how far the garment comes from x towards a target, both (V, 3, N), without passing through itself.
+
+        Args:
+            known: which cloth may touch which at x, on older sides than those at x; None where there are none.
+
+        Returns:
+            The positions, and the inputs with what may touch there.
+        """
+        inputs = replace(inputs, neighbours=self.self_contact.neighbours(x, x, known))
+        inputs = self.with_contacts(x, inputs, moved=True)
+        for _ in range(ROUNDS):
+            assert inputs.contacts is not None
+            step = inputs.contacts.without_passing(x, target - x)
+            if bool(step.square().sum(1).max() < ARRIVED**2):
+                break
+            x = x + step
+            inputs = self.with_contacts(x, inputs, moved=True)
+        return x, inputs
+
     def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""
         if body_distance is None:
@@ -129,6 +182,8 @@ class IncrementalPotential:
             total = total + self.stitching.energy(x)
         for weight, target in self._anchors(inputs):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
+        if inputs.contacts is not None:
+            total = total + inputs.contacts.energy(x)
         return total + self.collision(x, body_distance).sum(0)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
@@ -148,6 +203,8 @@ class IncrementalPotential:
             total += self.hinges.gradient(x)
         if self.stitching:
             total += stitch_gradient(self.stitching, x)
+        if inputs.contacts is not None:
+            total += inputs.contacts.gradient(x)
         for weight, target in self._anchors(inputs):
             total += weight[:, None] * (x - target)
         if body_distance:
@@ -179,7 +236,14 @@ class IncrementalPotential:
             )
             contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
         fixed = None if fixed is None else fixed[self.free]
-        return self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
+        found = self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
+        return found if inputs.contacts is None else replace(found, contacts=self._stiffness(x, inputs.contacts))
+
+    def _stiffness(self, x: Tensor, contacts: ClothContacts) -> ContactStiffness:
+        """Return the Hessian of contacts of cloth with cloth."""
+        place = torch.full((len(x),), -1, device=x.device)
+        place[self.free] = torch.arange(len(self.free), device=x.device)
+        return ContactStiffness.of(contacts, x, place, len(self.free))
 
     def residual(self, gradient: Tensor) -> Tensor:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""

@@ -13,6 +13,8 @@ Where a body intersects itself, the nearest surface changes sides and the energy
 that, and one vertex at such a jump would stop its whole garment. When only a short step lowers the energy, the
 vertices whose energy rises more than predicted are fixed and the others move on. Once these have converged, all fixed
 vertices are released, once.
+
+Where cloth may not pass through cloth, each step is cut short before it does, vertex by vertex (`self_contact`).
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from torch import Tensor
 
 from ...errors import fail
 from ..collision import SmoothedDistance
+from ..self_contact import ClothContacts, ClothNeighbours
 from .incremental_potential import IncrementalPotential, StepInputs
 
 ARMIJO = 1e-4  # required decrease relative to the slope
@@ -32,6 +35,8 @@ MAX_BACKTRACKS = 12
 REDUCTION = 0.1  # of the residual by each linear solve
 MAX_DISPLACEMENT = 0.1  # of a vertex in one step, relative to the garment's size: a bound on inexact solutions
 SHORT_STEP = 0.25  # step length from which on obstructing vertices are fixed
+YIELDING = 1e-3  # [m] by which any two layers may come nearer in a step: what presses hard yields a little
+DOWNHILL = 0.1  # of the predicted decrease that slowed vertices must keep
 OBSTRUCTING = 0.1  # share of the predicted decrease that an obstructing vertex consumes
 EXACT_HESSIAN_BELOW = 2.0  # [g] of residual
 MISLED_BELOW = 0.25  # a shorter step means that the exact Hessian misled the frame
@@ -74,6 +79,7 @@ class Solution:
         iterations: Newton iterations, shape (N,).
         fixed: number of fixed vertices, shape (N,).
         cg_iterations: conjugate gradient iterations, each for all active frames.
+        neighbours: which cloth may touch which at x, where inputs say so.
     """
 
     x: Tensor
@@ -82,6 +88,7 @@ class Solution:
     iterations: Tensor
     fixed: Tensor
     cg_iterations: int
+    neighbours: ClothNeighbours | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +152,7 @@ def minimise_from(
             break
         search.advance()
         advanced()
-    return search.solution
+    return search.ended()
 
 
 def need_finite(first: State) -> None:
@@ -167,6 +174,7 @@ class _Search:
         fixed: fixed vertices, shape (V, N).
         cooldown: remaining iterations without the exact Hessian, shape (N,).
         released: frames whose fixed vertices have been released, shape (N,).
+        left: which cloth may touch which in frames that are looked at no more, each with the indices of its frames.
     """
 
     gradient: Tensor
@@ -175,14 +183,16 @@ class _Search:
     def __init__(
         self, potential: IncrementalPotential, start: Tensor, inputs: StepInputs, options: SolverOptions
     ) -> None:
-        self.potential, self.options, self.inputs = potential, options, inputs
-        self.state = State.at(potential, start, inputs)
+        self.potential, self.options = potential, options
+        self.inputs = potential.with_contacts(start, inputs)
+        self.state = State.at(potential, start, self.inputs)
         need_finite(self.state)
         energy = self.state.energy
         self.active = torch.arange(len(energy), device=start.device)
         self.moving = torch.ones_like(energy, dtype=torch.bool)
         self.fixed = torch.zeros_like(start[:, 0], dtype=torch.bool)
         self.cooldown, self.released = torch.zeros_like(self.active), torch.zeros_like(self.moving)
+        self.left: list[tuple[Tensor, ClothNeighbours]] = []
         self._evaluate()
         iterations = torch.zeros_like(self.active)
         found = start.clone(), energy.clone(), self.residual.clone()
@@ -191,7 +201,9 @@ class _Search:
     def drop_finished(self) -> bool:
         """Drop frames that have converged or that no step improves; return whether any remains."""
         self._release_fixed()
-        kept = (self.moving & (self.residual > self.options.tolerance)).nonzero()[:, 0]
+        keeps = self.moving & (self.residual > self.options.tolerance)
+        kept = keeps.nonzero()[:, 0]
+        self._leave((~keeps).nonzero()[:, 0])
         if 0 < len(kept) < len(self.active):
             self.state, self.inputs = self.state.select(kept), self.inputs.select(kept)
             for name in ("gradient", "fixed", "active", "residual", "cooldown", "released"):
@@ -205,6 +217,8 @@ class _Search:
         step, count = newton_step(
             potential, self.state, inputs, gradient, self.options.cg_iterations, self.fixed, exact_hessian
         )
+        if inputs.contacts is not None:
+            step = self._without_passing(inputs.contacts, step)
         self.state, length, obstructing = line_search(potential, self.state, inputs, gradient, step)
         misled = exact_hessian & (length < MISLED_BELOW)
         self.cooldown = torch.where(misled, COOLDOWN, self.cooldown - 1)
@@ -217,6 +231,25 @@ class _Search:
         found.iterations[self.active] += 1
         self.solution = replace(found, cg_iterations=found.cg_iterations + count)
 
+    def _without_passing(self, contacts: ClothContacts, step: Tensor) -> Tensor:
+        """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
+        slowed = contacts.without_passing(self.state.x, step, YIELDING)
+        steep = (self.gradient * slowed).sum((0, 1)) < DOWNHILL * (self.gradient * step).sum((0, 1))
+        return torch.where(steep, slowed, contacts.allowed(self.state.x, step, YIELDING).amin(0) * step)
+
+    def ended(self) -> Solution:
+        """Return the solution after the last step."""
+        if self.inputs.neighbours is None:
+            return self.solution
+        if sum(len(frames) for frames, _ in self.left) < len(self.solution.energy):
+            self._leave(torch.arange(len(self.active), device=self.active.device))
+        return replace(self.solution, neighbours=ClothNeighbours.joined(self.left))
+
+    def _leave(self, frames: Tensor) -> None:
+        """Keep which cloth may touch which in active frames that are looked at no more."""
+        if self.inputs.neighbours is not None and len(frames):
+            self.left.append((self.active[frames], self.inputs.neighbours.select(frames)))
+
     def _release_fixed(self) -> None:
         """Release the fixed vertices of frames whose other vertices have converged, once."""
         again = (self.residual <= self.options.tolerance) & ~self.released & self.fixed.any(0)
@@ -227,7 +260,9 @@ class _Search:
             self._record()
 
     def _evaluate(self) -> None:
-        """Evaluate gradient and residual of the current states."""
+        """Evaluate contacts of cloth with cloth, gradient and residual of the current states."""
+        if self.inputs.neighbours is not None:
+            self.inputs = self.potential.with_contacts(self.state.x, self.inputs, moved=True)
         gradient = self.potential.gradient(self.state.x, self.inputs, self.state.body_distance)
         self.gradient = gradient.masked_fill(self.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)
@@ -281,7 +316,8 @@ def line_search(
     for _ in range(MAX_BACKTRACKS):
         if not len(left):
             break
-        trial = State.at(potential, (state.x + length * step)[..., left], inputs.select(left))
+        x = (state.x + length * step)[..., left]
+        trial = State.at(potential, x, potential.with_contacts(x, inputs.select(left)))
         fallen = trial.energy <= (state.energy + ARMIJO * length * slope)[left]
         rows = fallen.nonzero()[:, 0]
         if len(rows):

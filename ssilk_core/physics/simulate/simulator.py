@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,7 +20,9 @@ from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
 from ...scene.assets import Floats, Motion, Scene, Skeleton
 from ...scene.fabrics import Fabric
+from ...scene.kinematics import bind_pose, slerp
 from ..constants import GRAVITY
+from ..self_contact import ClothNeighbours
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
 from .incremental_potential import IncrementalPotential, StepInputs
@@ -28,6 +30,8 @@ from .newton import Solution, SolverOptions, minimise_from
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
+POSES = 16  # between the bind pose and the first one
+ON_THE_WAY = SolverOptions(iterations=10)  # to each of these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +46,7 @@ class SimulationOptions:
             None for whole shots.
         precision: "float64" or "float32", of positions, energies and forces; linear systems are always float32.
         gravity: acceleration [m/s2].
+        self_contact: loose cloth does not pass through the garment (`physics.self_contact`).
         solver: settings for every step.
         quasi_static_solver: settings for quasi-static states, which converge more slowly without inertia.
     """
@@ -52,6 +57,7 @@ class SimulationOptions:
     sequence: int | None = None
     precision: str = "float64"
     gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
+    self_contact: bool = False
     solver: SolverOptions = field(default_factory=SolverOptions)
     quasi_static_solver: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
 
@@ -99,17 +105,20 @@ class StepHistory:
             in the second step.
         root: the character's root one step ago [m], float64, shape (3, N).
         lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
+        neighbours: which cloth may touch which, where that is looked at.
     """
 
     last: Tensor
     before: Tensor | None
     root: Tensor
     lbs: Tensor
+    neighbours: ClothNeighbours | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
         before = None if self.before is None else self.before[..., :count]
-        return StepHistory(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count])
+        neighbours = self.neighbours and self.neighbours.first(count)
+        return StepHistory(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count], neighbours)
 
     @property
     def local(self) -> Tensor:
@@ -168,8 +177,7 @@ class Simulator:
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            solution = self.step(poses, past) if past else self._first(poses)
-            past = _advanced(past, poses, solution)
+            past, solution = self._after(past, poses) if past else self._first(poses, running)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, past.last, solution)
 
@@ -181,15 +189,45 @@ class Simulator:
         """
         for poses in characters:
             past = past.first(poses.root.shape[-1])
-            past = _advanced(past, poses, self.step(poses, past))
+            past = self._after(past, poses)[0]
             yield past
 
-    def _first(self, poses: PosedCharacters) -> Solution:
+    def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
+        """Return the states after those of the past, and their solution."""
+        solution = self.step(poses, past)
+        world = solution.x.double() + poses.root
+        return StepHistory(world, past.last, poses.root, poses.lbs, solution.neighbours), solution
+
+    def _first(self, poses: PosedCharacters, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
         solver = self.options.quasi_static_solver
         self.report(Message(f"cloth comes to rest in the first pose, in {solver.iterations} iterations at most"))
-        start, told = poses.lbs, Countdown(solver.iterations, self.report)
-        return minimise_from(self.potential, start, self.inputs(poses, None), solver, advanced=told)
+        told = Countdown(solver.iterations, self.report)
+        inputs, start = self.inputs(poses, None), poses.lbs
+        if self.options.self_contact:
+            start, known = self._from_bind_pose(poses, spans)
+            inputs = replace(inputs, neighbours=known)
+        solution = minimise_from(self.potential, start, inputs, solver, advanced=told)
+        world = solution.x.double() + poses.root
+        return StepHistory(world, None, poses.root, poses.lbs, solution.neighbours), solution
+
+    def _from_bind_pose(
+        self, poses: PosedCharacters, spans: Sequence[MotionSpan]
+    ) -> tuple[Tensor, ClothNeighbours | None]:
+        """Return the garment (V, 3, N), carried from the bind pose to the first poses past itself, and its sides."""
+        first = [
+            np.stack([getattr(span.motion, name)[0] for span in spans]) for name in ("rotations", "translations")
+        ]
+        turned, placed = bind_pose(self.poser.skeleton)
+        start = self.poser.pose(np.broadcast_to(turned, first[0].shape), np.broadcast_to(placed, first[1].shape))
+        x, lbs, known = start.lbs, start.lbs, None
+        for share in np.arange(1, POSES + 1) / POSES:
+            between = self.poser.pose(slerp(turned, first[0], share), (1 - share) * placed + share * first[1])
+            inputs = self.inputs(between, None)
+            x, inputs = self.potential.approach(x, x + between.lbs - lbs, inputs, known)
+            found = minimise_from(self.potential, self.apply_pins(x, between), inputs, ON_THE_WAY)
+            x, lbs, known = found.x, between.lbs, found.neighbours
+        return self.apply_pins(x, poses), known
 
     def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
@@ -207,7 +245,11 @@ class Simulator:
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
-        return self.solve(self.best_start(self.starts(poses, past, inputs), inputs), inputs)
+        start = self.best_start(self.starts(poses, past, inputs), inputs)
+        if self.options.self_contact:
+            x, inputs = self.potential.approach(past.local, start, inputs, past.neighbours)
+            start = self.apply_pins(x, poses)
+        return self.solve(start, inputs)
 
     def starts(self, poses: PosedCharacters, past: StepHistory, inputs: StepInputs) -> list[Tensor]:
         """Return states (V, 3, N) that a step after `past` may start from: predicted, still, and with the body."""
@@ -232,12 +274,6 @@ class Simulator:
         for number, start in enumerate(starts[1:], start=1):
             best = torch.where(chosen == number, start, best)
         return best
-
-
-def _advanced(past: StepHistory | None, poses: PosedCharacters, solution: Solution) -> StepHistory:
-    """Return the previous states for the step after a solution."""
-    world = solution.x.double() + poses.root
-    return StepHistory(world, past.last if past else None, poses.root, poses.lbs)
 
 
 def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:

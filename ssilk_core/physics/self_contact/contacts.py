@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contacts of cloth with cloth, linear in the positions: gap = n . sum c_i x_i over the four vertices of each.
+
+Nearest points, directions n and sides are those of one state. Gradient and Hessian there are those of the energy in
+which they turn, but for the Hessian's part that turning makes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..energy.collision import ContactLaw
+
+CLOSING = 0.8  # of a gap, by which it may close in one step
+SLACK = 0.2  # of what pairs begin to touch later than others: these lie near each other at rest, as along seams
+SLOWED = 40  # rounds in which single vertices are slowed, since each changes how others close
+UNSLOWED = 0.99  # the share above which a vertex counts as not slowed: 0.8 + 0.01 of a gap is still a gap
+TINY = 1e-12  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class ClothContacts:
+    """Contacts of P pairs in N frames, by ascending frame.
+
+    Attributes:
+        law: how pressure depends on the gap, which is measured from each pair's own start.
+        reach: distance within which all pairs are known [m].
+        frames: number N.
+        frame: of each contact, shape (P,).
+        vertices: shape (4, P).
+        coefficients: c_i, shape (4, P).
+        second: whether each vertex belongs to the second of the two, shape (4, P).
+        direction: n, from the second to the first, unit vectors, shape (3, P).
+        start: gap at which contact begins [m], shape (P,).
+        area: on which pressure acts [m2], shape (P,).
+    """
+
+    law: ContactLaw
+    reach: float
+    frames: int
+    frame: Tensor
+    vertices: Tensor
+    coefficients: Tensor
+    second: Tensor
+    direction: Tensor
+    start: Tensor
+    area: Tensor
+
+    def along(self, x: Tensor) -> Tensor:
+        """Return vectors (V, 3, N) along each direction, shape (4, P)."""
+        return (self.direction * x[self.vertices, :, self.frame].movedim(-1, 1)).sum(1)
+
+    def gap(self, x: Tensor) -> Tensor:
+        """Return the gaps [m] at positions (V, 3, N), shape (P,); negative where cloth has passed through."""
+        return (self.coefficients * self.along(x)).sum(0)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Return the energy of each frame [J], shape (N,)."""
+        energy = self.area * self.law.energy(self._relative(x))
+        return energy.new_zeros(self.frames).index_put_((self.frame,), energy, accumulate=True)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Return the gradient [N], shape (V, 3, N)."""
+        push = -self.area * self.law.pressure(self._relative(x))
+        force = (push * self.coefficients)[:, None] * self.direction
+        found = x.new_zeros(len(x), x.shape[-1], 3)
+        at = self.vertices, self.frame.expand_as(self.vertices)
+        return found.index_put_(at, force.movedim(1, -1), accumulate=True).movedim(-1, 1).contiguous()
+
+    def stiffness(self, x: Tensor) -> Tensor:
+        """Return the second derivative of each contact's energy by its gap [N/m], shape (P,)."""
+        return self.area * self.law.curvature(self._relative(x))
+
+    def allowed(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
+        """Return by which share of a step (V, 3, N) each vertex may move, shape (V, N).
+
+        With the least of all shares of a frame, a plane across n goes on to separate each pair: the two come nearer
+        to each other by at most `CLOSING` of their gap. Those that are hardly apart may do so by
+        `yielding` [m].
+        """
+        along = self.along(step)
+        first = along.masked_fill(self.second, torch.inf).amin(0)
+        closing = along.masked_fill(~self.second, -torch.inf).amax(0) - first
+        near = SLACK * (self.law.start - self.start)
+        most = torch.maximum(CLOSING * self.gap(x), near.clamp_min(yielding))
+        share = (most / closing.clamp_min(TINY)).clamp_max(1).expand(4, -1)
+        found = torch.ones_like(step[:, 0]).flatten()
+        at = self.vertices * self.frames + self.frame
+        return found.scatter_reduce_(0, at.flatten(), share.flatten(), "amin").view_as(step[:, 0])
+
+    def without_passing(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
+        """Return a step (V, 3, N) from x in which no cloth passes through cloth: some vertices are slowed.
+
+        A step is first cut to the distance within which pairs are known.
+
+        Args:
+            yielding: as in `allowed`.
+        """
+        longest = step.norm(dim=1).amax(0).clamp_min(TINY)
+        step = step * (self.reach / longest).clamp_max(1)
+        for _ in range(SLOWED):
+            share = self.allowed(x, step, yielding)
+            step = share[:, None] * step
+            if bool((share > UNSLOWED).all()):
+                return step
+        return self.allowed(x, step, yielding).amin(0) * step
+
+    def select(self, frames: Tensor) -> ClothContacts:
+        """Return the contacts in the frames with indices (M,), in ascending order."""
+        place = torch.full((self.frames,), -1, device=self.frame.device)
+        place[frames] = torch.arange(len(frames), device=place.device)
+        new = place[self.frame]
+        return self._kept(new >= 0, new, len(frames))
+
+    def pressing(self, x: Tensor) -> ClothContacts:
+        """Return those that have an energy."""
+        return self._kept(self.gap(x) < self.start, self.frame, self.frames)
+
+    def _kept(self, kept: Tensor, frame: Tensor, frames: int) -> ClothContacts:
+        rows = (frame, self.vertices, self.coefficients, self.second, self.direction, self.start, self.area)
+        return ClothContacts(self.law, self.reach, frames, *(part[..., kept] for part in rows))
+
+    def _relative(self, x: Tensor) -> Tensor:
+        """Return the gaps as the law counts them."""
+        return self.gap(x) + (self.law.start - self.start)

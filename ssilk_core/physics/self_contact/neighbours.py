@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs of points that lie near each other, frame by frame, found in a grid."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+AT_ONCE = 1 << 24  # pairs in memory before distances are compared
+
+
+def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tensor) -> Tensor:
+    """Return all pairs whose distance is at most the sum of both reaches, by frame, point and other.
+
+    The cost grows with the number of points times the pairs within the largest reach.
+
+    Args:
+        points, others: positions [m], shapes (A, 3, N) and (B, 3, N).
+        reach, other_reach: of each [m], shapes (A,) and (B,).
+
+    Returns:
+        Frame, point and other of each pair, shape (3, P).
+    """
+    frames = points.shape[-1]
+    size = float(reach.max() + other_reach.max())
+    low = torch.minimum(points.amin((0, 2)), others.amin((0, 2)))
+    span = torch.maximum(points.amax((0, 2)), others.amax((0, 2))) - low
+    cells = (span / size).long() + 3  # an empty layer of cells on each side
+    own, theirs = (_cells(x, low, size, cells) for x in (points, others))
+    key, order = theirs.flatten().sort(stable=True)
+    other_frame, other = order // len(others), order % len(others)
+    steps = torch.arange(-1, 2, device=points.device)
+    rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
+    row = (own[..., None] + rows).contiguous()
+    starts = torch.searchsorted(key, row - 1)
+    counts = torch.searchsorted(key, row + 1, right=True) - starts
+    starts, counts = starts.flatten(), counts.flatten()
+    found, first, total = [], 0, counts.cumsum(0)
+    while first < len(counts):
+        before = total[first - 1] if first else 0
+        last = max(first + 1, int(torch.searchsorted(total, before + AT_ONCE, right=True)))
+        query = torch.repeat_interleave(torch.arange(first, last, device=key.device), counts[first:last])
+        within = torch.arange(len(query), device=key.device) - (total[query] - counts[query] - before)
+        at = starts[query] + within
+        frame, point = query // (9 * len(points)), query // 9 % len(points)
+        far = points[point, :, frame] - others[other[at], :, other_frame[at]]
+        limit = reach[point] + other_reach[other[at]]
+        near = (far * far).sum(1) <= limit * limit
+        found.append(torch.stack([frame[near], point[near], other[at][near]]))
+        first = last
+    pairs = torch.cat(found, dim=1)
+    keys = (pairs[0] * len(points) + pairs[1]) * len(others) + pairs[2]
+    assert frames * len(points) * len(others) < 2**63
+    return pairs[:, keys.argsort()]
+
+
+def _cells(x: Tensor, low: Tensor, size: float, cells: Tensor) -> Tensor:
+    """Return the cell of each point in each frame, shape (N, A)."""
+    place = ((x - low[:, None]) / size).long() + 1
+    frame = torch.arange(x.shape[-1], device=x.device)
+    key = ((frame * cells[0] + place[:, 0]) * cells[1] + place[:, 1]) * cells[2] + place[:, 2]
+    return key.T

@@ -1,0 +1,301 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Contact of cloth with cloth: pairs, sides and forces against slow references, and folds that stay apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.physics.energy.collision import ContactLaw
+from ssilk_core.physics.intersections.pairs import self_intersections
+from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
+from ssilk_core.physics.self_contact import ClothContacts, SelfContact
+from ssilk_core.physics.self_contact.neighbours import near_pairs
+from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
+from ssilk_core.physics.simulate import SimulationOptions, Simulator
+from ssilk_core.physics.simulate.blocks import BlockMatrix, BlockPattern
+from ssilk_core.physics.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
+from ssilk_core.physics.simulate.contact_stiffness import ContactStiffness
+from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
+from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
+from ssilk_core.scene.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, SkinWeights
+from ssilk_core.scene.fabrics import Fabric
+
+CPU = torch.device("cpu")
+FABRIC = Fabric("plain")
+START = FABRIC.thickness + 0.5 * FABRIC.margin  # [m] at which cloth begins to touch cloth
+
+
+def random(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def dressed(scene: Scene, points: np.ndarray, faces: np.ndarray, pinned: np.ndarray) -> Scene:
+    skin = SkinWeights("/cloth", np.zeros((len(points), 1), dtype=int), np.ones((len(points), 1)))
+    garment = Garment(Mesh("/cloth", points, faces), skin, np.where(pinned, PINNED, LOOSE))
+    return replace(
+        scene, garment=garment, rig=ProxyRig("/cloth", (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), skin)
+    )
+
+
+def frames(points: np.ndarray) -> torch.Tensor:
+    return torch.as_tensor(np.array(points))[:, :, None]
+
+
+@pytest.fixture
+def layers(scene) -> tuple[Scene, SelfContact]:
+    """Two sheets of one triangle each, 30 cm apart in the bind pose."""
+    sheet = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]])
+    points = np.concatenate([sheet, sheet + [0.0, 0.3, 0.0]])
+    worn = dressed(scene, points, np.array([[0, 1, 2], [3, 4, 5]]), np.zeros(6, dtype=bool))
+    return worn, SelfContact(worn, FABRIC, CPU, torch.float64)
+
+
+def stacked(height: float) -> torch.Tensor:
+    """The second sheet over the first, turned and moved so that one corner is over its inside, and edges cross."""
+    first = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]])
+    second = np.array([[0.03, height, 0.03], [0.13, height + 0.06, 0.05], [0.05, height + 0.06, 0.13]])
+    return frames(np.concatenate([first, second]))
+
+
+def test_near_pairs_are_those_of_all_distances():
+    points, others = random(40, 3, 3), random(60, 3, 3, seed=1)
+    reach, other_reach = 0.2 * random(40, seed=2), 0.2 * random(60, seed=3)
+    far = (points[:, None] - others[None]).square().sum(2).sqrt()
+    expected = (far <= (reach[:, None] + other_reach)[..., None]).permute(2, 0, 1).nonzero().T
+    assert len(expected[0]) > 50
+    assert torch.equal(near_pairs(points, reach, others, other_reach), expected)
+
+
+@pytest.mark.parametrize("shape", [over_faces, between_edges])
+def test_distances_are_those_of_many_points(shape):
+    corners = random(4, 3, 300, seed=4)
+    share = torch.linspace(0, 1, 101, dtype=torch.float64)
+    a, b, c, d = corners[..., None]
+    if shape is over_faces:
+        v, w = (part.flatten() for part in torch.meshgrid(share, share, indexing="ij"))
+        v, w = v[v + w <= 1], w[v + w <= 1]
+        far = (a - (b + v * (c - b) + w * (d - b))).norm(dim=0)
+    else:
+        one, other = a + share * (b - a), c + share * (d - c)
+        far = (one[..., None] - other[..., None, :]).norm(dim=0).flatten(1)
+    found = shape(corners)
+    assert ((found.distance - far.amin(1)).abs() < 0.02).all()
+    assert (found.distance <= far.amin(1) + 1e-12).all()
+    assert found.facing.any() and not found.facing.all()
+    torch.testing.assert_close(found.height.abs()[found.facing], found.distance[found.facing])
+
+
+@pytest.mark.parametrize("shape", [over_faces, between_edges])
+def test_directions_are_the_slopes_of_distances(shape):
+    corners = random(4, 3, 200, seed=5).requires_grad_()
+    (slope,) = torch.autograd.grad(shape(corners).distance.sum(), corners)
+    found = shape(corners.detach())
+    _, direction = found.gaps(torch.zeros(200, dtype=torch.float64))
+    torch.testing.assert_close(found.coefficients[:, None] * direction, slope, rtol=0, atol=1e-10)
+
+
+def test_a_vertex_over_a_face_has_the_energy_of_the_law(layers):
+    worn, contact = layers
+    height = 0.003
+    x = stacked(height)
+    touching = contact.contacts(x, contact.neighbours(x, x))
+    own = (touching.gap(x) - height).abs() < 1e-12
+    area = 0.5 * worn.garment.mesh.points[1, 0] ** 2 / 2 / 3  # half of a vertex's third of its triangle
+    law = ContactLaw(FABRIC.loose_contact, START, 0.5 * FABRIC.margin)
+    depth = START - height
+    expected = area * law.stiffness * depth**3 / (6 * law.ramp)
+    assert own.sum() == 1
+    assert touching.energy(x).item() == pytest.approx(expected, rel=1e-9)
+
+
+def test_forces_are_minus_the_slope_of_the_energy(layers):
+    _, contact = layers
+    x = stacked(0.002) + 1e-4 * random(6, 3, 1, seed=6)
+    known = contact.neighbours(x, x)
+    gradient = contact.contacts(x, known).gradient(x)
+    step = 1e-7
+    for vertex, axis in np.ndindex(6, 3):
+        moved = torch.zeros_like(x)
+        moved[vertex, axis] = step
+        more, less = (contact.contacts(x + sign * moved, known).energy(x + sign * moved) for sign in (1, -1))
+        slope = float(more - less) / (2 * step)
+        assert gradient[vertex, axis].item() == pytest.approx(slope, rel=1e-4, abs=1e-9)
+    assert gradient.abs().max() > 1e-4
+    assert gradient.sum(0).abs().max() < 1e-12  # it moves nothing as a whole
+
+
+def test_what_has_passed_through_is_pushed_back(layers):
+    _, contact = layers
+    before, after = stacked(0.004), stacked(-0.002)
+    sided = contact.contacts(after, contact.neighbours(before, after))
+    assert sided.gap(after).min().item() == pytest.approx(-0.002)
+    assert sided.gradient(after)[3, 1, 0] < 0  # the force on the corner points up, to where it came from
+    fresh = contact.contacts(after, contact.neighbours(after, after))
+    assert fresh.gap(after).min() > 0 and fresh.gradient(after)[3, 1, 0] > 0
+
+
+def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
+    _, contact = layers
+    known = contact.neighbours(stacked(0.004), stacked(-0.002))
+    x = stacked(-0.003)
+    assert contact.contacts(x, contact.moved(x, known)).gap(x).min().item() == pytest.approx(-0.003)
+    deep = stacked(-START - 0.002)
+    assert contact.contacts(deep, contact.moved(deep, known)).gap(deep).min() > 0
+
+
+def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
+    worn, _ = layers
+    held = dressed(worn, worn.garment.mesh.points, worn.garment.mesh.faces, np.ones(6, dtype=bool))
+    contact = SelfContact(held, FABRIC, CPU, torch.float64)
+    x = stacked(0.003)
+    assert not len(contact.contacts(x, contact.neighbours(x, x)).frame)
+
+
+def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np.ndarray]:
+    """A sheet in zigzag folds 8 mm apart, in frames that are folded more or less."""
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    worn = dressed(scene, points, faces, np.zeros(len(points), dtype=bool))
+    rows = np.round(-points[:, 1] / 0.05).astype(int)
+    found = []
+    for n in range(count):
+        folded = points.copy()
+        folded[:, 1], folded[:, 2] = -0.008 * (1 + 0.1 * n) * rows, np.where(rows % 2, 0.049, 0.0)
+        found.append(folded)
+    return SelfContact(worn, FABRIC, CPU, torch.float64), torch.as_tensor(np.stack(found, axis=-1)), faces
+
+
+def test_no_step_passes_through_folds(scene, toy_grid):
+    contact, x, faces = crumpled(toy_grid, scene, 3)
+    touching = contact.contacts(x, contact.neighbours(x, x))
+    crossed = 0
+    for seed in range(8):
+        step = 0.04 * (random(*x.shape, seed=seed) - 0.5)
+        held = x + touching.without_passing(x, step)
+        for n in range(3):
+            crossed += len(self_intersections((x + step)[..., n].numpy(), faces))
+            assert not len(self_intersections(held[..., n].numpy(), faces))
+        assert (held - x).abs().max() > 1e-4
+    assert crossed > 50
+    alike = torch.full_like(x, 0.004)  # what all move alike is not slowed
+    torch.testing.assert_close(touching.without_passing(x, alike), alike)
+
+
+def test_frames_are_independent(scene, toy_grid):
+    contact, x, _ = crumpled(toy_grid, scene, 3)
+    x = x + 0.002 * random(*x.shape, seed=9)
+    known = contact.neighbours(x, x)
+    whole = contact.contacts(x, known)
+    for frames_of in (
+        whole.select(torch.tensor([0, 2])),
+        contact.contacts(x[..., [0, 2]], known.select(torch.tensor([0, 2]))),
+    ):
+        torch.testing.assert_close(frames_of.energy(x[..., [0, 2]]), whole.energy(x)[[0, 2]])
+    parts = [(torch.tensor(rows), known.select(torch.tensor(rows))) for rows in ([0, 2], [1])]
+    joined = known.joined([parts[1], parts[0]])
+    for kind in ("faces", "edges"):
+        for name in ("frame", "first", "second", "side", "start"):
+            assert torch.equal(getattr(getattr(joined, kind), name), getattr(getattr(known, kind), name))
+    assert torch.equal(joined.at, known.at)
+
+
+def random_contacts(vertices: int, count: int, frames_of: int) -> ClothContacts:
+    """Contacts between random vertices, all pressed."""
+    corners = torch.rand(vertices, count, generator=torch.Generator().manual_seed(3)).argsort(0)[:4]
+    direction = torch.nn.functional.normalize(random(3, count, seed=1) - 0.5, dim=0)
+    w = random(3, count, seed=2)
+    coefficients = torch.cat([torch.ones(1, count, dtype=torch.float64), -w / w.sum(0)])
+    frame = (frames_of * random(count, seed=4)).long().sort()[0]
+    law = ContactLaw(1e5, 5.0, 4e-3)
+    second = torch.tensor([[False], [True], [True], [True]]).expand(4, count)
+    start, area = torch.full((count,), 5.0, dtype=torch.float64), 1e-4 * random(count, seed=5)
+    return ClothContacts(law, 0.01, frames_of, frame, corners, coefficients, second, direction, start, area)
+
+
+@pytest.mark.parametrize("frames_of", [1, 3])
+def test_stiffness_is_that_of_dense_algebra(frames_of):
+    contacts, vertices = random_contacts(12, 20, frames_of), 12
+    x = random(vertices, 3, frames_of, seed=7)
+    free = np.array([0, 1, 2, 4, 5, 7, 8, 9, 11])
+    place = torch.full((vertices,), -1)
+    place[free] = torch.arange(len(free))
+    found = ContactStiffness.of(contacts, x, place, len(free))
+    for n in range(frames_of):
+        dense = torch.zeros(3 * vertices, 3 * vertices, dtype=torch.float64)
+        for p in torch.nonzero(contacts.frame == n)[:, 0].tolist():
+            row = torch.zeros(vertices, 3, dtype=torch.float64)
+            for i in range(4):
+                row[contacts.vertices[i, p]] += contacts.coefficients[i, p] * contacts.direction[:, p]
+            dense += contacts.stiffness(x)[p] * torch.outer(row.flatten(), row.flatten())
+        kept = (3 * torch.as_tensor(free)[:, None] + torch.arange(3)).flatten()
+        dense = dense[kept][:, kept]
+        vectors, image = random(len(free), 3, frames_of, seed=8).float(), torch.zeros(len(free), 3, frames_of)
+        found.add_product(vectors, image)
+        expected = (dense @ vectors[..., n].double().flatten()).view(-1, 3)
+        torch.testing.assert_close(image[..., n].double(), expected, rtol=1e-4, atol=1e-4)
+        for u in range(len(free)):
+            block = dense[3 * u : 3 * u + 3, 3 * u : 3 * u + 3]
+            torch.testing.assert_close(found.diagonal[u, ..., n].double(), block, rtol=1e-4, atol=1e-4)
+
+
+def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
+    vertices, frames_of = 12, 3
+    pattern = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, CPU)
+    blocks = 3.0 * torch.eye(3)[:, :, None].repeat(vertices, 1, 1, frames_of)
+    x, place = random(vertices, 3, frames_of, seed=7), torch.arange(vertices)
+    contacts = ContactStiffness.of(random_contacts(vertices, 20, frames_of), x, place, vertices)
+    matrix = BlockMatrix(pattern, blocks, contacts)
+    right = random(vertices, 3, frames_of, seed=9).float()
+    inverse = inverse_blocks((blocks + contacts.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
+    by_kernel, _ = solve_kernel(blocks, pattern.table, inverse, right, 1e-6, 96, CHECK_EVERY, contacts.add_product)
+    monkeypatch.setattr("ssilk_core.physics.kernels.available", lambda device: False)
+    found, _ = matrix.solve(right, 1e-6, 96)
+    size = 3 * vertices * frames_of
+    stiffness = contacts.columns.to_dense().double() @ contacts.rows.to_dense().double()
+    dense = 3 * torch.eye(size, dtype=torch.float64) + stiffness
+    expected = torch.linalg.solve(dense, right.double().flatten()).view_as(right).float()
+    torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(by_kernel, expected, rtol=1e-3, atol=1e-5)
+
+
+def twisted(potential: IncrementalPotential, points: np.ndarray, pinned: np.ndarray, apart: bool) -> list[np.ndarray]:
+    """A sheet whose upper edge turns by 30 degrees in each frame and shrinks, so that it becomes a rope."""
+    down = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
+    pins = torch.as_tensor(np.flatnonzero(pinned))
+    x = frames(points) + 1e-3 * (random(*points.shape, 1) - 0.5) * frames(~pinned[:, None])
+    before, known, found = x, None, []
+    for frame in range(12):
+        angle, width = np.deg2rad(30 * (frame + 1)), 1 - 0.6 * min(1, (frame + 1) / 8)
+        edge = points[pinned][:, :1] * width * np.array([np.cos(angle), 0, np.sin(angle)])
+        inputs = StepInputs(None, down, 2 * x - before, x, 1 / 30)
+        start = (2 * x - before).index_copy(0, pins, frames(edge))
+        if apart:
+            start, inputs = potential.approach(x, start, inputs, known)
+            start = start.index_copy(0, pins, frames(edge))
+        solution = minimise_from(potential, start, inputs, SolverOptions())
+        before, x, known = x, solution.x, solution.neighbours
+        found.append(x[..., 0].numpy())
+    return found
+
+
+def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
+    points, faces = toy_grid(10, 10, height=0.5, width=0.5)
+    pinned = points[:, 1] > -1e-9
+    potential = IncrementalPotential(dressed(scene, points, faces, pinned), FABRIC, device=CPU)
+    through = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=False)]
+    apart = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=True)]
+    assert sum(through) > 10
+    assert apart == [0] * 12
+
+
+def test_shots_of_different_lengths_go_on_with_it(scene, toy_motion):
+    simulator = Simulator(scene, FABRIC, SimulationOptions(self_contact=True))
+    motions = [toy_motion(scene, 3), toy_motion(scene, 2)]  # the second one is the beginning of the first
+    found = {(frame.shot, frame.number): frame for frame in simulator.frames(motions)}
+    assert sorted(found) == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1)]
+    for (_, number), frame in found.items():
+        np.testing.assert_allclose(frame.points, found[0, number].points, atol=1e-5)
+        assert frame.residual < 1e-2
