@@ -266,10 +266,12 @@ def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> 
 def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, int], where: str) -> Floats:
     """Return an attribute at each time code, shape (F, *shape)."""
     values = [np.array(animation.GetAttribute(name).Get(code)) for code in codes]
-    odd = next((item for item in values if item.shape != shape), None)
-    if odd is not None:
-        found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}"
-        fail(where, f"the animation has {found}", f"{shape[0]} are needed, one for each joint", "export it again")
+    for code, odd in zip(codes, values):
+        if odd.shape != shape:
+            when = f" at time code {code:g}" if animation.GetAttribute(name).HasValue() else ""
+            found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}{when}"
+            needed = f"{shape[0]} are needed, one for each joint"
+            fail(where, f"the animation has {found}", needed, "export it again")
     result = np.array(values, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(result).all(axis=(1, 2)))
     if len(bad):
