@@ -78,7 +78,7 @@ def gather(
         units=scene_units(),
         joints=joints if rig else joints.character,
         character=Character(
-            ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", [body.skin for body in bodies]), tuple(bodies)
+            ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", bodies), tuple(bodies)
         ),
         garment=Garment(
             mesh,

@@ -9,7 +9,7 @@ import pytest
 from blender_addon.arrays.joints import Joints, identifiers, joint_order, joint_paths
 from blender_addon.arrays.renamed import TrainedJoints, known_as
 from blender_addon.errors import SetupError
-from ssilk_core.scene.assets import SkinWeights
+from ssilk_core.scene.assets import Body, Mesh, SkinWeights
 
 
 def test_names_become_unique_identifiers():
@@ -66,8 +66,15 @@ def test_two_bones_are_not_one_joint(joints):
 
 def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
     """As readers of stages find it: a root above the hips may stand still."""
-    moved = SkinWeights.from_dense("/Body", np.array([[0.0, 1.0], [0.0, 1.0]]))
+
+
+    def body(weights: list[list[float]], height: float = 1.0) -> Body:
+        points = np.array([[0, 0, 0], [1, 0, 0], [0, height, 0]])
+        return Body(Mesh("/Body", points, np.array([[0, 1, 2]])), SkinWeights.from_dense("/Body", np.array(weights)))
+
+    moved, spread = body([[0, 1], [0, 1], [0, 1]]), body([[0.5, 0.5], [0, 1], [0, 1]])
     assert joints.skeleton("/").hub == 0
     assert joints.skeleton("/", [moved]).hub == 1
-    spread = SkinWeights.from_dense("/Body", np.array([[0.5, 0.5], [0.0, 1.0]]))
     assert joints.skeleton("/", [moved, spread]).hub == 0
+    shadow = body([[1, 0], [1, 0], [1, 0]])
+    assert joints.skeleton("/", [body([[0.01, 0.99], [0, 1], [0, 1]]), shadow]).hub == 1

@@ -797,7 +797,7 @@ def game_skeleton(case: str) -> Usd.Stage:
         "stray weights": ["root"],
         "targets of inverse kinematics": ["root", "root/ik", "root/ik/hand"],
         "another root first": ["helper"],
-    }[case]
+    }.get(case, ["root", "root/hand"])
     under = {"two": "world/root/", "another root first": ""}.get(case, "root/")
     skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
     for attribute in (skeleton.GetBindTransformsAttr(), skeleton.GetRestTransformsAttr()):
@@ -814,6 +814,57 @@ def game_skeleton(case: str) -> Usd.Stage:
         binding.GetJointWeightsPrimvar().Set(weights.tolist())
     binding.GetJointIndicesPrimvar().Set(indices.tolist())
     return stage
+
+
+def add_prop(stage: Usd.Stage, joints: list[int], size: float) -> None:
+    """Add a triangle of some size, each corner of which follows one of the joints."""
+    prop = UsdGeom.Mesh.Define(stage, "/Hero/Prop")
+    prop.CreatePointsAttr([Gf.Vec3f(0, 1, 0), Gf.Vec3f(size, 1, 0), Gf.Vec3f(0, 1 + size, 0)])
+    prop.CreateFaceVertexCountsAttr([3])
+    prop.CreateFaceVertexIndicesAttr([0, 1, 2])
+    binding = UsdSkel.BindingAPI.Apply(prop.GetPrim())
+    binding.CreateJointIndicesPrimvar(False, 1).Set(joints)
+    binding.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 3)
+
+
+def beside(case: str) -> Usd.Stage:
+    """The character of `game_skeleton`, and what else is in its stage, or not."""
+    stage = game_skeleton("a prop" if case != "a root" else case)
+    root, body = UsdSkel.Root(stage.GetPrimAtPath("/Hero")), stage.GetPrimAtPath("/Hero/Body")
+    if case == "a prop that a joint beside the hips moves":
+        add_prop(stage, [1, 1, 1], 2.0)
+    elif case == "a small prop with two such joints":
+        add_prop(stage, [0, 1, 1], 0.2)
+    elif case == "a stand-in":
+        add_prop(stage, [0, 1, 1], 2.0)
+        UsdGeom.Imageable(stage.GetPrimAtPath("/Hero/Prop")).CreatePurposeAttr("proxy")
+    elif case == "a garment alone":
+        body.CreateAttribute("ssilk:garment", Sdf.ValueTypeNames.Bool).Set(True)
+    elif case == "parts that joints carry":
+        cache = UsdSkel.Cache()
+        cache.Populate(root, Usd.PrimDefaultPredicate)
+        query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")))
+        poses = [query.ComputeSkinningTransforms(code) for code in range(1, FRAMES + 1)]
+        for joint in (2, 3, 4, 5):
+            Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), f"/Hero/Part{joint}")
+            part = stage.GetPrimAtPath(f"/Hero/Part{joint}")
+            for name in ("Indices", "Weights"):
+                part.RemoveProperty(f"primvars:skel:joint{name}")
+            place = UsdGeom.Xformable(part).AddTransformOp()
+            for code, pose in enumerate(poses, start=1):
+                place.Set(pose[joint], code)
+        body.SetActive(False)
+    return stage
+
+
+BESIDE = ("a prop that a joint beside the hips moves", "a small prop with two such joints", "a stand-in",
+          "a garment alone", "parts that joints carry")  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BESIDE)
+def test_what_else_is_in_a_stage_does_not_move_the_hub(case):
+    skeleton = read_character(beside(case)).skeleton
+    assert skeleton.joint_names[skeleton.hub] == "root/Hips"
 
 
 @pytest.mark.parametrize(

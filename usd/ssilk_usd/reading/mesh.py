@@ -132,10 +132,10 @@ def winds_backwards(prim: Usd.Prim) -> bool:
     the geomBindTransform of a skinned mesh, whose xforms UsdSkel ignores.
     """
     left_handed = value(prim, "orientation") == UsdGeom.Tokens.leftHanded
-    return bool(left_handed != (np.linalg.det(_placement(prim)[:3, :3]) < 0))
+    return bool(left_handed != (np.linalg.det(placement(prim)[:3, :3]) < 0))
 
 
-def _placement(prim: Usd.Prim) -> Floats:
+def placement(prim: Usd.Prim) -> Floats:
     """Return what places a mesh's points: to bind space where it is skinned, else to the world, shape (4, 4)."""
     bound = inherited_target(prim, "skel:skeleton")
     if not (bound and bound.IsA(UsdSkel.Skeleton) and inherited(prim, SKEL[0])):
