@@ -907,6 +907,8 @@ TILTED = {
     "y up in a z-up stage": Recipe(up="Z", placements=[np.linalg.inv(UPRIGHT_Z)]),
     "centimetres, y up, in a z-up stage of metres": Recipe(up="Z", placements=[turned("x", 90, 0.01)]),
     "turned, moved and scaled": Recipe(placements=[turned("y", 30, at=(2, 0, 1)) @ turned("x", -90, 0.01)]),
+    "turned and moved": Recipe(placements=[turned("y", 70, at=(3, 0.5, -2))]),
+    "moved": Recipe(placements=[turned("y", 0, at=(3, 0, 2))]),
 }
 
 
@@ -915,6 +917,32 @@ def test_a_clip_alone_moves_its_character_as_usdskel_shows_it_bound(recipe):
     stage = author(Usd.Stage.CreateInMemory(), recipe)
     character = read_character(stage)
     motion = read_motion(alone(stage, meters=recipe.meters, up=recipe.up), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+
+
+def lay_down(stage: Usd.Stage) -> None:
+    """Turn the character of a stage over, face down or on its back, in the space of its skeleton."""
+    over = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 0, 0), 180))
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    for code in animation.GetRotationsAttr().GetTimeSamples():
+        turns, places = animation.GetRotationsAttr().Get(code), animation.GetTranslationsAttr().Get(code)
+        turns[0] = Gf.Quatf(over.ExtractRotationQuat()) * turns[0]
+        places[0] = Gf.Vec3f(over.TransformDir(Gf.Vec3d(places[0])))
+        animation.GetRotationsAttr().Set(turns, code)
+        animation.GetTranslationsAttr().Set(places, code)
+
+
+@pytest.mark.parametrize(("scale", "says_axis"), [(1.0, False), (0.01, True), (0.01, False)])
+def test_a_clip_alone_may_lie(scale, says_axis):
+    """Upright by its own file's axis: the unit tells the space, and a file that says no axis converted nothing."""
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("x", -90, scale)]))
+    character = read_character(stage)
+    lay_down(stage)
+    clip = alone(stage, meters=1, up="Y")
+    if not says_axis:
+        clip.GetRootLayer().pseudoRoot.ClearInfo("upAxis")
+    motion = read_motion(clip, character.skeleton)
     expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
     np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
 

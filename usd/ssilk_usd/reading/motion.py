@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdSkel
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
@@ -123,7 +123,9 @@ def read_motion(
     units = StageUnits.of(stage)
     if placed is None and skeleton.placement is not None:
         sample = read_samples(animation, spread(codes, LOOKED_AT), len(joints), where)
-        found = clip_placement(rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match], match, units, skeleton)
+        posed_so = rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match]
+        says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
+        found = clip_placement(posed_so, match, units, skeleton, says_axis=says_axis)
         placements, units = (placements, units) if found is None else (found[None], StageUnits())
     scale = similarity_scale(placements)
     rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
