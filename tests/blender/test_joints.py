@@ -67,7 +67,6 @@ def test_two_bones_are_not_one_joint(joints):
 def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
     """As readers of stages find it: a root above the hips may stand still."""
 
-
     def body(weights: list[list[float]], height: float = 1.0) -> Body:
         points = np.array([[0, 0, 0], [1, 0, 0], [0, height, 0]])
         return Body(Mesh("/Body", points, np.array([[0, 1, 2]])), SkinWeights.from_dense("/Body", np.array(weights)))
