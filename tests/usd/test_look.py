@@ -236,7 +236,7 @@ def test_what_a_mesh_has_from_above_and_what_is_said_in_words_is_kept(hero, tmp_
 
 
 def beside_the_character(hero: Path, *, skin: bool) -> None:
-    """Put the cape under an Xform that says its look; `skin` is bound to the character, stronger than what hangs on it."""
+    """Put the cape under an Xform that says its look; `skin` is bound to the character, more strongly."""
     stage = Usd.Stage.Open(str(hero))
     top = UsdGeom.Xform.Define(stage, "/Wardrobe").GetPrim()
     edit = Sdf.BatchNamespaceEdit()

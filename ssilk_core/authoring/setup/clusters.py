@@ -87,16 +87,20 @@ def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
     return [kept[label == number] for number in np.argsort(-areas, kind="stable")]
 
 
-def distribute_proxies(areas: Floats, sizes: Ints, count: int) -> Ints:
+def distribute_proxies(areas: Floats, sizes: Ints, count: int, images: Ints) -> Ints:
     """Distribute `count` proxies among pieces in proportion to `areas` (N,).
 
     Each piece gets one proxy first, in order, until none is left. A piece gets no more proxies than it has
-    vertices: `sizes`, shape (N,).
+    vertices: `sizes`, shape (N,). Of those left, pieces that are `images` of each other, (N,), get as many, so that
+    one may stay; others are images of themselves.
     """
-    shares = (np.arange(len(areas)) < count).astype(int)
-    while shares.sum() < min(count, sizes.sum()):
-        unfilled = np.where((shares > 0) & (shares < sizes), areas, -1.0)
-        shares[np.argmax(unfilled / np.maximum(shares, 1))] += 1
+    shares, alone = (np.arange(len(areas)) < count).astype(int), images == np.arange(len(areas))
+    while (left := min(count, int(sizes.sum())) - int(shares.sum())) > 0:
+        fitting = (shares > 0) & (shares < sizes) & (alone | (left > 1))
+        if not fitting.any():
+            break
+        chosen = int(np.argmax(np.where(fitting, areas, -1.0) / np.maximum(shares, 1)))
+        shares[np.unique([chosen, images[chosen]])] += 1
     return shares
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh.geodesic import distances
-from ...scene.mesh.topology import edges
+from ...scene.mesh.topology import edge_use, edges
 
 SAME = 1e-5  # [m] between a vertex and the image of its twin
 LEFT, RIGHT = "_L", "_R"  # USD has no dots in names; Blender flips these too
@@ -30,7 +30,8 @@ class Mirror:
     Attributes:
         axis: of the core's axes, that the plane is across.
         centre: where the plane is on it [m].
-        twin: of each vertex, the one that is its image: itself in the plane, shape (V,).
+        twin: of each vertex, the one that is its image: itself in the plane; of one that is carried, that of its
+            host, shape (V,).
     """
 
     axis: int
@@ -58,20 +59,34 @@ class Mirror:
         return [LEFT if (place - self.centre) * left > 0 else RIGHT for place in places[:, self.axis]]
 
 
-def find_mirror(mesh: Mesh, loose: NDArray[np.bool_]) -> Mirror | None:
-    """Return the upright plane that mirrors a mesh and what of it is `loose` (V,); None where it has none."""
+def find_mirror(mesh: Mesh, pieces: Ints, hosts: Ints) -> Mirror | None:
+    """Return the upright plane that mirrors the points, the borders and the pieces of a mesh; None without one.
+
+    Its polygons need not be images: programs divide them along either diagonal. Nor need what the cloth carries,
+    such as buttons.
+
+    Args:
+        pieces: number of the loose piece that each vertex belongs to, -1 for the others, shape (V,).
+        hosts: vertex that carries each, itself without one, shape (V,).
+    """
     from scipy.spatial import cKDTree
 
-    points, numbers = np.asarray(mesh.points), np.arange(mesh.vertex_count)
-    sides = _sides(mesh)
+    numbers = np.arange(mesh.vertex_count)
+    kept = np.flatnonzero(hosts == numbers)
+    points, borders = mesh.points[kept], _borders(mesh, hosts == numbers)
     for axis in (0, 2):
         centre = (points[:, axis].min() + points[:, axis].max()) / 2
         image = points.copy()
         image[:, axis] = 2 * centre - image[:, axis]
-        away, twin = cKDTree(points).query(image)
-        if not (away.max() < SAME and (twin[twin] == numbers).all() and (loose[twin] == loose).all()):
+        away, nearest = cKDTree(points).query(image)
+        if not (away.max() < SAME and (nearest[nearest] == np.arange(len(kept))).all()):
             continue
-        if np.array_equal(sides, np.unique(np.sort(twin[sides], axis=1), axis=0)):
+        twin = numbers.copy()
+        twin[kept] = kept[nearest]
+        twin = twin[hosts]
+        of_pieces = np.unique(np.stack([pieces, pieces[twin]], axis=1), axis=0)
+        one_to_one = len(of_pieces) == len(np.unique(pieces)) and np.array_equal(pieces < 0, pieces[twin] < 0)
+        if one_to_one and np.array_equal(borders, _in_order(twin[borders])):
             return Mirror(axis, float(centre), twin)
     return None
 
@@ -90,7 +105,7 @@ def mirrored_points(
         The samples, shape (S,), and the distance of every vertex to each of them [m], shape (S, V).
     """
     numbers = np.arange(len(points))
-    pairs, within = edges(faces), twin == numbers
+    pairs, within, paired = edges(faces), twin == numbers, twin[twin] == numbers
     crossing = np.unique(pairs[twin[pairs[:, 0]] == pairs[:, 1]])
     to_plane = distances(points, faces, np.union1d(np.flatnonzero(within), crossing))
     samples: list[int] = []
@@ -98,18 +113,21 @@ def mirrored_points(
 
     def add(vertex: int) -> None:
         row = distances(points, faces, np.array([vertex]))
-        both = [(vertex, (row + row[twin]) / 2)] if within[vertex] else [(vertex, row), (int(twin[vertex]), row[twin])]
+        both = (
+            [(vertex, (row + row[twin]) / 2)] if within[vertex] else [(vertex, row), (int(twin[vertex]), row[twin])]
+        )
         for sample, distance in both:
             samples.append(sample)
             rows.append(distance)
             placed()
 
+    first = np.where(paired, first, np.inf)
     begin = np.where(within, first, np.inf)
     add(int((begin if np.isfinite(begin).any() else first).argmin()))
     while len(samples) < count:
         nearest = np.min(rows, axis=0)
         gain = np.where(within, nearest, np.minimum(nearest, 2 * to_plane))
-        gain[~np.isfinite(gain) | (~within & (count - len(samples) < 2))] = 0
+        gain[~np.isfinite(gain) | ~paired | (~within & (count - len(samples) < 2))] = 0
         if gain.max() <= 0:
             break
         add(int(gain.argmax()))
@@ -122,13 +140,12 @@ def mates_of(samples: Ints, twin: Ints) -> Ints:
     return np.array([place.get(int(twin[sample]), -1) for sample in samples], dtype=np.int64)
 
 
-def _sides(mesh: Mesh) -> Ints:
-    """Return the sides of a mesh's polygons, each once as an ascending pair of vertices, in order, shape (E, 2).
+def _borders(mesh: Mesh, kept: NDArray[np.bool_]) -> Ints:
+    """Return the edges that one face alone has, of vertices that are `kept` (V,), as `_in_order` does."""
+    pairs, used = edge_use(mesh.faces)
+    return _in_order(pairs[(used == 1) & kept[pairs].all(axis=1)])
 
-    Triangles may divide two polygons that are images along different diagonals.
-    """
-    counts, corners = np.asarray(mesh.polygon_counts), np.asarray(mesh.indices_of_corners)
-    following = np.arange(1, len(corners) + 1)
-    ends = np.cumsum(counts)
-    following[ends - 1] = ends - counts
-    return np.unique(np.sort(np.stack([corners, corners[following]], axis=1), axis=1), axis=0)
+
+def _in_order(pairs: Ints) -> Ints:
+    """Return pairs of vertices (E, 2), each ascending, in ascending order."""
+    return np.unique(np.sort(pairs, axis=1), axis=0)

@@ -99,8 +99,12 @@ def build_rig(
         return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
     body_weights = garment.skin.dense(character.skeleton.joint_count)
     seam = find_seam(joined, loose)
-    mirror = find_mirror(garment.mesh, loose)
-    clusters = _clusters(character, joined, loose, body_weights, seam, options, mirror, report)
+    pieces, piece_of = find_pieces(joined, loose), np.full(joined.vertex_count, -1)
+    for number, piece in enumerate(pieces):
+        piece_of[piece] = number
+    mirror = find_mirror(garment.mesh, piece_of, hosts.carry(np.arange(joined.vertex_count)))
+    images = np.arange(len(pieces)) if mirror is None else piece_of[mirror.twin[[piece[0] for piece in pieces]]]
+    clusters = _clusters(character, joined, pieces, images, body_weights, seam, options, mirror, report)
     weights = proxy_weights(
         joined,
         loose,
@@ -119,21 +123,20 @@ def build_rig(
 def _clusters(
     character: Character,
     mesh: Mesh,
-    loose: Mask,
+    pieces: Sequence[Ints],
+    images: Ints,
     body_weights: Floats,
     seam: Seam,
     options: RigOptions,
     mirror: Mirror | None,
     report: events.Reporter,
 ) -> list[Cluster]:
-    """Return the clusters that get proxies, in descending order of area; images of each other where pieces are."""
-    pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
+    """Return the clusters that get proxies, in the order of the pieces, whose `images` are clusters' images, too."""
+    areas = vertex_areas(mesh.points, mesh.faces)
     count = _affordable(len(pieces), options, mesh.path, report)
     shares = distribute_proxies(
-        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
+        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count, images
     )
-    images = _images(pieces, mirror)
-    shares = np.minimum(shares, shares[images])
     parents, roots = character.skeleton.parents, options.roots_per_cluster
     placed = events.Countdown(int(shares.sum()), report)
     clusters: dict[int, Cluster] = {}
@@ -146,20 +149,17 @@ def _clusters(
             continue
         twin = np.searchsorted(piece, mirror.twin[piece]) if mirror and image == number else None
         clusters[number] = build_cluster(
-            mesh, piece, seam, body_weights, parents, proxies=int(shares[number]), roots=roots, twin=twin, placed=placed
+            mesh,
+            piece,
+            seam,
+            body_weights,
+            parents,
+            proxies=int(shares[number]),
+            roots=roots,
+            twin=twin,
+            placed=placed,
         )
     return list(clusters.values())
-
-
-def _images(pieces: Sequence[Ints], mirror: Mirror | None) -> Ints:
-    """Return which of some pieces is the image of each, itself without a mirror."""
-    numbers = np.arange(len(pieces))
-    if mirror is None:
-        return numbers
-    piece_of = np.zeros(len(mirror.twin), dtype=np.int64)
-    for number, piece in enumerate(pieces):
-        piece_of[piece] = number
-    return np.array([piece_of[mirror.twin[piece[0]]] for piece in pieces])
 
 
 def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether UsdSkel skins a mesh that has influences. USD says nothing where it does not, and shows the mesh unposed."""
+"""Whether UsdSkel skins a mesh that has influences. Where it does not, USD shows the mesh as it was modelled."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def need_skinned(prim: Usd.Prim) -> None:
 
 
 def unapplied(prim: Usd.Prim, name: str) -> str:
-    """Return in words that a prim which says `name` does not apply the schema that makes it count; empty if it does."""
+    """Return in words that a prim says `name` without the schema that makes it count; empty if it has the schema."""
     return "" if prim.HasAPI(UsdSkel.BindingAPI) else f"{prim.GetPath()} says {name} and does not apply {SCHEMA}"
 
 

@@ -118,7 +118,7 @@ def character_skeleton(source: SkelSource) -> Skeleton:
 
 
 def _moved(source: SkelSource) -> list[Floats]:
-    """Return how much of each body each joint of a skeleton moves, shapes (N,); of garments where there is no body."""
+    """Return how much of each body each joint of a skeleton moves, shapes (N,); of garments where no body is."""
     meshes = [prim for prim in Usd.PrimRange(source.root, PRIMS) if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
     bodies = rendered([prim for prim in meshes if not is_garment(prim)])
     skinned = [_skinned(prim, source) for prim in bodies]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a mesh looks like by the prims above it: it would lose that, or take on other things, where it is moved away."""
+"""What a mesh looks like by the prims above it. Moved away, it would lose that, or take on other things."""
 
 from __future__ import annotations
 
