@@ -77,3 +77,19 @@ def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
     assert joints.skeleton("/", [moved, spread]).hub == 0
     shadow = body([[1, 0], [1, 0], [1, 0]])
     assert joints.skeleton("/", [body([[0.01, 0.99], [0, 1], [0, 1]]), shadow]).hub == 1
+
+
+def test_blender_symmetrizes_proxies(bpy):
+    """The names that proxies of a symmetric garment have are those that Blender takes for two sides."""
+    from ssilk_core.authoring.setup.mirror import LEFT, RIGHT
+
+    rig = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
+    bpy.context.collection.objects.link(rig)
+    bpy.context.view_layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = rig.data.edit_bones.new(f"Cape_proxy_03{LEFT}")
+    bone.head, bone.tail = (0.3, 0, 1), (0.35, 0, 0.8)
+    bone.select = bone.select_head = bone.select_tail = True
+    bpy.ops.armature.symmetrize()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert rig.data.bones[f"Cape_proxy_03{RIGHT}"].head_local[:] == pytest.approx((-0.3, 0, 1))

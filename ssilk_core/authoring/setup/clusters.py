@@ -136,6 +136,8 @@ def build_cluster(
     points = mesh.points[vertices]
     off_middle = np.linalg.norm(points - points[at_seam].mean(axis=0), axis=1)
     first = np.where(at_seam, off_middle, np.inf)
+    samples: Ints
+    mates: Ints
     if twin is None or proxies == 1:
         samples, spread = farthest_points(points, faces, int(first.argmin()), proxies, sampled=placed)
         mates = np.arange(len(samples))
@@ -214,7 +216,7 @@ def hierarchy(
     above = [-1] * len(order)
     while len(order) < count:
         rest = np.setdiff1d(np.arange(count), order)
-        reach = between[np.ix_(order, rest)]
+        reach = between[np.ix_(np.array(order), rest)]
         level = np.flatnonzero(np.isfinite(reach.min(axis=0)))
         level = level[np.argsort(reach.min(axis=0)[level], kind="stable")]
         parents = dict(zip(rest[level].tolist(), reach.argmin(axis=0)[level].tolist()))
