@@ -63,9 +63,7 @@ class Baseline(nn.Module, ABC):
         """Return the states (N, S) of poses without a past, from static descriptors (N, 9 J)."""
 
     @abstractmethod
-    def roll(
-        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
-    ) -> list[Tensor]:
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None) -> list[Tensor]:
         """Return `states`, of which the last counts, followed by those of the next frames; each (batch, S).
 
         Args:
@@ -106,9 +104,7 @@ class NCS(Baseline):
         code = self.posed(static)
         return torch.cat([code, torch.zeros_like(code)], dim=1)
 
-    def roll(
-        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
-    ) -> list[Tensor]:
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None) -> list[Tensor]:
         still, moving, _ = split_features(pose)
         begun = states[-1][:, self.width :].contiguous()
         motion, _ = self.memory(self.gathered(self.moved(moving).flatten(2)), begun[None])
@@ -146,9 +142,7 @@ class SNUG(Baseline):
         seen = nn.functional.pad(static, (0, ROOT))
         return self._remembered(seen[None], seen.new_zeros(len(seen), self.depth * self.width))[0]
 
-    def roll(
-        self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None
-    ) -> list[Tensor]:
+    def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames | None = None) -> list[Tensor]:
         still, _, root = split_features(pose)
         return [*states, *self._remembered(torch.cat([still, root], dim=2), states[-1])]
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssilk_core.scene.assets import Skeleton, SkinWeights, carrying_joint
+from ssilk_core.scene.assets import Body, Skeleton, carrying_joint, moved_by_joints
 from ssilk_core.scene.kinematics import local_transforms
 
 from ..errors import SetupError
@@ -59,16 +59,16 @@ class Joints:
         return replace(self, names=self.names[:count], parents=self.parents[:count], binds=self.binds[:count],
                        proxy_count=0, known=self.known[:count])  # fmt: skip
 
-    def skeleton(self, path: str, bodies: Sequence[SkinWeights] = ()) -> Skeleton:
+    def skeleton(self, path: str, bodies: Sequence[Body] = ()) -> Skeleton:
         """Return the character's joints as a skeleton whose rest pose is its bind pose.
 
         Args:
             path: of its prim.
-            bodies: weights of the bodies over the joints; with none the first joint carries the character.
+            bodies: what the joints move; with none the first joint carries the character.
         """
         own = self.character
         count = len(own.names)
-        moved = sum((skin.dense(count).mean(axis=0) for skin in bodies), np.zeros(count))
+        moved = [moved_by_joints(body.mesh.points, body.skin.dense(count)) for body in bodies]
         hub = carrying_joint(moved, own.parents)
         return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents), hub)
 

@@ -77,9 +77,7 @@ def gather(
     return GatheredScene(
         units=scene_units(),
         joints=joints if rig else joints.character,
-        character=Character(
-            ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", [body.skin for body in bodies]), tuple(bodies)
-        ),
+        character=Character(ROOT, joints.skeleton(f"{ROOT}/{SKELETON}", bodies), tuple(bodies)),
         garment=Garment(
             mesh,
             None if lbs is None else SkinWeights.from_dense(paths[0], lbs),

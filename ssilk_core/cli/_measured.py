@@ -34,6 +34,7 @@ def measured_inputs(
     from ..delivery.bake.inputs import stage_contents
     from ..devices import device_name, select_device
     from ..files import sha256
+    from ..physics.intersections.pairs import libigl_version
 
     return {
         "models": [(path.stem, sha256(path)) for path in models],
@@ -41,7 +42,7 @@ def measured_inputs(
         "motions": dict(zip(clips, contents(clips.values()))),
         **{name: contents(paths) for name, paths in others.items()},
         "hardware": device_name(select_device(device)),
-        "versions": {"ssilk": __version__, "torch": torch.__version__},
+        "versions": {"ssilk": __version__, "torch": torch.__version__, "libigl": libigl_version()},
     }
 
 

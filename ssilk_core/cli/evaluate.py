@@ -116,8 +116,10 @@ def evaluated(
         exact: see `evaluation.methods.EvaluationScene`.
     """
     from ..devices import select_device
+    from ..physics.intersections.pairs import need_predicates
     from ..quality.evaluation.run import evaluate
 
+    need_predicates()
     device = select_device(options.device)
     opened, listed = [opener(path, device) for path in options.models], _listed(options)
     results = _results(options, asked, opened, listed)

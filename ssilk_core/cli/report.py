@@ -46,8 +46,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Measure, draw and write."""
     from ..delivery.report.figures import section_of
     from ..delivery.report.page import page
+    from ..physics.intersections.pairs import need_predicates
 
     _check(options)
+    if options.stage or options.subject.suffix != MODEL:
+        need_predicates()
     given = [section_of(path) for path in options.figures]
     own = _model(options, report) if options.subject.suffix == MODEL else _shot(options.subject, report)
     *measured, provenance = own

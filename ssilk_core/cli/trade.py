@@ -59,6 +59,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Sweep; return 0, or 4 where variants could not be measured."""
+    from ..physics.intersections.pairs import need_predicates
     from ..quality.charts import write_chart
     from ..quality.trade.collision_cost import measure_collisions
     from ..quality.trade.plot import trade_panels
@@ -70,6 +71,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models)
+    need_predicates()
     bench = Bench(options)
     results = Results(options.output, bench.asked)
     results.resume(report)

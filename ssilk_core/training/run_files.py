@@ -14,6 +14,7 @@ from ..devices import device_name
 from ..files import remove_unfinished
 from ..network.checkpoint import model_file, save_model
 from ..network.model.network import GarmentModel
+from ..physics.intersections.pairs import libigl_version
 from .curve import curve_path, summary, write_curve
 from .divergence import fault_path, save_fault
 from .job import TrainJob
@@ -71,6 +72,7 @@ class RunFiles:
                 "seed": self.job.train.seed,
                 "ssilk": __version__,
                 "torch": torch.__version__,
+                "libigl": libigl_version(),
                 "python": platform.python_version(),
                 "device": device_name(self.device),
                 "validation": summary(score),

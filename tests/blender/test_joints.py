@@ -9,7 +9,7 @@ import pytest
 from blender_addon.arrays.joints import Joints, identifiers, joint_order, joint_paths
 from blender_addon.arrays.renamed import TrainedJoints, known_as
 from blender_addon.errors import SetupError
-from ssilk_core.scene.assets import SkinWeights
+from ssilk_core.scene.assets import Body, Mesh, SkinWeights
 
 
 def test_names_become_unique_identifiers():
@@ -66,8 +66,30 @@ def test_two_bones_are_not_one_joint(joints):
 
 def test_the_joint_that_carries_the_bodies_is_the_hub(joints):
     """As readers of stages find it: a root above the hips may stand still."""
-    moved = SkinWeights.from_dense("/Body", np.array([[0.0, 1.0], [0.0, 1.0]]))
+
+    def body(weights: list[list[float]], height: float = 1.0) -> Body:
+        points = np.array([[0, 0, 0], [1, 0, 0], [0, height, 0]])
+        return Body(Mesh("/Body", points, np.array([[0, 1, 2]])), SkinWeights.from_dense("/Body", np.array(weights)))
+
+    moved, spread = body([[0, 1], [0, 1], [0, 1]]), body([[0.5, 0.5], [0, 1], [0, 1]])
     assert joints.skeleton("/").hub == 0
     assert joints.skeleton("/", [moved]).hub == 1
-    spread = SkinWeights.from_dense("/Body", np.array([[0.5, 0.5], [0.0, 1.0]]))
     assert joints.skeleton("/", [moved, spread]).hub == 0
+    shadow = body([[1, 0], [1, 0], [1, 0]])
+    assert joints.skeleton("/", [body([[0.01, 0.99], [0, 1], [0, 1]]), shadow]).hub == 1
+
+
+def test_blender_symmetrizes_proxies(bpy):
+    """The names that proxies of a symmetric garment have are those that Blender takes for two sides."""
+    from ssilk_core.authoring.setup.mirror import LEFT, RIGHT
+
+    rig = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
+    bpy.context.collection.objects.link(rig)
+    bpy.context.view_layer.objects.active = rig
+    bpy.ops.object.mode_set(mode="EDIT")
+    bone = rig.data.edit_bones.new(f"Cape_proxy_03{LEFT}")
+    bone.head, bone.tail = (0.3, 0, 1), (0.35, 0, 0.8)
+    bone.select = bone.select_head = bone.select_tail = True
+    bpy.ops.armature.symmetrize()
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert rig.data.bones[f"Cape_proxy_03{RIGHT}"].head_local[:] == pytest.approx((-0.3, 0, 1))

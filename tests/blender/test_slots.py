@@ -95,7 +95,8 @@ def test_a_strip_of_the_own_slot_counts_as_the_action_and_one_of_another_by_itse
     assert [source.kind for source in sources(hero)] == ["TIMELINE", "ACTION"]
     other = hero.animation_data.nla_tracks.new().strips.new("Villain's", 100, action)
     other.action_slot = villain.animation_data.action_slot
-    assert [(source.kind, source.name) for source in sources(hero)][2:] == [("STRIP", "Villain's")]
+    # Before Blender 5.0 a new strip is called after its action, whatever name is given.
+    assert [(source.kind, source.name) for source in sources(hero)][2:] == [("STRIP", other.name)]
 
 
 def test_an_action_whose_slot_nobody_tells_is_refused_with_their_names(bpy, cast):

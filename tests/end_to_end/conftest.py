@@ -89,6 +89,7 @@ def write_clip(path: Path, frames: int = 40, fps: float = 30.0, joints: Sequence
     stage.SetTimeCodesPerSecond(fps)
     animation = UsdSkel.Animation.Define(stage, "/Clip")
     animation.CreateJointsAttr(list(joints))
+    animation.CreateScalesAttr([Gf.Vec3h(1)] * len(joints))  # without which USD plays nothing
     rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
     steps = np.diff(HEIGHTS, prepend=0)
     for frame in range(frames):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shlex
 from dataclasses import replace
+from importlib.metadata import version
 
 import pytest
 from pxr import Usd
@@ -42,6 +43,7 @@ def test_figures_by_split_are_shown_and_written(world, capsys):
     assert shown.out.count("| garment") == 8 and shown.out.count("| ssilk ") == 24  # no simulator was named
     document = json.loads((world / "out" / "figures.json").read_text())
     assert document["models"] == {"model.safetensors": sha256("model.safetensors")} and document["units"] == "SI"
+    assert document["versions"]["libigl"] == version("libigl")  # which counts what intersects
     rows = {(row["method"], row["split"]): row["figures"] for row in document["figures"]}
     assert rows.keys() == {(m, s) for m in ("LBS", "ssilk") for s in ("valid", "inertia", "flips")}
     assert rows["ssilk", "valid"] == rows["ssilk", "inertia"] and rows["ssilk", "flips"]["frames"] == 10

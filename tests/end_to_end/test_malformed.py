@@ -751,6 +751,32 @@ def test_errors_are_events_for_machines(toy, monkeypatch, capsys):
         assert all(earlier["event"] == "started" for earlier in before)
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        "evaluate model.safetensors --stage rigged.usda --motions .",
+        "trade model.safetensors --stage rigged.usda --motions . --no-refine",
+        "report shot.usda -o new.html",
+        "report model.safetensors --stage rigged.usda --motion clip.usda -o new.html",
+    ],
+    ids=["evaluate", "trade", "shot", "model"],
+)
+@pytest.mark.parametrize(
+    ("found", "said"), [(None, "it is not installed"), ("2.5.1", "version 2.5.1 is installed")], ids=["none", "old"]
+)
+def test_libigl_is_asked_for_before_any_work(command, found, said, toy, monkeypatch, capsys):
+    """Without it the triangles that intersect others cannot be counted, at the end of minutes."""
+    monkeypatch.chdir(toy.folder)
+    monkeypatch.setattr("ssilk_core.physics.intersections.pairs.can_find", lambda: False)
+    monkeypatch.setattr("ssilk_core.physics.intersections.pairs.libigl_version", lambda: found)
+    for work in ("ssilk_core.network.checkpoint.load_model", "ssilk_usd.shots.read.read_parts"):
+        monkeypatch.setattr(work, lambda *_: pytest.fail("work began"))
+    assert main(shlex.split(command)) == 2
+    told = capsys.readouterr().err.strip()
+    assert told.startswith(f"error: libigl: {said}; 2.6.3 or newer is needed") and "\n" not in told
+    assert not Path("new.html").exists()
+
+
 def test_one_frame_can_be_baked(toy, tmp_path, monkeypatch):
     toy.copy(tmp_path)
     edited("clip.usda", one_frame)(tmp_path)

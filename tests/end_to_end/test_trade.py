@@ -8,6 +8,7 @@ import json
 import shlex
 import shutil
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,7 @@ def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     points = {point["variant"]: point for point in document["points"]}
     assert {"as trained", "2 blendshapes", "0 proxies", "int16", "15 frames/s", "crowd", "film"} <= points.keys()
     assert all(name in text for name in points) and document["asked"]["clips"] == ["long", "short"]
+    assert document["asked"]["versions"]["libigl"] == version("libigl")  # which counts what intersects
     assert document["asked"]["frames"] == {"long": 12, "short": 10} and "the first 12 of long, 10 of short" in text
     whole, half = points["as trained"], points["15 frames/s"]
     assert whole["position"] == 0 and half["shot_bytes"] < whole["shot_bytes"]

@@ -17,7 +17,7 @@ from ssilk_usd.reading.surface import read_surface
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Motion, Skeleton
-from ssilk_core.scene.kinematics import motion_transforms
+from ssilk_core.scene.kinematics import motion_transforms, skin_points, skinning_matrices
 
 JOINTS = ("Hips", "Hips/Spine", "Hips/Spine/Head")
 LAST = 12
@@ -161,7 +161,17 @@ def another_kind(stage: Usd.Stage) -> None:
     UsdSkel.BindingAPI(stage.GetPrimAtPath("/World/Hero")).GetAnimationSourceRel().SetTargets(["/World"])
 
 
-@pytest.mark.parametrize("off", [deactivated, blocked, gone, beneath_what_is_off, another_kind])
+def without_the_schema(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/World/Hero").RemoveAppliedSchema("SkelBindingAPI")
+
+
+def without_scales(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/World/Pose").RemoveProperty("scales")
+
+
+@pytest.mark.parametrize(
+    "off", [deactivated, blocked, gone, beneath_what_is_off, another_kind, without_the_schema, without_scales]
+)
 def test_an_animation_that_usd_does_not_play_is_refused_by_name(off):
     stage = Usd.Stage.CreateInMemory()
     define_hero(stage)
@@ -192,6 +202,94 @@ def test_joints_that_the_animation_does_not_pose_rest_as_in_usd(animated):
     rest.Set([Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(0, 0, 1), 30)) * matrix for matrix in rest.Get()])
     found = places(read_motion(stage, skeleton), skeleton)
     np.testing.assert_allclose(found, joints_of_usd(stage, [0.0]), atol=1e-5)
+
+
+def test_a_sample_without_a_value_is_named():
+    stage = Usd.Stage.CreateInMemory()
+    define_hero(stage)
+    skeleton = read_character(stage).skeleton
+    rotations = UsdSkel.Animation(stage.GetPrimAtPath("/World/Pose")).GetRotationsAttr()
+    for code in (1, 2, 3):
+        rotations.Set(Sdf.ValueBlock() if code == 2 else rotations.Get(), code)
+    with pytest.raises(SsilkError, match="/World/Pose: the animation has no rotations at time code 2; 3 are needed"):
+        read_motion(stage, skeleton)
+
+
+def body_of_usd(stage: Usd.Stage, path: str = "/World/Hero/Body") -> np.ndarray:
+    """Where UsdSkel bakes the points of the body in the world."""
+    baked = Usd.Stage.Open(stage.Flatten())
+    assert UsdSkel.BakeSkinning(UsdSkel.Root(baked.GetPrimAtPath("/World/Hero")), Gf.Interval(0, 1))
+    mesh = UsdGeom.Mesh(baked.GetPrimAtPath(path))
+    world = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()))
+    points = np.array(mesh.GetPointsAttr().Get(0), dtype=np.float64)
+    return points @ world[:3, :3] + world[3, :3]
+
+
+def body_of_ours(stage: Usd.Stage) -> np.ndarray:
+    character = read_character(stage)
+    world = motion_transforms(read_motion(stage, character.skeleton), character.skeleton.parents)
+    matrices = skinning_matrices(world, character.skeleton.bind_transforms)
+    (body,) = character.bodies
+    return skin_points(body.mesh.points, body.skin, matrices)[0]
+
+
+def placed_by_samples(stage: Usd.Stage) -> None:
+    """What places the points is a time sample, as some programs write all that they export."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/Hero/Body"))
+    mesh.GetPointsAttr().Set(Vt.Vec3fArray([100 * point for point in mesh.GetPointsAttr().Get()]))
+    UsdSkel.BindingAPI(mesh).CreateGeomBindTransformAttr().Set(Gf.Matrix4d().SetScale(0.01), 0)
+
+
+def seen_later(stage: Usd.Stage) -> None:
+    visibility = UsdGeom.Imageable(stage.GetPrimAtPath("/World/Hero")).CreateVisibilityAttr()
+    visibility.Set("invisible", 0)
+    visibility.Set("inherited", 1)
+
+
+def blocked_below_others(stage: Usd.Stage) -> None:
+    above = UsdSkel.BindingAPI(stage.GetPrimAtPath("/World/Hero"))
+    above.CreateJointIndicesPrimvar(True, 1).Set([1])
+    above.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    for name in ("Indices", "Weights"):
+        stage.GetPrimAtPath("/World/Hero/Body").GetAttribute(f"primvars:skel:joint{name}").Block()
+
+
+@pytest.mark.parametrize("change", [placed_by_samples, seen_later, blocked_below_others])
+def test_a_body_is_where_usd_skins_it(change):
+    stage = Usd.Stage.CreateInMemory()
+    define_hero(stage)
+    change(stage)
+    np.testing.assert_allclose(body_of_ours(stage), body_of_usd(stage), atol=1e-6)
+
+
+def unapplied_on_the_mesh(stage: Usd.Stage) -> str:
+    stage.GetPrimAtPath("/World/Hero/Body").RemoveAppliedSchema("SkelBindingAPI")
+    return "/World/Hero/Body says primvars:skel:jointIndices and does not apply SkelBindingAPI"
+
+
+def unapplied_above(stage: Usd.Stage) -> str:
+    without_the_schema(stage)
+    return "/World/Hero says skel:skeleton and does not apply SkelBindingAPI"
+
+
+def beneath_no_xform(stage: Usd.Stage) -> str:
+    stage.DefinePrim("/World/Hero/Group")
+    edit = Sdf.BatchNamespaceEdit()
+    edit.Add("/World/Hero/Body", "/World/Hero/Group/Body")
+    assert stage.GetRootLayer().Apply(edit)
+    return "/World/Hero/Group above it is no Xform"
+
+
+@pytest.mark.parametrize("change", [unapplied_on_the_mesh, unapplied_above, beneath_no_xform])
+def test_a_mesh_that_usd_does_not_skin_is_refused_by_name(change):
+    stage = Usd.Stage.CreateInMemory()
+    define_hero(stage)
+    body_of_ours(stage)
+    found, path = change(stage), "/World/Hero/Body"
+    path = path if stage.GetPrimAtPath(path) else "/World/Hero/Group/Body"
+    np.testing.assert_allclose(body_of_usd(stage, path)[:, 2], 0, atol=1e-6)  # USD leaves it as it was modelled
+    with pytest.raises(SsilkError, match=f"{path}: USD does not skin it: {found}"):
+        read_character(stage)
 
 
 def strong(stage: Usd.Stage, above: Usd.Prim, stiff: UsdShade.Material) -> None:

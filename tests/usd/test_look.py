@@ -210,6 +210,76 @@ def test_a_rig_of_a_garment_from_its_own_file_keeps_its_look(hero, tmp_path):
     assert look(after, "/Hero/Cloak") == look(stage, "/Wardrobe/Cloak")
 
 
+def test_what_a_mesh_has_from_above_and_what_is_said_in_words_is_kept(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    above = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Hero"))
+    above.CreatePrimvar("season", TINT.String, "constant").Set("winter")
+    codes = above.CreatePrimvar("codes", TINT.IntArray, "constant")
+    codes.Set([7, 8])
+    codes.SetIndices([1, 0])
+    cape = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Cape"))
+    cape.CreateHoleIndicesAttr([2])
+    words = UsdGeom.PrimvarsAPI(cape).CreatePrimvar("panel", TINT.StringArray, "uniform")
+    words.Set([f"panel {face}" for face in range(COLUMNS * ROWS)])
+    UsdGeom.MotionAPI.Apply(cape.GetPrim()).CreateMotionBlurScaleAttr(0.5)
+    Usd.ModelAPI(cape.GetPrim()).SetKind("subcomponent")
+    stage.Save()
+    summary = shoot(worn(hero), tmp_path / "shot.usda")
+    assert summary.left_out == ""
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    prim = next(each for each in shot.Traverse() if each.GetName() == "Cape")
+    found = UsdGeom.PrimvarsAPI(prim)
+    assert found.FindPrimvarWithInheritance("season").Get() == "winter"
+    assert list(found.FindPrimvarWithInheritance("codes").ComputeFlattened()) == [8, 7]
+    assert list(found.GetPrimvar("panel").Get()) == [f"panel {face}" for face in range(COLUMNS * ROWS) if face != 2]
+    assert prim.HasAPI(UsdGeom.MotionAPI) and Usd.ModelAPI(prim).GetKind() == "subcomponent"
+
+
+def beside_the_character(hero: Path, *, skin: bool) -> None:
+    """Put the cape under an Xform that says its look; `skin` is bound to the character, more strongly."""
+    stage = Usd.Stage.Open(str(hero))
+    top = UsdGeom.Xform.Define(stage, "/Wardrobe").GetPrim()
+    edit = Sdf.BatchNamespaceEdit()
+    edit.Add("/Hero/Cape", "/Wardrobe/Cape")
+    assert stage.GetRootLayer().Apply(edit)
+    cape = stage.GetPrimAtPath("/Wardrobe/Cape")
+    for name in ("skel:jointIndices", "skel:jointWeights"):
+        cape.RemoveProperty(f"primvars:{name}")
+    UsdShade.MaterialBindingAPI(cape).UnbindAllBindings()
+    binding = UsdShade.MaterialBindingAPI.Apply(top)
+    binding.Bind(material(stage, "/Looks/Wool", "map1"))
+    collection = Usd.CollectionAPI.Apply(top, "trims")
+    collection.CreateIncludesRel().SetTargets(["/Wardrobe/Cape/trim"])
+    binding.Bind(collection, material(stage, "/Looks/Lace", "map1"), "trims", UsdShade.Tokens.strongerThanDescendants)
+    UsdGeom.PrimvarsAPI(top).CreatePrimvar("season", TINT.String, "constant").Set("winter")
+    UsdGeom.Imageable(top).CreatePurposeAttr("render")
+    if skin:
+        bound = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/Hero"))
+        bound.Bind(material(stage, "/Looks/Skin", "map1"), UsdShade.Tokens.strongerThanDescendants)
+    lights = stage.DefinePrim("/Lights")
+    Usd.CollectionAPI.Apply(lights, "lit").CreateIncludesRel().SetTargets(["/Wardrobe/Cape"])
+    stage.Save()
+
+
+@pytest.mark.parametrize("skin", [False, True])
+def test_a_rig_keeps_the_look_of_a_garment_that_moves_beneath_its_character(hero, tmp_path, skin):
+    beside_the_character(hero, skin=skin)
+    left = write_rigged_stage(hero, worn(hero).scene, tmp_path / "rigged.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "rigged.usda"))
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    bound = [
+        UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0].GetPrim().GetName()
+        for prim in (cape, stage.GetPrimAtPath("/Hero/Cape/trim"))
+    ]
+    assert bound == (["Skin", "Skin"] if skin else ["Wool", "Lace"])
+    told = "Cape has Wool, and takes on Skin from above; trim has Lace, and takes on Skin from above"
+    assert left == (told if skin else "")
+    assert UsdGeom.PrimvarsAPI(cape).FindPrimvarWithInheritance("season").Get() == "winter"
+    assert UsdGeom.Imageable(cape).ComputePurpose() == "render"
+    lit = Usd.CollectionAPI(stage.GetPrimAtPath("/Lights"), "lit").ComputeMembershipQuery()
+    assert lit.IsPathIncluded(cape.GetPath())
+
+
 def test_what_is_lost_is_told_by_name(hero, tmp_path):
     stage = Usd.Stage.Open(str(hero))
     cape = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Cape"))

@@ -797,7 +797,7 @@ def game_skeleton(case: str) -> Usd.Stage:
         "stray weights": ["root"],
         "targets of inverse kinematics": ["root", "root/ik", "root/ik/hand"],
         "another root first": ["helper"],
-    }[case]
+    }.get(case, ["root", "root/hand"])
     under = {"two": "world/root/", "another root first": ""}.get(case, "root/")
     skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
     for attribute in (skeleton.GetBindTransformsAttr(), skeleton.GetRestTransformsAttr()):
@@ -814,6 +814,57 @@ def game_skeleton(case: str) -> Usd.Stage:
         binding.GetJointWeightsPrimvar().Set(weights.tolist())
     binding.GetJointIndicesPrimvar().Set(indices.tolist())
     return stage
+
+
+def add_prop(stage: Usd.Stage, joints: list[int], size: float) -> None:
+    """Add a triangle of some size, each corner of which follows one of the joints."""
+    prop = UsdGeom.Mesh.Define(stage, "/Hero/Prop")
+    prop.CreatePointsAttr([Gf.Vec3f(0, 1, 0), Gf.Vec3f(size, 1, 0), Gf.Vec3f(0, 1 + size, 0)])
+    prop.CreateFaceVertexCountsAttr([3])
+    prop.CreateFaceVertexIndicesAttr([0, 1, 2])
+    binding = UsdSkel.BindingAPI.Apply(prop.GetPrim())
+    binding.CreateJointIndicesPrimvar(False, 1).Set(joints)
+    binding.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 3)
+
+
+def beside(case: str) -> Usd.Stage:
+    """The character of `game_skeleton`, and what else is in its stage, or not."""
+    stage = game_skeleton("a prop" if case != "a root" else case)
+    root, body = UsdSkel.Root(stage.GetPrimAtPath("/Hero")), stage.GetPrimAtPath("/Hero/Body")
+    if case == "a prop that a joint beside the hips moves":
+        add_prop(stage, [1, 1, 1], 2.0)
+    elif case == "a small prop with two such joints":
+        add_prop(stage, [0, 1, 1], 0.2)
+    elif case == "a stand-in":
+        add_prop(stage, [0, 1, 1], 2.0)
+        UsdGeom.Imageable(stage.GetPrimAtPath("/Hero/Prop")).CreatePurposeAttr("proxy")
+    elif case == "a garment alone":
+        body.CreateAttribute("ssilk:garment", Sdf.ValueTypeNames.Bool).Set(True)
+    elif case == "parts that joints carry":
+        cache = UsdSkel.Cache()
+        cache.Populate(root, Usd.PrimDefaultPredicate)
+        query = cache.GetSkelQuery(UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")))
+        poses = [query.ComputeSkinningTransforms(code) for code in range(1, FRAMES + 1)]
+        for joint in (2, 3, 4, 5):
+            Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), f"/Hero/Part{joint}")
+            part = stage.GetPrimAtPath(f"/Hero/Part{joint}")
+            for name in ("Indices", "Weights"):
+                part.RemoveProperty(f"primvars:skel:joint{name}")
+            place = UsdGeom.Xformable(part).AddTransformOp()
+            for code, pose in enumerate(poses, start=1):
+                place.Set(pose[joint], code)
+        body.SetActive(False)
+    return stage
+
+
+BESIDE = ("a prop that a joint beside the hips moves", "a small prop with two such joints", "a stand-in",
+          "a garment alone", "parts that joints carry")  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BESIDE)
+def test_what_else_is_in_a_stage_does_not_move_the_hub(case):
+    skeleton = read_character(beside(case)).skeleton
+    assert skeleton.joint_names[skeleton.hub] == "root/Hips"
 
 
 @pytest.mark.parametrize(
@@ -856,6 +907,8 @@ TILTED = {
     "y up in a z-up stage": Recipe(up="Z", placements=[np.linalg.inv(UPRIGHT_Z)]),
     "centimetres, y up, in a z-up stage of metres": Recipe(up="Z", placements=[turned("x", 90, 0.01)]),
     "turned, moved and scaled": Recipe(placements=[turned("y", 30, at=(2, 0, 1)) @ turned("x", -90, 0.01)]),
+    "turned and moved": Recipe(placements=[turned("y", 70, at=(3, 0.5, -2))]),
+    "moved": Recipe(placements=[turned("y", 0, at=(3, 0, 2))]),
 }
 
 
@@ -864,6 +917,32 @@ def test_a_clip_alone_moves_its_character_as_usdskel_shows_it_bound(recipe):
     stage = author(Usd.Stage.CreateInMemory(), recipe)
     character = read_character(stage)
     motion = read_motion(alone(stage, meters=recipe.meters, up=recipe.up), character.skeleton)
+    expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
+    np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
+
+
+def lay_down(stage: Usd.Stage) -> None:
+    """Turn the character of a stage over, face down or on its back, in the space of its skeleton."""
+    over = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 0, 0), 180))
+    animation = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Walk"))
+    for code in animation.GetRotationsAttr().GetTimeSamples():
+        turns, places = animation.GetRotationsAttr().Get(code), animation.GetTranslationsAttr().Get(code)
+        turns[0] = Gf.Quatf(over.ExtractRotationQuat()) * turns[0]
+        places[0] = Gf.Vec3f(over.TransformDir(Gf.Vec3d(places[0])))
+        animation.GetRotationsAttr().Set(turns, code)
+        animation.GetTranslationsAttr().Set(places, code)
+
+
+@pytest.mark.parametrize(("scale", "says_axis"), [(1.0, False), (0.01, True), (0.01, False)])
+def test_a_clip_alone_may_lie(scale, says_axis):
+    """Upright by its own file's axis: the unit tells the space, and a file that says no axis converted nothing."""
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(placements=[turned("x", -90, scale)]))
+    character = read_character(stage)
+    lay_down(stage)
+    clip = alone(stage, meters=1, up="Y")
+    if not says_axis:
+        clip.GetRootLayer().pseudoRoot.ClearInfo("upAxis")
+    motion = read_motion(clip, character.skeleton)
     expected = usdskel_points(stage, "/Hero/Body", range(1, FRAMES + 1))
     np.testing.assert_allclose(our_points(character, motion), expected, atol=1e-5)
 

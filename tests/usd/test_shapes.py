@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.reading.shapes import animated_shapes
@@ -113,4 +113,30 @@ def test_what_a_motion_makes_of_shapes_is_told(tmp_path):
     ]
     (tmp_path / "without").mkdir()
     without = dressed(tmp_path / "without", [0.0], order=("Other",))
-    assert animated_shapes(path, without) == []
+    np.testing.assert_allclose(seen(without, "/Hero/Body", 1), (POINTS * 2 + [0, 0.001, 0]), atol=2e-6)
+    assert [str(found) for found in animated_shapes(path, without)] == [
+        "'Full' of Body, 0 where the character's stage has 1",
+        "'Full' of Cape, 0 where the character's stage has 1",
+    ]
+    alone = Usd.Stage.CreateNew(str(tmp_path / "clip.usda"))  # which leaves the shape as it is
+    Sdf.CopySpec(Sdf.Layer.FindOrOpen(without), "/Hero/Rig/Look", alone.GetRootLayer(), "/Look")
+    alone.Save()
+    assert animated_shapes(path, str(tmp_path / "clip.usda")) == []
+
+
+def test_a_shape_of_a_body_that_a_joint_carries_is_read(tmp_path):
+    """UsdSkel moves the points of a mesh without influences by the blendshapes that its skeleton has on."""
+    path = dressed(tmp_path, [0.0, 1.0])
+    stage = Usd.Stage.Open(path)
+    body, look = stage.GetPrimAtPath("/Hero/Body"), UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Look"))
+    for name in ("Indices", "Weights"):
+        body.RemoveProperty(f"primvars:skel:joint{name}")
+    place, hips = UsdGeom.Xformable(body).AddTranslateOp(), list(look.GetTranslationsAttr().Get())
+    for code in (1, 2, 3):
+        moved = Gf.Vec3f(10 * (code - 1), 0, 0)
+        place.Set(Gf.Vec3d(moved), code)
+        look.GetTranslationsAttr().Set([hips[0] + moved, hips[1]], code)
+        look.GetRotationsAttr().Set(look.GetRotationsAttr().Get(), code)
+    stage.Save()
+    (body,) = read_scene(path, garment="Cape")[0].bodies
+    np.testing.assert_allclose(body.mesh.points, seen(path, "/Hero/Body", 1), atol=2e-6)

@@ -13,6 +13,7 @@ from ...errors import fail
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh.geodesic import farthest_points, nearest_sources, submesh
 from ...scene.mesh.topology import components, edges, vertex_areas, vertex_mask
+from .mirror import mates_of, mirrored_points
 
 Mask = NDArray[np.bool_]
 
@@ -86,16 +87,20 @@ def find_pieces(mesh: Mesh, loose: Mask) -> list[Ints]:
     return [kept[label == number] for number in np.argsort(-areas, kind="stable")]
 
 
-def distribute_proxies(areas: Floats, sizes: Ints, count: int) -> Ints:
+def distribute_proxies(areas: Floats, sizes: Ints, count: int, images: Ints) -> Ints:
     """Distribute `count` proxies among pieces in proportion to `areas` (N,).
 
     Each piece gets one proxy first, in order, until none is left. A piece gets no more proxies than it has
-    vertices: `sizes`, shape (N,).
+    vertices: `sizes`, shape (N,). Of those left, pieces that are `images` of each other, (N,), get as many, so that
+    one may stay; others are images of themselves.
     """
-    shares = (np.arange(len(areas)) < count).astype(int)
-    while shares.sum() < min(count, sizes.sum()):
-        unfilled = np.where((shares > 0) & (shares < sizes), areas, -1.0)
-        shares[np.argmax(unfilled / np.maximum(shares, 1))] += 1
+    shares, alone = (np.arange(len(areas)) < count).astype(int), images == np.arange(len(areas))
+    while (left := min(count, int(sizes.sum())) - int(shares.sum())) > 0:
+        fitting = (shares > 0) & (shares < sizes) & (alone | (left > 1))
+        if not fitting.any():
+            break
+        chosen = int(np.argmax(np.where(fitting, areas, -1.0) / np.maximum(shares, 1)))
+        shares[np.unique([chosen, images[chosen]])] += 1
     return shares
 
 
@@ -108,6 +113,7 @@ def build_cluster(
     *,
     proxies: int,
     roots: int,
+    twin: Ints | None = None,
     placed: Callable[[], object] = lambda: None,
 ) -> Cluster:
     """Sample `proxies` vertices of a loose piece and connect them to the character's joints.
@@ -119,6 +125,8 @@ def build_cluster(
         vertices: vertices of the piece, ascending, shape (M,).
         body_weights: LBS weights of all garment vertices over the character's joints, shape (V, J).
         parents: parents of the character's joints, shape (J,).
+        twin: of each vertex of a symmetric piece, its image among these: proxies are symmetric too then, and may be
+            one fewer, shape (M,).
         placed: called after each proxy.
     """
     inside = np.zeros(mesh.vertex_count, dtype=bool)
@@ -127,11 +135,34 @@ def build_cluster(
     at_seam = _at_seam(mesh, inside)[vertices]
     points = mesh.points[vertices]
     off_middle = np.linalg.norm(points - points[at_seam].mean(axis=0), axis=1)
-    start = int(np.where(at_seam, off_middle, np.inf).argmin())
-    samples, spread = farthest_points(points, faces, start, proxies, sampled=placed)
-    order, above = hierarchy(spread, samples, seam.distance[vertices], at_seam, edges(faces), roots)
+    first = np.where(at_seam, off_middle, np.inf)
+    samples: Ints
+    mates: Ints
+    if twin is None or proxies == 1:
+        samples, spread = farthest_points(points, faces, int(first.argmin()), proxies, sampled=placed)
+        mates = np.arange(len(samples))
+    else:
+        samples, spread = mirrored_points(points, faces, twin, first, proxies, placed)
+        mates = mates_of(samples, twin)
+    order, above = hierarchy(spread, samples, seam.distance[vertices], at_seam, edges(faces), roots, mates)
     joint = carrying_joint(body_weights[seam.nearest[vertices[at_seam]]].sum(axis=0), parents)
     return Cluster(vertices, at_seam, vertices[samples[order]], spread[order], above, joint)
+
+
+def mirrored_cluster(
+    cluster: Cluster, vertices: Ints, twin: Ints, seam: Seam, body_weights: Floats, parents: Ints
+) -> Cluster:
+    """Return the image of a cluster in the piece of the garment that is the image of its own.
+
+    Args:
+        vertices: of that piece, ascending, shape (M,).
+        twin: image of each vertex of the garment, shape (V,).
+        seam, body_weights, parents: as for `build_cluster`.
+    """
+    own = np.searchsorted(cluster.vertices, twin[vertices])
+    at_seam = cluster.at_seam[own]
+    joint = carrying_joint(body_weights[seam.nearest[vertices[at_seam]]].sum(axis=0), parents)
+    return Cluster(vertices, at_seam, twin[cluster.samples], cluster.distances[:, own], cluster.parents, joint)
 
 
 def _at_seam(mesh: Mesh, inside: Mask) -> Mask:
@@ -156,13 +187,13 @@ def carrying_joint(weights: Floats, parents: Ints) -> int:
 
 
 def hierarchy(
-    spread: Floats, samples: Ints, to_seam: Floats, at_seam: Mask, pairs: Ints, roots: int
+    spread: Floats, samples: Ints, to_seam: Floats, at_seam: Mask, pairs: Ints, roots: int, mates: Ints
 ) -> tuple[Ints, Ints]:
     """Order proxies breadth first along the adjacency of their regions.
 
     The region of a proxy is its geodesic Voronoi cell in the piece. The roots are the `roots` proxies nearest to
     the seam among those whose regions reach it. The others follow level by level. The parent of each is its
-    nearest neighbour on the level above.
+    nearest neighbour on the level above. Of two proxies that are images of each other, the parents are too.
 
     Args:
         spread: distance of every piece vertex to each sample [m], shape (S, M).
@@ -170,6 +201,7 @@ def hierarchy(
         to_seam: distance of every piece vertex to the seam [m], shape (M,).
         at_seam: whether each piece vertex lies at the seam, shape (M,).
         pairs: edges of the piece, shape (E, 2).
+        mates: sample that is the image of each, itself without one, shape (S,).
 
     Returns:
         The samples in order, shape (S,), and the position of each one's parent in that order, -1 for roots, (S,).
@@ -177,15 +209,30 @@ def hierarchy(
     count, region = len(samples), spread.argmin(axis=0)
     touching = np.zeros((count, count), dtype=bool)
     touching[tuple(region[pairs].T)] = touching[tuple(region[pairs[:, ::-1]].T)] = True
+    touching |= touching[np.ix_(mates, mates)]
     between = np.where(touching, spread[:, samples], np.inf)
-    hinged = np.unique(region[at_seam])
-    order = hinged[np.argsort(to_seam[samples[hinged]], kind="stable")][:roots].tolist()
+    hinged = np.unique(np.append(region[at_seam], mates[region[at_seam]]))
+    order = _whole_pairs(hinged[np.argsort(to_seam[samples[hinged]], kind="stable")], roots, mates)
     above = [-1] * len(order)
     while len(order) < count:
         rest = np.setdiff1d(np.arange(count), order)
-        reach = between[np.ix_(order, rest)]
+        reach = between[np.ix_(np.array(order), rest)]
         level = np.flatnonzero(np.isfinite(reach.min(axis=0)))
         level = level[np.argsort(reach.min(axis=0)[level], kind="stable")]
-        above += reach.argmin(axis=0)[level].tolist()
-        order += rest[level].tolist()
+        parents = dict(zip(rest[level].tolist(), reach.argmin(axis=0)[level].tolist()))
+        for proxy, mate in zip(rest[level].tolist(), mates[rest[level]].tolist()):
+            if mate < proxy:
+                parents[proxy] = order.index(mates[order[parents[mate]]])
+        above += parents.values()
+        order += parents.keys()
     return np.array(order), np.array(above)
+
+
+def _whole_pairs(ordered: Ints, count: int, mates: Ints) -> list[int]:
+    """Return the first `count` of proxies in an order, without one whose image has no place; one at least."""
+    chosen: list[int] = []
+    for proxy in ordered.tolist():
+        pair = list(dict.fromkeys((proxy, int(mates[proxy]))))
+        if proxy not in chosen and (len(chosen) + len(pair) <= count or not chosen):
+            chosen += pair
+    return chosen

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +14,18 @@ from ...errors import fail
 from ...scene.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
 from ...scene.kinematics import rigid
 from ...scene.mesh.topology import vertex_areas, vertex_normals
-from .clusters import Cluster, Mask, Seam, build_cluster, distribute_proxies, find_pieces, find_seam
+from .clusters import (
+    Cluster,
+    Mask,
+    Seam,
+    build_cluster,
+    distribute_proxies,
+    find_pieces,
+    find_seam,
+    mirrored_cluster,
+)
 from .hosts import Hosts
+from .mirror import Mirror, find_mirror, mates_of
 from .proxy_weights import proxy_weights
 
 
@@ -62,6 +73,9 @@ def build_rig(
     loose vertices near the seam keep a share of the weights of the nearest vertex on it. Without this the cloth
     tears there as soon as a root rotates, because tight vertices follow only the body.
 
+    Proxies of a garment that is symmetric to rounding are symmetric, and end on "_L" and "_R" (`mirror`); there may
+    be one fewer of a piece then.
+
     Stitches connect the islands that lie on one another. What is carried wholly follows its host and gets no proxies.
 
     Args:
@@ -85,7 +99,12 @@ def build_rig(
         return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
     body_weights = garment.skin.dense(character.skeleton.joint_count)
     seam = find_seam(joined, loose)
-    clusters = _clusters(character, joined, loose, body_weights, seam, options, report)
+    pieces, piece_of = find_pieces(joined, loose), np.full(joined.vertex_count, -1)
+    for number, piece in enumerate(pieces):
+        piece_of[piece] = number
+    mirror = find_mirror(garment.mesh, piece_of, hosts.carry(np.arange(joined.vertex_count)))
+    images = np.arange(len(pieces)) if mirror is None else piece_of[mirror.twin[[piece[0] for piece in pieces]]]
+    clusters = _clusters(character, joined, pieces, images, body_weights, seam, options, mirror, report)
     weights = proxy_weights(
         joined,
         loose,
@@ -98,31 +117,49 @@ def build_rig(
     influences = int((weights > 0).sum(axis=1).max()) + (options.influences if len(hosts.stitches) else 0)
     held = np.concatenate([body_weights, np.zeros((len(weights), weights.shape[1] - body_weights.shape[1]))], axis=1)
     weights = np.where(authored[:, None], hosts.blend(weights, authored), np.where(loose[:, None], held, weights))
-    return _assemble(character, garment.mesh, clusters, weights, influences, seam)
+    return _assemble(character, garment.mesh, clusters, weights, influences, seam, mirror)
 
 
 def _clusters(
     character: Character,
     mesh: Mesh,
-    loose: Mask,
+    pieces: Sequence[Ints],
+    images: Ints,
     body_weights: Floats,
     seam: Seam,
     options: RigOptions,
+    mirror: Mirror | None,
     report: events.Reporter,
 ) -> list[Cluster]:
-    """Return the clusters that get proxies, in descending order of area."""
-    pieces, areas = find_pieces(mesh, loose), vertex_areas(mesh.points, mesh.faces)
+    """Return the clusters that get proxies, in the order of the pieces, whose `images` are clusters' images, too."""
+    areas = vertex_areas(mesh.points, mesh.faces)
     count = _affordable(len(pieces), options, mesh.path, report)
     shares = distribute_proxies(
-        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count
+        np.array([areas[piece].sum() for piece in pieces]), np.array([len(piece) for piece in pieces]), count, images
     )
     parents, roots = character.skeleton.parents, options.roots_per_cluster
     placed = events.Countdown(int(shares.sum()), report)
-    return [
-        build_cluster(mesh, piece, seam, body_weights, parents, proxies=int(share), roots=roots, placed=placed)
-        for piece, share in zip(pieces, shares)
-        if share
-    ]
+    clusters: dict[int, Cluster] = {}
+    for number in np.flatnonzero(shares).tolist():
+        piece, image = pieces[number], int(images[number])
+        if mirror and image in clusters:
+            clusters[number] = mirrored_cluster(clusters[image], piece, mirror.twin, seam, body_weights, parents)
+            for _ in clusters[number].samples:
+                placed()
+            continue
+        twin = np.searchsorted(piece, mirror.twin[piece]) if mirror and image == number else None
+        clusters[number] = build_cluster(
+            mesh,
+            piece,
+            seam,
+            body_weights,
+            parents,
+            proxies=int(shares[number]),
+            roots=roots,
+            twin=twin,
+            placed=placed,
+        )
+    return list(clusters.values())
 
 
 def _affordable(piece_count: int, options: RigOptions, path: str, report: events.Reporter) -> int:
@@ -140,7 +177,13 @@ def _affordable(piece_count: int, options: RigOptions, path: str, report: events
 
 
 def _assemble(
-    character: Character, mesh: Mesh, clusters: list[Cluster], weights: Floats, influences: int, seam: Seam
+    character: Character,
+    mesh: Mesh,
+    clusters: list[Cluster],
+    weights: Floats,
+    influences: int,
+    seam: Seam,
+    mirror: Mirror | None,
 ) -> ProxyRig:
     """Return the rig of all clusters; proxies are ordered by cluster, breadth first within each."""
     skeleton = character.skeleton
@@ -149,23 +192,32 @@ def _assemble(
         first = skeleton.joint_count + len(parents)
         parents += [cluster.joint if above < 0 else first + above for above in cluster.parents]
     samples = np.concatenate([cluster.samples for cluster in clusters])
+    binds = _bind_transforms(mesh, samples, np.array(parents) - skeleton.joint_count, seam)
+    digits = max(2, len(str(len(parents) - 1)))
+    labels = [f"{number:0{digits}d}" for number in range(len(parents))]
+    if mirror:
+        sides = mirror.sides(binds[:, :3, 3], skeleton.joint_names, skeleton.bind_transforms[:, :3, 3])
+        for proxy, mate in enumerate(mates_of(samples, mirror.twin).tolist()):
+            if mate > proxy:
+                binds[mate] = mirror.image(binds[proxy])
+                labels[mate] = labels[proxy] + sides[mate]
+                labels[proxy] += sides[proxy]
     return ProxyRig(
         mesh.path,
-        _names(mesh.path, skeleton.joint_names, parents),
+        _names(mesh.path, skeleton.joint_names, parents, labels),
         np.array(parents),
-        _bind_transforms(mesh, samples, np.array(parents) - skeleton.joint_count, seam),
+        binds,
         SkinWeights.from_dense(mesh.path, weights, influences),
     )
 
 
-def _names(path: str, joint_names: tuple[str, ...], parents: list[int]) -> tuple[str, ...]:
-    """Return a USD joint path for each proxy: the path of its parent, then "<garment>_proxy_<number>"."""
+def _names(path: str, joint_names: tuple[str, ...], parents: list[int], labels: list[str]) -> tuple[str, ...]:
+    """Return a USD joint path for each proxy: the path of its parent, then "<garment>_proxy_<label>"."""
     garment = re.sub(r"\W", "_", path.rstrip("/").rsplit("/", 1)[-1], flags=re.ASCII)
     stem = garment if re.match("[A-Za-z_]", garment) else f"_{garment}"
-    digits = max(2, len(str(len(parents) - 1)))
     names = list(joint_names)
-    for number, parent in enumerate(parents):
-        names.append(f"{names[parent]}/{stem}_proxy_{number:0{digits}d}")
+    for label, parent in zip(labels, parents):
+        names.append(f"{names[parent]}/{stem}_proxy_{label}")
     return tuple(names[len(joint_names) :])
 
 

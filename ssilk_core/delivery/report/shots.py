@@ -25,6 +25,7 @@ PICTURES, SKIN_PICTURES = 4, 2  # worst frames to show: of the energy, and of th
 APART = 0.5  # the least time between them [s]
 WIDTH, HEIGHT = 300, 400  # of a picture [pixels]
 LETTERS = "ABCDEFGH"
+LOST = "All covered skin counts as shown in them, and all triangles (100 %) as intersecting others."
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +113,7 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
     lost = [time for time, finite in zip(player.frame_times, meter.finite) if not finite]
     if lost:
         said = f"The garment is not finite in {len(lost)} of {len(times)} frames, first in frame {lost[0]:g}."
-        charts += f'<p class="note">{said} Energies leave these frames out; all covered skin counts as shown.</p>'
+        charts += f'<p class="note">{said} Energies leave these frames out. {LOST}</p>'
     crossed = meter.intersections(name)
     figures = {**({"shown_skin": asdict(found)} if found else {}), "intersections": asdict(crossed)}
     return [

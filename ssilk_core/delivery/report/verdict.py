@@ -63,7 +63,8 @@ def verdict(
     if intersections.worst:
         most = f"{intersections.worst:.1%} in frame {intersections.frame:g}".replace("%", " %")
         share = f"{100 * intersections.mean:.2f} % of its triangles intersect others of it on average, and {most}"
-        words.append(f"{share}. One frame in {EVERY} is counted.")
+        known = ", and one that is not finite as 100 %" if len(lost) else ""
+        words.append(f"{share}. One frame in {EVERY} is counted{known}.")
     if len(lost) < len(frame_times):
         worst = int(np.nanargmax(values[STRETCH]))
         if values[STRETCH][worst] > STRETCHED:

@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 EVERY = 4  # of so many frames one is counted, as libigl takes some 30 ms for one; cloth hardly crosses itself in less
-
+LIBIGL = "2.6.3"  # the first version with the predicates that find what intersects
 
 SHARE = "triangles that intersect others"
-NOT_COUNTED = "not counted, as libigl 2.6.3 or newer was missing"  # in place of figures
+NOT_COUNTED = f"not counted, as libigl {LIBIGL} or newer was missing"  # in place of figures
 
 
 @dataclass(frozen=True, kw_only=True)

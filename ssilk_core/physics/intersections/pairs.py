@@ -7,17 +7,44 @@ edge of one that is opposite to it meets the other, and with a common edge where
 
 from __future__ import annotations
 
+from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import fail
 from ...scene.assets import Floats, Ints
+from .figures import LIBIGL
 
 
 def can_find() -> bool:
-    """Return whether libigl is installed, of a version that has these predicates (2.6.3)."""
+    """Return whether libigl is installed, of a version that has these predicates."""
     return find_spec("igl") is not None and find_spec("igl.predicates") is not None
+
+
+def libigl_version() -> str | None:
+    """Return the version of libigl that is installed; None without one."""
+    try:
+        return version("libigl")
+    except PackageNotFoundError:
+        return None
+
+
+def need_predicates() -> None:
+    """Check that pairs can be found, before work that ends in counting them.
+
+    Raises:
+        SsilkError: libigl is missing, or too old.
+    """
+    if not can_find():
+        found = libigl_version()
+        fail(
+            "libigl",
+            f"version {found} is installed" if found else "it is not installed",
+            f"{LIBIGL} or newer is needed, which counts the triangles that intersect others",
+            f"pip install 'libigl>={LIBIGL}'",
+        )
 
 
 def self_intersections(points: Floats, faces: Ints) -> NDArray[np.int64]:

@@ -14,12 +14,12 @@ from .mesh import Mesh
 from .motion import Motion
 from .rig import ProxyRig
 from .scene import Scene
-from .skeleton import Skeleton, carrying_joint, check_rigid
+from .skeleton import Skeleton, carrying_joint, check_rigid, moved_by_joints
 from .skin import SkinWeights
 from .surface import PLATE_THICKNESS, SurfaceMaterial
 
 __all__ = [
     "CLASS_NAMES", "LOOSE", "PINNED", "PLATE_THICKNESS", "TIGHT", "UP", "Body", "Character", "Deformer", "Floats",
     "Garment", "GarmentPose", "Ints", "Mesh", "Motion", "ProxyRig", "Scene", "Skeleton", "SkinWeights",
-    "SurfaceMaterial", "carrying_joint", "check_rigid", "classes_at",
+    "SurfaceMaterial", "carrying_joint", "check_rigid", "classes_at", "moved_by_joints",
 ]  # fmt: skip

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
-_STRAY = 0.01  # of a body that may be bound to joints above the one that carries it
+_STRAY = 0.05  # of all bodies that may be bound to joints above or beside the one that carries them
+_WHOLE = 0.999  # of a body, and no more, that one joint may move where several do
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,22 +85,36 @@ class Skeleton:
         return tuple(path)
 
 
-def carrying_joint(moved: Floats, parents: Ints) -> int:
-    """Return the joint that carries the body, a hub: the lowest that all of it hangs from, but for `_STRAY` of it.
+def carrying_joint(moved: Sequence[Floats], parents: Ints) -> int:
+    """Return the joint that carries the body, a hub: the lowest that all bodies hang from, but for `_STRAY` of them.
 
-    Game skeletons have joints above the hips, which may stand still while the character runs.
+    Game skeletons have joints above the hips, which may stand still while the character runs, and joints beside the
+    hips for what hands hold. Bodies that one joint moves as a whole, such as props and shadows, do not count beside
+    others.
 
     Args:
-        moved: how much of the bodies each joint moves itself: of each body its mean weight, summed, shape (J,).
+        moved: `moved_by_joints` of each body.
         parents: as a skeleton has them, shape (J,).
     """
-    below = np.array(moved, dtype=np.float64)
+    bending = [each for each in moved if each.max() < _WHOLE * each.sum()]
+    below = np.sum([np.zeros(len(parents)), *(bending or moved)], axis=0)
+    whole = (1 - _STRAY) * below.sum()
     for joint in range(len(parents) - 1, -1, -1):
         if parents[joint] >= 0:
             below[parents[joint]] += below[joint]
-    whole = (1 - _STRAY) * np.sum(moved)
     held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
     return int(held[-1]) if len(held) else 0
+
+
+def moved_by_joints(points: Floats, weights: Floats) -> Floats:
+    """Return how much of a body each joint moves, shape (J,): its mean weight, times the square of the body's size.
+
+    Args:
+        points: of the body, shape (V, 3).
+        weights: of the joints at the points, shape (V, J).
+    """
+    size = np.ptp(points, axis=0)
+    return weights.mean(axis=0) * float(size @ size)
 
 
 def check_rigid(transforms: Floats, where: str, what: str, names: tuple[str, ...]) -> None:

@@ -241,6 +241,48 @@ def test_a_loose_vertex_of_no_face_is_refused_as_such(character):
         build_rig(character, Garment(mesh, skin, np.append(garment.classes, LOOSE)))
 
 
+def mirrored(points: np.ndarray) -> np.ndarray:
+    return points * [-1, 1, 1] + [1, 0, 0]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"columns": 21}, {"columns": 20}, {"columns": 24, "slits": 4}, {"columns": 21, "slits": 3}],
+    ids=["a column in the middle", "none there", "pairs of strips", "a strip in the middle"],
+)
+@pytest.mark.parametrize("proxies", [2, 7, 20])
+def test_proxies_of_a_symmetric_garment_are_symmetric(character, options, proxies):
+    garment = hanging(**options)  # whose diagonals are no images
+    rig = build_rig(character, garment, RigOptions(proxies=proxies))
+    Scene(character, garment, rig)
+    leaves, places = [name.rpartition("/")[2] for name in rig.joint_names], rig.bind_transforms[:, :3, 3]
+    flipped = [{"L": f"{leaf[:-1]}R", "R": f"{leaf[:-1]}L"}.get(leaf[-1], leaf) for leaf in leaves]
+    mates = np.array([leaves.index(leaf) for leaf in flipped])
+    assert rig.proxy_count >= proxies - 1 and (mates[mates] == np.arange(len(mates))).all()
+    np.testing.assert_allclose(places[mates], mirrored(places), atol=1e-9)
+    for leaf, place in zip(leaves, places):
+        assert leaf.endswith({-1: "_L", 0: tuple("0123456789"), 1: "_R"}[int(np.sign(np.round(place[0] - 0.5, 6)))])
+    turns = rig.bind_transforms[:, :3, :3]
+    image = turns[mates] * np.array([-1, 1, 1])[:, None] * [-1, 1, 1]  # x = y x z of the images of y and z
+    paired = mates != np.arange(len(mates))
+    np.testing.assert_allclose(turns[paired], image[paired], atol=1e-9)
+    parents = np.where(rig.parents < 3, np.array([0, 2, 1])[np.minimum(rig.parents, 2)], 0)
+    chained = rig.parents >= 3
+    parents[chained] = 3 + mates[rig.parents[chained] - 3]
+    np.testing.assert_array_equal(rig.parents[mates][paired], parents[paired])
+    twin = np.array([np.abs(garment.mesh.points - point).sum(1).argmin() for point in mirrored(garment.mesh.points)])
+    weights = rig.skin.dense(3 + len(mates))[:, 3:]
+    np.testing.assert_allclose(weights[twin][:, mates], weights, atol=1e-5)
+
+
+def test_a_garment_that_is_only_nearly_symmetric_has_no_sides(character):
+    garment = hanging()
+    points = garment.mesh.points.copy()
+    points[100, 2] += 1e-4
+    rig = build_rig(character, replace(garment, mesh=replace(garment.mesh, points=points)))
+    assert not any(name.endswith(("_L", "_R")) for name in rig.joint_names)
+
+
 @pytest.mark.parametrize(
     ("weights", "expected"),
     [
@@ -255,9 +297,16 @@ def test_carrying_joint_is_the_deepest_with_most_of_the_weight(weights, expected
 
 
 def test_shares_follow_area_but_leave_none_out():
-    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([99, 99, 99]), 10).tolist() == [6, 3, 1]
-    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([2, 2, 2]), 10).tolist() == [2, 2, 2]
-    assert distribute_proxies(np.array([6.0, 3.0, 0.1]), np.array([9, 9, 9]), 2).tolist() == [1, 1, 0]
+    areas, alone = np.array([6.0, 3.0, 0.1]), np.arange(3)
+    assert distribute_proxies(areas, np.array([99, 99, 99]), 10, alone).tolist() == [6, 3, 1]
+    assert distribute_proxies(areas, np.array([2, 2, 2]), 10, alone).tolist() == [2, 2, 2]
+    assert distribute_proxies(areas, np.array([9, 9, 9]), 2, alone).tolist() == [1, 1, 0]
+
+
+def test_pieces_that_are_images_have_equal_shares():
+    sizes = np.array([99] * 4)
+    assert distribute_proxies(np.array([3.0, 3, 1, 1]), sizes, 9, np.array([1, 0, 3, 2])).tolist() == [3, 3, 1, 1]
+    assert distribute_proxies(np.array([3.0, 3, 2, 1]), sizes, 9, np.array([1, 0, 2, 3])).tolist() == [3, 3, 2, 1]
 
 
 def test_falloff_is_continuous_where_the_choice_of_proxies_changes():

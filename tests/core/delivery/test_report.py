@@ -105,6 +105,7 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
     assert "it is lost and skin shows through" in opening.body and playing.plays
     assert "not finite in 2 of 6 frames, first in frame 1002, at 0.03 s" in opening.body
     assert "not finite in 2 of 6 frames, first in frame 1002." in energies.body and "nan" not in energies.body
+    assert "all triangles (100 %) as intersecting others" in energies.body
     figures = energies.figures["Cover"]
     assert figures["non-finite frames"] == 2 and figures["shown_skin"]["frame"] == 1002
     assert "A: frame 1005, at 0.13 s, " in worst.body and "frame 1002" not in worst.body
@@ -122,7 +123,11 @@ def test_a_verdict_tells_what_is_wrong_where_and_when():
     assert "0.267 % of the covered skin shows on average, and 0.80 % in frame 13, at 0.07 s, most at LeftArm" in body
     assert "; 12.0 % is bare, 20.0 % at most." in body
     assert "stretch by at most 4 % as a rule, and by 21 % in frame 12, at 0.03 s" in body and "At most" not in body
-    assert "3.10 % of its triangles intersect others of it on average, and 25.0 % in frame 11." in body
+    share = "3.10 % of its triangles intersect others of it on average, and 25.0 % in frame 11."
+    assert f"{share} One frame in 4 is counted." in body
+    lost = {**values, STRETCH: np.array([np.nan, 21.0, 4.0])}
+    told = verdict("Cape", lost, skin, crossed, [11, 12, 13], 30.0).body
+    assert f"{share} One frame in 4 is counted, and one that is not finite as 100 %." in told
     flat = replace(crossed, mean=0.0, worst=0.0)
     calm = verdict("Cape", {name: np.zeros(3) for name in values}, None, flat, [11, 12, 13], 30.0).body
     assert "Cape holds" in calm and "skin" not in calm

@@ -7,6 +7,7 @@ import signal
 import threading
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -357,7 +358,8 @@ def test_provenance_tells_how_the_model_came_to_be(uninterrupted):
     assert provenance["inputs"] == {"stage.usd": "abc"} and provenance["lowered"] == []
     assert provenance["motions"] == {"/a": [[0, 60, 30]], "/b": [[0, 45, 30]]}
     assert provenance["held out"] == {"/held": [[0, 40, 30]]}
-    assert provenance["torch"] == torch.__version__ and provenance["device"].startswith("cpu")
+    assert provenance["torch"] == torch.__version__ and provenance["libigl"] == version("libigl")
+    assert provenance["device"].startswith("cpu")
     assert set(provenance["validation"]) >= {"stretch", "gravity", "total", "collisions"}
     json.dumps(provenance, allow_nan=False)
 

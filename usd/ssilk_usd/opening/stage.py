@@ -173,10 +173,14 @@ def listed(prims: list[Usd.Prim]) -> str:
 
 
 def inherited(prim: Usd.Prim, name: str) -> Usd.Property | None:
-    """Return the nearest authored property `name` of a prim or its ancestors, as UsdSkel bindings inherit."""
+    """Return the nearest authored property `name` of a prim or its ancestors, as UsdSkel bindings inherit.
+
+    A value that is blocked is none, and hides none above it.
+    """
     while prim and not prim.IsPseudoRoot():
-        if prim.HasProperty(name) and prim.GetProperty(name).IsAuthored():
-            return prim.GetProperty(name)
+        found = prim.GetProperty(name) if prim.HasProperty(name) else None
+        if found and (found.HasAuthoredValue() if isinstance(found, Usd.Attribute) else found.IsAuthored()):
+            return found
         prim = prim.GetParent()
     return None
 

@@ -29,6 +29,14 @@ def xform_attributes(prim: Usd.Prim) -> Iterator[Usd.Attribute]:
         prim = prim.GetParent()
 
 
+def visibility_attributes(prim: Usd.Prim) -> Iterator[Usd.Attribute]:
+    """Yield the attributes that say whether a prim is visible, its own first."""
+    while prim and not prim.IsPseudoRoot():
+        if UsdGeom.Imageable(prim):
+            yield UsdGeom.Imageable(prim).GetVisibilityAttr()
+        prim = prim.GetParent()
+
+
 def earliest(prim: Usd.Prim) -> Usd.TimeCode:
     """Return the earliest time at which a prim has a place: a spline may slope down to none in the infinite past."""
     splines = [attribute for attribute in xform_attributes(prim) if _has_spline(attribute)]

@@ -11,8 +11,10 @@ from pxr import Usd, UsdSkel
 from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import column_matrix, inherited, value
+from .bindings import unapplied
 
 SOURCE = "skel:animationSource"
+NEEDED = ("translations", "rotations", "scales")  # without one of these UsdSkel poses no joint
 _RIGID_TOLERANCE = 1e-3
 
 
@@ -47,6 +49,11 @@ def animation_source(skeleton: Usd.Prim) -> AnimationSource:
         return AnimationSource(off=f"{targets[0]} is deactivated")
     if not prim.IsA(UsdSkel.Animation):
         return AnimationSource(off=f"{targets[0]} is no SkelAnimation")
+    if missing := unapplied(source.GetPrim(), SOURCE):
+        return AnimationSource(off=missing)
+    lacks = [name for name in NEEDED if not prim.GetAttribute(name).HasAuthoredValue()]
+    if lacks and value(prim, "joints"):  # without joints it weighs blendshapes alone
+        return AnimationSource(off=f"{targets[0]} has no {lacks[0]}")
     return AnimationSource(prim)
 
 

@@ -13,6 +13,7 @@ from ssilk_core.scene.assets import Body, Character, Floats, SkinWeights
 
 from ..names import GEOM_BIND, SKEL
 from ..opening.stage import (
+    EARLIEST,
     PRIMS,
     StageLike,
     column_matrix,
@@ -23,6 +24,7 @@ from ..opening.stage import (
     needs_whole_files,
     open_stage,
 )
+from .bindings import need_skinned
 from .carried import carried_by
 from .mesh import is_drawn, is_garment, read_mesh, rendered
 from .shapes import shape_offsets
@@ -79,7 +81,7 @@ def read_character(
 def geom_to_core(prim: Usd.Prim, skel: SkelSource) -> Floats:
     """Return the transform from a bound mesh's local space to the core's bind space [m], column vectors, (4, 4)."""
     bind = inherited(prim, GEOM_BIND)
-    matrix = None if bind is None else bind.Get()
+    matrix = None if bind is None else bind.Get(EARLIEST)
     return skel.bind_to_core if matrix is None else skel.bind_to_core @ column_matrix(matrix)
 
 
@@ -109,17 +111,17 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
 
 def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report: Reporter) -> Body:
     method = inherited(prim, SKINNING_METHOD)
-    if method is not None and method.Get() != UsdSkel.Tokens.classicLinear:
-        report(
-            Message(f"{location(prim)}: its {method.Get()} skinning is evaluated as linear blend skinning", "warning")
-        )
+    chosen = None if method is None else method.Get(EARLIEST)
+    if chosen not in (None, UsdSkel.Tokens.classicLinear):
+        report(Message(f"{location(prim)}: its {chosen} skinning is evaluated as linear blend skinning", "warning"))
     purpose = str(UsdGeom.Imageable(prim).ComputePurpose())
     carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
     if carried:
-        mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind)
+        mesh = read_mesh(prim, skel.bind_to_core @ carried.to_bind, shape_offsets(prim, skel))
         joint = order.index(skel.joints[carried.joint])
         return Body(mesh, SkinWeights.rigid(mesh.path, joint, mesh.vertex_count), purpose)
     mesh = read_mesh(prim, geom_to_core(prim, skel), shape_offsets(prim, skel))
     skin = read_skin(prim, skel.joints, order, report)
     assert skin is not None  # is_skinned
+    need_skinned(prim)
     return Body(mesh, skin, purpose)

@@ -4,7 +4,7 @@
 Exporters write axis and scale of a character into an Xform above its skeleton. Joints then are in skeleton space,
 lying and in centimetres perhaps, and so are clips of them, whatever their own files say of axis and units. UsdSkel
 shows them by the character's Xforms. Other exporters convert clips to what their files say. The bones tell the unit,
-and the character stands upright in one of both.
+which tells the axis too. Where both have one unit, the character stands upright by one of both axes.
 """
 
 from __future__ import annotations
@@ -28,26 +28,33 @@ def spread(codes: Floats, count: int) -> Floats:
     return codes[np.unique(np.linspace(0, len(codes) - 1, min(len(codes), count)).round().astype(int))]
 
 
-def clip_placement(local: Floats, match: Ints, units: StageUnits, skeleton: Skeleton) -> Floats | None:
+def clip_placement(
+    local: Floats, match: Ints, units: StageUnits, skeleton: Skeleton, *, says_axis: bool
+) -> Floats | None:
     """Return what brings a clip's root joints into the world [m], shape (4, 4); None where its file's units do.
 
     Args:
         local: joint to parent in some frames of the clip, as authored, in the skeleton's order, (F, J, 4, 4).
         match: index of each joint in the clip, or -1 where `local` means nothing, shape (J,).
         units: those of the clip's file.
-        skeleton: of a character whose Xforms tilt or scale it.
+        skeleton: of a character whose Xforms place it.
+        says_axis: whether the clip's file states its up axis.
     """
     assert skeleton.placement is not None
     above = skeleton.placement
     scale = similarity_scale(above)
     metres = _scale_of_bones(local, match, skeleton, (scale, units.meters_per_unit))
-    turns = above[:3, :3] / scale, units.rotation
-    if np.abs(turns[0] - turns[1]).max() < SAME:
-        turn = turns[1]
+    turn = above[:3, :3] / scale
+    if abs(scale / units.meters_per_unit - 1) > SAME:  # the unit tells the space: a character may lie
+        is_converted = metres == units.meters_per_unit
+    elif np.abs(turn - units.rotation).max() < SAME or not says_axis:
+        is_converted = False
     else:
-        by_character, by_file = (_uprightness(local, match, turn, metres, skeleton) for turn in turns)
-        turn = turns[1] if by_file > by_character + UPRIGHT else turns[0]
-    if turn is turns[1] and metres == units.meters_per_unit:
+        by_character, by_file = (
+            _uprightness(local, match, each, metres, skeleton) for each in (turn, units.rotation)
+        )
+        is_converted = by_file > by_character + UPRIGHT
+    if is_converted:
         return None
     placement = np.eye(4)
     placement[:3, :3] = turn * metres

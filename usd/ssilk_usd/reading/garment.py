@@ -27,6 +27,7 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
+from .bindings import need_skinned
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
@@ -73,6 +74,8 @@ def read_garment(
     mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
     mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
+    if skel and is_skinned(prim, skel):
+        need_skinned(prim)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
     if carried:
         assert skel is not None

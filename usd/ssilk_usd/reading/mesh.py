@@ -22,6 +22,7 @@ from ..opening.stage import (
     value,
     world_matrix,
 )
+from ..opening.times import change_times, visibility_attributes
 from .polygons import triangulate
 
 
@@ -31,10 +32,11 @@ def is_garment(prim: Usd.Prim) -> bool:
 
 
 def is_drawn(prim: Usd.Prim) -> bool:
-    """Return whether a prim is visible at its earliest time and not a guide."""
+    """Return whether a prim is visible at any time and not a guide."""
     imageable = UsdGeom.Imageable(prim)
-    invisible = imageable.ComputeVisibility(EARLIEST) == UsdGeom.Tokens.invisible
-    return not invisible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
+    times = [EARLIEST, *change_times(visibility_attributes(prim))]
+    visible = any(imageable.ComputeVisibility(time) != UsdGeom.Tokens.invisible for time in times)
+    return visible and imageable.ComputePurpose() != UsdGeom.Tokens.guide
 
 
 def is_stand_in(prim: Usd.Prim) -> bool:
@@ -130,16 +132,16 @@ def winds_backwards(prim: Usd.Prim) -> bool:
     the geomBindTransform of a skinned mesh, whose xforms UsdSkel ignores.
     """
     left_handed = value(prim, "orientation") == UsdGeom.Tokens.leftHanded
-    return bool(left_handed != (np.linalg.det(_placement(prim)[:3, :3]) < 0))
+    return bool(left_handed != (np.linalg.det(placement(prim)[:3, :3]) < 0))
 
 
-def _placement(prim: Usd.Prim) -> Floats:
+def placement(prim: Usd.Prim) -> Floats:
     """Return what places a mesh's points: to bind space where it is skinned, else to the world, shape (4, 4)."""
     bound = inherited_target(prim, "skel:skeleton")
     if not (bound and bound.IsA(UsdSkel.Skeleton) and inherited(prim, SKEL[0])):
         return world_matrix(prim)
     bind = inherited(prim, GEOM_BIND)
-    matrix = None if bind is None else bind.Get()
+    matrix = None if bind is None else bind.Get(EARLIEST)
     return np.eye(4) if matrix is None else column_matrix(matrix)
 
 

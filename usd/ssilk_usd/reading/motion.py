@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdSkel
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
@@ -123,7 +123,9 @@ def read_motion(
     units = StageUnits.of(stage)
     if placed is None and skeleton.placement is not None:
         sample = read_samples(animation, spread(codes, LOOKED_AT), len(joints), where)
-        found = clip_placement(rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match], match, units, skeleton)
+        posed_so = rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match]
+        says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
+        found = clip_placement(posed_so, match, units, skeleton, says_axis=says_axis)
         placements, units = (placements, units) if found is None else (found[None], StageUnits())
     scale = similarity_scale(placements)
     rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
@@ -266,10 +268,12 @@ def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> 
 def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, int], where: str) -> Floats:
     """Return an attribute at each time code, shape (F, *shape)."""
     values = [np.array(animation.GetAttribute(name).Get(code)) for code in codes]
-    odd = next((item for item in values if item.shape != shape), None)
-    if odd is not None:
-        found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}"
-        fail(where, f"the animation has {found}", f"{shape[0]} are needed, one for each joint", "export it again")
+    for code, odd in zip(codes, values):
+        if odd.shape != shape:
+            when = f" at time code {code:g}" if animation.GetAttribute(name).HasValue() else ""
+            found = f"{name} for {len(odd)} joints" if odd.ndim else f"no {name}{when}"
+            needed = f"{shape[0]} are needed, one for each joint"
+            fail(where, f"the animation has {found}", needed, "export it again")
     result = np.array(values, dtype=np.float64)
     bad = np.flatnonzero(~np.isfinite(result).all(axis=(1, 2)))
     if len(bad):

@@ -102,6 +102,8 @@ def animated_shapes(
 ) -> list[AnimatedShape]:
     """Return the blendshapes of a character's meshes that a motion weighs otherwise than its stage does.
 
+    A shape that a shot's animation does not name is off in that shot; a clip that stands alone leaves it as it is.
+
     Args:
         source: the character's stage.
         motion: "file[:/Prim/Path]", as for `read_motion`.
@@ -113,17 +115,17 @@ def animated_shapes(
     """
     file, prim = split_location(motion)
     of_motion = open_stage(file)
-    animation = UsdSkel.Animation(find_animation(of_motion, prim, root)[0])
+    found_animation, placed = find_animation(of_motion, prim, root)
+    animation = UsdSkel.Animation(found_animation)
     names = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
-    if not names:
+    if not names and placed is None:
         return []
     stage = open_stage(source)
     skel = find_skeleton(stage, root=root, garment=garment)
     attribute = animation.GetBlendShapeWeightsAttr()
     codes = attribute.GetTimeSamples() or [Usd.TimeCode.Default()]
-    rows = np.array(
-        [row for row in (attribute.Get(code) for code in codes) if row is not None and len(row) == len(names)]
-    )
+    given = [row for row in (attribute.Get(code) for code in codes) if row is not None and len(row) == len(names)]
+    rows = np.array(given if given or placed is None else [[0.0] * len(names)])
     found = []
     for mesh in Usd.PrimRange(skel.root, PRIMS):
         if not (len(rows) and mesh.IsA(UsdGeom.Mesh) and bound_skeleton(mesh) == skel.prim):
@@ -131,7 +133,8 @@ def animated_shapes(
         own = [str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ()]
         weights = _weights(mesh, skel) or [0.0] * len(own)
         for name, weight in zip(own, weights):
-            course = rows[:, names.index(name)] if name in names else np.array([weight])
+            unnamed = weight if placed is None else 0.0
+            course = rows[:, names.index(name)] if name in names else np.array([unnamed])
             if np.abs(course - weight).max() > SAME:
                 low, high = float(course.min()), float(course.max())
                 found.append(AnimatedShape(name, mesh.GetName(), weight, low, high))

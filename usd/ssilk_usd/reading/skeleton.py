@@ -7,11 +7,12 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import SsilkError, fail
-from ssilk_core.scene.assets import Floats, Ints, Skeleton, carrying_joint
+from ssilk_core.scene.assets import Floats, Ints, Skeleton, carrying_joint, moved_by_joints
 
 from ..names import PROXIES, SKEL
 from ..opening.stage import (
     PRIMS,
+    apply,
     column_matrix,
     has_value,
     inherited,
@@ -23,7 +24,8 @@ from ..opening.stage import (
     world_matrix,
 )
 from ..units import StageUnits
-from .mesh import is_drawn, is_garment
+from .carried import carried_by
+from .mesh import is_drawn, is_garment, placement, rendered
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
@@ -110,24 +112,52 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     parents = position[source.parents[kept]]
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
-    hub = carrying_joint(_moved_weights(source)[kept], parents)
-    binds, placement = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
-    return Skeleton(location(source.prim), names, parents, binds, rest, hub, placement)
+    hub = carrying_joint([moved[kept] for moved in _moved(source)], parents)
+    binds, world = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
+    return Skeleton(location(source.prim), names, parents, binds, rest, hub, world)
 
 
-def _moved_weights(source: SkelSource) -> Floats:
-    """Return how much of the bodies each joint of a skeleton moves, as the sum of its weights, shape (N,)."""
-    total = np.zeros(len(source.joints) + 1)
-    for prim in Usd.PrimRange(source.root, PRIMS):
-        if prim.IsA(UsdGeom.Mesh) and is_drawn(prim) and not is_garment(prim) and bound_skeleton(prim) == source.prim:
-            try:
-                influences = read_influences(prim, source.joints)
-            except SsilkError:  # told where the mesh is read as a body; others may be as they like
-                continue
-            if influences is not None:
-                at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
-                np.add.at(total, at, np.abs(influences.weights) / max(len(at), 1))
-    return total[:-1]
+def _moved(source: SkelSource) -> list[Floats]:
+    """Return how much of each body each joint of a skeleton moves, shapes (N,); of garments where no body is."""
+    meshes = [prim for prim in Usd.PrimRange(source.root, PRIMS) if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
+    bodies = rendered([prim for prim in meshes if not is_garment(prim)])
+    skinned = [_skinned(prim, source) for prim in bodies]
+    if not any(each is not None for each in skinned):
+        skinned = [_carried(prim, source) for prim in bodies]
+    if not any(each is not None for each in skinned):
+        skinned = [_skinned(prim, source) for prim in meshes]
+    return [each for each in skinned if each is not None]
+
+
+def _skinned(prim: Usd.Prim, source: SkelSource) -> Floats | None:
+    """Return how much of a mesh each joint moves, shape (N,); None where it is not bound to this skeleton."""
+    if bound_skeleton(prim) != source.prim:
+        return None
+    try:
+        influences = read_influences(prim, source.joints)
+    except SsilkError:  # told where the mesh is read as a body; others may be as they like
+        return None
+    if influences is None:
+        return None
+    at = np.array([*match_joints(influences.joints, source.joints), -1])[influences.indices]
+    weights = np.zeros((len(at), len(source.joints) + 1))
+    np.add.at(weights, (np.arange(len(at))[:, None], at), np.abs(influences.weights))
+    return _of_mesh(prim, weights[:, :-1])
+
+
+def _carried(prim: Usd.Prim, source: SkelSource) -> Floats | None:
+    """Return how much of a mesh each joint moves, which one carries; None where none does."""
+    carried = carried_by(prim, source)
+    if carried is None:
+        return None
+    weights = np.zeros((len(value(prim, "points") or []), len(source.joints)))
+    weights[:, carried.joint] = 1
+    return _of_mesh(prim, weights)
+
+
+def _of_mesh(prim: Usd.Prim, weights: Floats) -> Floats | None:
+    points = np.array(value(prim, "points") or [], dtype=np.float64).reshape(-1, 3)
+    return moved_by_joints(apply(placement(prim), points), weights) if len(points) else None
 
 
 def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
@@ -140,7 +170,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
     if bind is None:
         fail(where, "the skeleton has no bindTransforms", "one for each joint is needed", "export the armature again")
     rest = _matrices(prim, "restTransforms", len(joints))
-    placement = need_similarity(prim, world_matrix(prim))
+    placed = need_similarity(prim, world_matrix(prim))
     return SkelSource(
         stage=prim.GetStage(),
         root=root,
@@ -150,7 +180,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
         parents=parents,
         bind=bind,
         rest=_rest_from_bind(bind, parents) if rest is None else rest,
-        placement=placement,
+        placement=placed,
         owners=_owners(root, joints, parents),
     )
 

@@ -73,11 +73,8 @@ class SkelSource:
 
     @property
     def skeleton_to_world(self) -> Floats | None:
-        """Skeleton space to the core's world [m], (4, 4), where the xforms above tilt or scale it; None elsewhere."""
-        scale, up = similarity_scale(self.placement), self.units.rotation.T @ np.array([0.0, 1.0, 0.0])
-        tilt = up @ self.placement[:3, :3] @ up / scale
-        plain = abs(scale - 1) < _RIGID_TOLERANCE and tilt > 1 - _RIGID_TOLERANCE
-        return None if plain else self.units.matrix @ self.placement
+        """Skeleton space to the core's world [m], (4, 4), where xforms above it place it; None elsewhere."""
+        return self.units.matrix @ self.placement if (self.placement != np.eye(4)).any() else None
 
     @property
     def world_to_bind(self) -> Floats:

@@ -23,6 +23,7 @@ from ssilk_core.scene.assets import Ints, Mesh
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
 from ..reading.mesh import is_garment, kept_faces, polygons
 from .body_faces import face_kind
+from .look_above import OTHER_PRIMVARS, PURPOSES, inherited_primvars
 
 LOOKS = "Looks"  # scope of materials beneath the root
 _OTHERS = {
@@ -30,12 +31,12 @@ _OTHERS = {
     "visibility", "purpose", "proxyPrim",
 }  # fmt: skip
 _OTHER_SPACES = (
-    "xformOp:", "skel:", "primvars:skel:", "ssilk:", "primvars:ssilk:", "physics:", "omniphysics:", "physx",
-    "material:binding", "collection:",
+    *OTHER_PRIMVARS, "xformOp:", "skel:", "ssilk:", "physics:", "omniphysics:", "physx", "material:binding",
+    "collection:",
 )  # fmt: skip
 _LEFT = ("normals", "primvars:normals", "velocities", "accelerations")
-_PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview)
-_METADATA = ("customData", "assetInfo", "displayName", "documentation")
+_METADATA = ("customData", "assetInfo", "displayName", "documentation", "kind")
+_OTHER_SCHEMAS = ("Skel", "Ssilk", "MaterialBinding", "Collection", "Physics", "Physx", "Omni", "Deformable")
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +147,8 @@ def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:
 
 def _copy_properties(flat: Sdf.Layer, layer: Sdf.Layer, look: LookSource, path: Sdf.Path, left: LeftOut) -> None:
     prim = flat.GetPrimAtPath(look.prim.GetPath())
-    for spec in list(prim.properties) if prim else []:
+    above = [flat.GetPropertyAtPath(found) for found in inherited_primvars(look.prim)]
+    for spec in [*(prim.properties if prim else ()), *filter(None, above)]:
         name = spec.name
         if name in _OTHERS or name.startswith(_OTHER_SPACES):
             continue
@@ -160,7 +162,8 @@ def _copy_properties(flat: Sdf.Layer, layer: Sdf.Layer, look: LookSource, path: 
         if flat.ListTimeSamplesForPath(spec.path):
             for time in layer.ListTimeSamplesForPath(to):
                 layer.EraseTimeSample(to, time)
-            layer.GetAttributeAtPath(to).default = look.prim.GetAttribute(name).Get(EARLIEST)
+            source = look.prim.GetStage().GetAttributeAtPath(spec.path)
+            layer.GetAttributeAtPath(to).default = source.Get(EARLIEST)
             left.add(path.name, f"the animation of {name}, which keeps its first value")
         _keep_rows(layer, look, to, name)
     here = layer.GetPrimAtPath(path)
@@ -179,12 +182,18 @@ def _keep_rows(layer: Sdf.Layer, look: LookSource, to: Sdf.Path, name: str) -> N
     size = UsdGeom.Primvar(look.prim.GetAttribute(name)).GetElementSize() if not name.endswith(":indices") else 1
     if values is None or len(values) < size * len(rows):
         return
-    array = np.array(values)
-    array = array.reshape(-1, size, *array.shape[1:])[rows].reshape(-1, *array.shape[1:])
-    spec.default = type(values).FromNumpy(np.ascontiguousarray(array))
+    chosen = (rows[:, None] * size + np.arange(size)).reshape(-1)
+    if hasattr(values, "FromNumpy"):
+        spec.default = type(values).FromNumpy(np.ascontiguousarray(np.array(values)[chosen]))
+    else:  # words
+        spec.default = type(values)([values[index] for index in chosen.tolist()])
 
 
 def _copy_meaning(look: LookSource, mesh: UsdGeom.Mesh) -> None:
+    applied = look.prim.GetMetadata("apiSchemas")
+    for schema in applied.GetAppliedItems() if applied else ():
+        if not schema.startswith(_OTHER_SCHEMAS):
+            mesh.GetPrim().AddAppliedSchema(schema)
     purpose = UsdGeom.Imageable(look.prim).ComputePurpose()
     if purpose != UsdGeom.Tokens.default_:
         mesh.CreatePurposeAttr(purpose)
@@ -228,7 +237,7 @@ def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf
 
 def _bound(prim: Usd.Prim) -> Iterator[tuple[UsdShade.Material, str]]:
     """Yield the materials that are bound to a prim, each with the purpose of its binding."""
-    for purpose in _PURPOSES:
+    for purpose in PURPOSES:
         material, relationship = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
         if material and (purpose == UsdShade.Tokens.allPurpose or purpose in relationship.GetName().split(":")):
             yield material, purpose

@@ -38,6 +38,7 @@ from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
 from .look import copy_looks
+from .look_above import LookFromAbove
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
 
@@ -59,7 +60,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
 
     Returns:
-        What a garment from a file of its own loses of its look, for messages; empty where nothing.
+        What the garment loses of its look where it is copied or moved, for messages; empty where nothing.
 
     Raises:
         SsilkError: the output cannot be written.
@@ -69,6 +70,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
     old, left_out, wanted = _in_stage(stage, source, scene.garment), "", None
+    look = LookFromAbove.of(old) if old else None
     if old:
         mesh, to_bind, wanted = _place_garment(stage, skel, old, scene, moved)
     else:
@@ -79,6 +81,8 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     _bind_garment(mesh, to_bind, skel, scene, proxies)
     if wanted is not None:
         _shape_garment(mesh, skel, wanted)
+    if look:
+        left_out = look.keep(mesh.GetPrim())
     export(layer, out)
     return left_out
 
@@ -211,9 +215,9 @@ def _free_path(skel: SkelSource, name: str) -> Sdf.Path:
 
 
 def _move(stage: Usd.Stage, prim: Usd.Prim, to: Sdf.Path) -> Usd.Prim:
-    edit = Sdf.BatchNamespaceEdit()
-    edit.Add(Sdf.NamespaceEdit(prim.GetPath(), to, Sdf.NamespaceEdit.atEnd))
-    stage.GetRootLayer().Apply(edit)
+    editor = Usd.NamespaceEditor(stage)  # which takes along what names it, such as collections
+    editor.MovePrimAtPath(prim.GetPath(), to)
+    editor.ApplyEdits()
     return stage.GetPrimAtPath(to)
 
 
