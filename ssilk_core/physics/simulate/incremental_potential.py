@@ -17,11 +17,10 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import Scene
+from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
@@ -29,7 +28,7 @@ from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
 from .blocks import BlockMatrix, BlockPattern
-from .hessian import Hessian
+from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
 
@@ -209,9 +208,8 @@ class IncrementalPotential:
     @cached_property
     def _elastic_tables(self) -> ElasticTables:
         membrane, hinges = self.membrane, self.hinges
-        corners, numbers = np.zeros((0, 4), dtype=np.int64), self.mass.new_zeros(0, 2)
-        if hinges:
-            corners, numbers = hinges.corners, torch.cat([hinges.stiffness, hinges.rest], dim=1)
+        corners: Ints = hinges.corners if hinges else NO_CORNERS
+        numbers = torch.cat([hinges.stiffness, hinges.rest], dim=1) if hinges else self.mass.new_zeros(0, 2)
         weights, areas = membrane.weights.permute(1, 2, 0).numpy(), membrane.area[:, 0].numpy()
         return elastic_tables(len(self.mass), membrane.corners, weights, areas, corners, numbers)
 
