@@ -77,7 +77,10 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
         states = player.stepper.roll(course)
         before = states[-2:]
         monitor.lap(LATENTS)
-        activations, transforms = player.decoder.decode(states)
+        if course.outputs is None:
+            activations, transforms = player.decoder.decode(states)
+        else:
+            activations, transforms = player.decoder.pose_of(course.outputs.T)
         monitor.lap(DECODER)
         matrices = player.kinematics.matrices(transforms, given.matrices)
         monitor.lap(KINEMATICS)

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Measure what speed and size cost in accuracy, for all that can be changed without training again.
 
-Blendshapes, proxies, influences, precision, frame rate, refinement and quality levels are varied one at a time, and
-the simulator goes on by itself from the network's first two states. Networks of several sizes and garments can be
-compared: further models of a garment are measured whole and at their levels. Costs are the times of playing and of
-the solver, memory, and the sizes of model and shot. Accuracy is energy, collisions, skin that shows, and the distance
-of vertices and velocities from the whole model. All are measured on the same frames, the first ones of each clip,
-because the simulator takes seconds for each on a processor. A shot of a solver has the blendshapes that these frames
-need. Times are of this machine and of the first clip. --output writes each row when it is measured, and says that it
-is unfinished until the last. The same command, given again, goes on from there. A file of other models, motions or
-settings is begun anew. A variant that fails is told, the file stays unfinished, and the exit code is 4 then.
+Blendshapes, proxies, influences, precision, frame rate, refinement, iterations of the solver in latents and quality
+levels are varied one at a time, and the simulator goes on by itself from the network's first two states. Networks of
+several sizes and garments can be compared: further models of a garment are measured whole and at their levels. Costs
+are the times of playing and of the solver, memory, and the sizes of model and shot. Accuracy is energy, collisions,
+skin that shows, and the distance of vertices and velocities from the whole model. All are measured on the same
+frames, the first ones of each clip, because the simulator takes seconds for each on a processor. A shot of a solver
+has the blendshapes that these frames need. Times are of this machine and of the first clip. --output writes each row
+when it is measured, and says that it is unfinished until the last. The same command, given again, goes on from there.
+A file of other models, motions or settings is begun anew. A variant that fails is told, the file stays unfinished,
+and the exit code is 4 then.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="measure on the first N frames of each clip, at the models' rate (default "
                            f"{FRAMES})")  # fmt: skip
     verb.add_argument("--no-refine", action="store_true",
-                      help="leave out refinement and simulator, which take most of the time")  # fmt: skip
+                      help="leave out all solvers, which take most of the time")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, help="figures to write (.json), and a plot beside them (.png)")
     verb.add_argument("--device", default="cpu", help="where PyTorch and the solver run (default cpu)")
 

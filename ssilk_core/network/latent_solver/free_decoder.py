@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ...physics import loops
 from ...physics.skinning import blend_matrices, transform_points
 from ..model.decoder import limited, rotation_from_six_d
 from ..model.network import GarmentModel
@@ -87,22 +88,50 @@ class FreeDecoder(nn.Module):
         output = self.output(z)
         activation = self.bounded(output[:, : self.activation_count].T)
         values = self._values(output.T[self.activation_count :])
-        moved = limited(values[:, 6:], self.reach) if self.proxy_outputs > 6 else torch.zeros_like(values[:, :3])
-        own = self._about_pivots(rotation_from_six_d(values[:, :6]), moved)
-        affine = blend_matrices(self.weights, self.chain.matrices(own, character))
-        return transform_points(affine, self._at_rest(self._read(activation)))
+        if loops.supports(values) and values.numel():
+            matrices, _ = self._proxies_by_loop(
+                values, values.new_empty(len(z), values[..., 0].numel(), 0), character
+            )
+        else:
+            moved = limited(values[:, 6:], self.reach) if self.proxy_outputs > 6 else torch.zeros_like(values[:, :3])
+            matrices = self.chain.matrices(self._about_pivots(rotation_from_six_d(values[:, :6]), moved), character)
+        return transform_points(blend_matrices(self.weights, matrices), self._at_rest(self._read(activation)))
 
     @torch.no_grad()
     def linearise(self, z: Tensor, character: Tensor) -> DecodedPoints:
         """Return positions and their Jacobian; arguments as for `positions`."""
-        frames, latents = z.shape
         output, slopes = mlp_slopes(self.output, z)
-        count, proxies = self.activation_count, self.proxy_count
+        count = self.activation_count
         activation = self.bounded(output[:, :count].T)
         slope = 1 - activation.T**2 if self.tanh else (output[:, :count] == activation.T).to(output.dtype)
         d_activation = slope[:, :, None] * slopes[:, :count]
-        values = self._values(output.T[count:])
-        d_values = slopes[:, count:].reshape(frames, proxies, self.proxy_outputs, latents).permute(1, 2, 0, 3)
+        values, rest = self._values(output.T[count:]), self._at_rest(self._read(activation))
+        if loops.supports(values) and values.numel():
+            matrices, d_matrices = self._proxies_by_loop(values, slopes[:, count:], character)
+        else:
+            matrices, d_matrices = self._proxies(values, slopes[:, count:], character)
+        affine, jacobian = blend_matrices(self.weights, matrices), self._by_proxies(rest, d_matrices)
+        if len(self.shapes) and self.shapes.shape[-1]:
+            turned_shapes = torch.einsum("uabn,ubk->nuak", affine[:, :, :3], self.shapes).flatten(1, 2)
+            jacobian = jacobian.baddbmm_(turned_shapes, self._read(d_activation, dim=1))
+        return DecodedPoints(transform_points(affine, rest), jacobian)
+
+    def _proxies_by_loop(self, values: Tensor, slopes: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the result of `_proxies`."""
+        from ...physics.loops.proxy_slopes import proxy_slopes_loop
+
+        return proxy_slopes_loop(
+            values, slopes, self.scale[:, 0], self.pivots, self.chain.parents, character, self.reach
+        )
+
+    def _proxies(self, values: Tensor, slopes: Tensor, character: Tensor) -> tuple[Tensor, Tensor]:
+        """Return skinning matrices of all joints (J + P, 3, 4, N), and slopes of the proxies' (N, P, 4, 3, m).
+
+        Args:
+            values: of the proxies (P, C, N); slopes: of the network's outputs for them (N, C P, m).
+        """
+        frames, latents = len(slopes), slopes.shape[2]
+        d_values = slopes.reshape(frames, self.proxy_count, self.proxy_outputs, latents).permute(1, 2, 0, 3)
         d_values = self.scale[..., None] * d_values
         turned, d_turned = rotation_slopes(values[:, :6], d_values[:, :6])
         moved, d_moved = torch.zeros_like(values[:, :3]), torch.zeros_like(d_values[:, :3])
@@ -110,12 +139,7 @@ class FreeDecoder(nn.Module):
             moved, d_moved = limited_slopes(values[:, 6:], d_values[:, 6:], self.reach)
         own, d_own = self._about_pivots(turned, moved), self._about_pivots_slopes(d_turned, d_moved)
         matrices = self.chain.matrices(own, character)
-        affine, rest = blend_matrices(self.weights, matrices), self._at_rest(self._read(activation))
-        jacobian = self._by_proxies(rest, self.chain.slopes(own, d_own, matrices))
-        if len(self.shapes) and self.shapes.shape[-1]:
-            turned_shapes = torch.einsum("uabn,ubk->nuak", affine[:, :, :3], self.shapes).flatten(1, 2)
-            jacobian = jacobian.baddbmm_(turned_shapes, self._read(d_activation, dim=1))
-        return DecodedPoints(transform_points(affine, rest), jacobian)
+        return matrices, self.chain.slopes(own, d_own, matrices).permute(3, 0, 2, 1, 4)
 
     def _values(self, delta: Tensor) -> Tensor:
         """Return what `decoder.transform_of` takes (P, C, N) from the network's outputs for proxies (C P, N)."""
@@ -143,9 +167,9 @@ class FreeDecoder(nn.Module):
         return torch.cat([d_turned, offset[:, :, None]], dim=2)
 
     def _by_proxies(self, rest: Tensor, d_matrices: Tensor) -> Tensor:
-        """Return the part of the Jacobian by the proxies' matrices, shape (N, 3 U, m)."""
-        frames, latents = d_matrices.shape[3:]
+        """Return the part of the Jacobian by the slopes of the proxies' matrices (N, P, 4, 3, m), (N, 3 U, m)."""
+        frames, latents = len(d_matrices), d_matrices.shape[4]
         points = torch.cat([rest, torch.ones_like(rest[:, :1])], dim=1).permute(2, 0, 1)  # (N, U, 4)
         weighted = (self.weights[:, self.joints :, None] * points[:, :, None]).flatten(2)  # (N, U, 4 P)
-        slopes = d_matrices.permute(3, 0, 2, 1, 4).reshape(frames, 4 * self.proxy_count, 3 * latents)
+        slopes = d_matrices.reshape(frames, 4 * self.proxy_count, 3 * latents)
         return (weighted @ slopes).reshape(frames, 3 * len(rest), latents)

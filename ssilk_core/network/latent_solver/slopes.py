@@ -86,7 +86,7 @@ class ProxyChain:
     """
 
     def __init__(self, parents: Sequence[int], joints: int, device: torch.device) -> None:
-        self.joints = joints
+        self.joints, self.parents = joints, torch.as_tensor(parents, dtype=torch.long, device=device)
         depths: list[int] = []
         for parent in parents:  # a parent comes before its children
             depths.append(0 if parent < joints else depths[parent - joints] + 1)

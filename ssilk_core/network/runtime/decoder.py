@@ -41,14 +41,15 @@ class NumpyDecoder:
     def pose_of(self, output: NDArray) -> tuple[NDArray, NDArray]:
         """Return activations and transforms of outputs of the decoder's network (outputs, F)."""
         delta = output[self.activation_count :].reshape(self.proxies, len(self.scale), output.shape[1])
-        activations = output[: self.activation_count]
-        activations = np.tanh(activations) if self.tanh else activations.clip(-FREE_ACTIVATION, FREE_ACTIVATION)
-        if self.readout is not None:
-            activations = (self.readout @ activations).clip(-1, 1)
         values = self.identity + self.scale * delta
         if self.moves:
             values[:, 6:] = limited(values[:, 6:], self.reach)
-        return activations, transform_of(values)
+        return self.activations(output[: self.activation_count]), transform_of(values)
+
+    def activations(self, output: NDArray) -> NDArray:
+        """Return activations of the blendshapes (K, F) of the network's outputs for them (outputs, F)."""
+        found = np.tanh(output) if self.tanh else output.clip(-FREE_ACTIVATION, FREE_ACTIVATION)
+        return found if self.readout is None else (self.readout @ found).clip(-1, 1)
 
     def file_pose(self, activations: NDArray, transforms: NDArray) -> tuple[Floats, Floats, Floats | None]:
         """Return quaternions (F, P, 4), weights (F, K + 1) and translations, as `GarmentModel.file_pose`."""

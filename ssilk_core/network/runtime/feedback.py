@@ -16,63 +16,52 @@ from ...scene.assets import Floats
 from ..checkpoint import ModelFile
 from ..feedback import LIMIT, UNIT, feedback_size, feedback_vertices
 from .decoder import NumpyDecoder
-from .kinematics import ProxyKinematics
 from .networks import LayerBuffers, as_float32
-from .skinning import tiles, weights_of_joints
+from .two_frames import COLUMNS, PointRig, TwoFrames
 
 SATURATION = np.float32(UNIT * LIMIT)  # [m]
 
 
 @dataclass(frozen=True, eq=False)
 class BodyCourse:
-    """The character in F frames and in the two before them, as the points see it.
+    """The character in F frames, and but for `bend` in the two before them, as the points see it.
 
     Attributes:
-        matrices: skinning matrices about each root, shape (F + 2, J, 3, 4).
-        affine: what the character's joints add to each point's matrix, shape (F + 2, M, 3, 4).
-        bend: second differences of the root's position [m], shape (F, 3).
+        anchors: skinning matrices of the points' anchors about each root, shape (3, 4, F + 2, A).
+        affine: what the character's joints add to each point's matrix, shape (3, 4, F + 2, M).
+        turns: rotations of the root, shape (F + 2, 3, 3).
+        bend: second differences of the root's position [m], shape (F, 3, 1).
     """
 
-    matrices: NDArray
+    anchors: NDArray
     affine: NDArray
+    turns: NDArray
     bend: NDArray
 
 
 class ClothPoints:
-    """Decodes the points that S sees.
+    """The points that S sees, and what else it sees.
 
     Args:
-        file: the trained garment; decoder, kinematics: of it.
+        file: the trained garment; decoder: of it.
     """
 
-    def __init__(self, file: ModelFile, decoder: NumpyDecoder, kinematics: ProxyKinematics) -> None:
-        self.decoder, self.kinematics = decoder, kinematics
-        rows = feedback_vertices(file.scene, file.config)
-        self.count, self.joints = len(rows), file.scene.character.skeleton.joint_count
-        self.hub = file.scene.character.skeleton.hub
+    def __init__(self, file: ModelFile, decoder: NumpyDecoder) -> None:
+        self.decoder, rows = decoder, feedback_vertices(file.scene, file.config)
+        self.rig = PointRig(file.scene, file.parameters, decoder, rows)
+        self.count, self.hub = len(rows), file.scene.character.skeleton.hub
         self.size = feedback_size(file.scene, file.config)
-        whole = tiles(file.scene, file.parameters)
-        shapes = np.concatenate([tile.shapes.reshape(len(tile.shapes), 3, -1) for tile in whole], axis=2)
-        shapes = shapes[:, :, rows].transpose(0, 2, 1).reshape(len(shapes), -1)  # (K + 1, 3 M), the rest shape last
-        self.shapes, self.rest = as_float32(shapes[:-1]), as_float32(shapes[-1])
-        weights = weights_of_joints(file.scene, file.parameters, rows)
-        self.of_character, self.of_proxies = (as_float32(part) for part in np.split(weights, [self.joints], axis=1))
 
     def course(self, matrices: NDArray, bend: Floats) -> BodyCourse:
         """Return F frames for the points, from skinning matrices of F + 2 (J, 3, 4, F + 2) and bends (F, 3)."""
-        own = np.ascontiguousarray(matrices.transpose(3, 0, 1, 2))
-        affine = (self.of_character @ own.reshape(len(own), self.joints, 12)).reshape(len(own), self.count, 3, 4)
-        return BodyCourse(own, affine, as_float32(bend))
-
-    def points(self, outputs: NDArray, course: BodyCourse, frames: slice) -> NDArray:
-        """Return points (F, M, 3) of outputs of D (outputs, F) in frames of a course, counted with the two before."""
-        activations, transforms = self.decoder.pose_of(outputs)
-        matrices = self.kinematics.matrices(transforms, course.matrices[frames].transpose(1, 2, 3, 0))
-        proxies = matrices[self.joints :].transpose(3, 0, 1, 2).reshape(outputs.shape[1], -1, 12)
-        affine = (self.of_proxies @ proxies).reshape(-1, self.count, 3, 4)
-        affine += course.affine[frames]
-        rest = (activations.T @ self.shapes + self.rest).reshape(-1, self.count, 3, 1)
-        return (affine[..., :3] @ rest)[..., 0] + affine[..., 3]
+        own = matrices[:, :, COLUMNS].transpose(1, 2, 3, 0)
+        turns = matrices[self.hub, :, :3].transpose(2, 0, 1)
+        return BodyCourse(
+            as_float32(own[..., self.rig.anchors]),
+            as_float32(own @ self.rig.of_character),
+            as_float32(turns),
+            as_float32(bend[:, :, None]),
+        )
 
     def proxies(self, outputs: NDArray) -> NDArray:
         """Return the proxies (C P, F) of outputs of D (outputs, F), as S sees them."""
@@ -88,18 +77,24 @@ class SeenCloth:
     Args:
         points: that S sees; course: of the frames.
         first: frame of the course that comes next; states: the two before it, (2, latent).
+        outputs: of D in the F frames of the course, which `keep` writes, shape (F, outputs).
         into: features of the next frame, which `look` writes, shape (3 M,).
     """
 
-    def __init__(self, points: ClothPoints, course: BodyCourse, first: int, states: NDArray, into: NDArray) -> None:
-        self.points, self.course, self.frame, self.into = points, course, first, into
+    def __init__(
+        self, points: ClothPoints, course: BodyCourse, first: int, states: NDArray, outputs: NDArray, into: NDArray
+    ) -> None:
+        self.points, self.course, self.frame, self.outputs, self.into = points, course, first, outputs, into
+        self.frames = TwoFrames(points.rig)
+        self.before: NDArray | None = None
         *hidden, last = points.decoder.layers
         self.layers, self.last = [LayerBuffers(layer.rows) for layer in hidden], last
         self.state = np.ones(len(self.layers[0].rows), np.float32)  # ends in a one, for the biases
-        self.older, self.newer = (np.empty(last.rows.shape[1], np.float32) for _ in range(2))
-        self.before: NDArray | None = None
-        for state in states:
-            self._keep(state)
+        self.past = np.empty(
+            (3, last.rows.shape[1]), np.float32
+        )  # outputs at z_{t-2}, z_{t-1}, and as they would go on
+        for into, state in zip(self.past, states):
+            self._decode(state, into)
 
     def look(self) -> None:
         """Write what S sees of the cloth in the next frame."""
@@ -107,36 +102,41 @@ class SeenCloth:
         if points:
             self._look_at_points(self.into[:points])
         if self.points.size > points:
-            self.into[points:] = self.points.proxies(np.stack([self.older, self.newer], axis=1)).T.reshape(-1)
+            self.into[points:] = self.points.proxies(self.past[:2].T).T.reshape(-1)
 
     def _look_at_points(self, into: NDArray) -> None:
-        both = np.stack([self.newer, 2 * self.newer - self.older], axis=1)
+        older, newer, on = self.past
+        np.add(newer, newer, on)
+        np.subtract(on, older, on)
         if self.before is None:
-            self.before = self.points.points(self.older[:, None], self.course, self._past(0, 1))[0]
-        now, carried = self.points.points(both, self.course, self._past(1, 3))
+            self.before = self._points(self.past[:2], self.frame)[:, 0]
+        now, carried = self._points(self.past[1:], self.frame + 1).swapaxes(0, 1)
         away = now + now
-        away -= self.before
-        away -= carried
-        away -= self.course.bend[self.frame]
-        away = away @ self.course.matrices[self.frame + 2, self.points.hub, :, :3]
-        np.divide(away.reshape(-1), SATURATION, into)
+        np.subtract(away, self.before, away)
+        np.subtract(away, carried, away)
+        np.subtract(away, self.course.bend[self.frame], away)
+        np.matmul(away.T, self.course.turns[self.frame + 2], into.reshape(-1, 3))
+        np.divide(into, SATURATION, into)
         np.tanh(into, into)
         np.multiply(into, np.float32(LIMIT), into)
         self.before = now
 
+    def _points(self, outputs: NDArray, first: int) -> NDArray:
+        """Return points of outputs (2, outputs) in two frames of the course, counted with the two before it."""
+        course, frames = self.course, slice(first, first + 2)
+        return self.frames.points(outputs, course.anchors[:, :, frames], course.affine[:, :, frames])
+
     def keep(self, state: NDArray) -> None:
         """Take the state of the frame that `look` was for, (latent,)."""
-        self._keep(state)
+        self.past[0] = self.past[1]
+        self._decode(state, self.past[1])
+        self.outputs[self.frame] = self.past[1]
         self.frame += 1
 
-    def _keep(self, state: NDArray) -> None:
-        self.older, self.newer = self.newer, self.older
+    def _decode(self, state: NDArray, into: NDArray) -> None:
         self.state[:-1] = state
         hidden = self.state
         for layer in self.layers:
             np.dot(hidden, layer.rows, layer.sums)
             hidden = layer.activate()
-        np.dot(hidden, self.last.rows, self.newer)
-
-    def _past(self, start: int, stop: int) -> slice:
-        return slice(self.frame + start, self.frame + stop)
+        np.dot(hidden, self.last.rows, into)

@@ -46,7 +46,7 @@ class NumpyGarment:
         self.tiles = tiles(scene, file.parameters)
         self.stepper: NumpyStepper[Any] | None = None
         if stepper := STEPPERS[config.scheme]:
-            points = ClothPoints(file, self.decoder, self.kinematics)
+            points = ClothPoints(file, self.decoder)
             sizes = descriptor_sizes(scene, file.joints, config.descriptors)
             self.stepper = stepper(config, file.parameters, *sizes, points)
 

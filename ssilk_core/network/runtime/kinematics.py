@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from ...scene.assets import ProxyRig
 
+SHORTEST = np.float32(1e-8)  # what the length of an axis is taken for at least, as in `model.decoder`
+
 
 def rotation_from_six_d(values: NDArray) -> NDArray:
     """Orthonormalise 6D rotations (P, 6, F) by Gram-Schmidt; returns (P, 3, 3, F) [ZBL*19]."""
@@ -32,7 +34,7 @@ def limited(displacements: NDArray, reach: np.float32) -> NDArray:
 
 def _unit(vectors: NDArray) -> NDArray:
     length = np.sqrt((vectors * vectors).sum(1, keepdims=True))
-    return vectors / np.maximum(length, np.float32(1e-8))
+    return vectors / np.maximum(length, SHORTEST)
 
 
 class ProxyKinematics:

@@ -39,6 +39,9 @@ class RolledSpan:
     def __init__(self, player: NumpyGarment, motion: Motion, block: int, before: int) -> None:
         self.player, self.motion, self.block, self.before = player, motion, block, before
         self.latents = np.empty((motion.frame_count, player.file.config.latent), dtype=np.float32)
+        sees = player.stepper is not None and player.stepper.points.size > 0
+        size = len(player.decoder.layers[-1].bias) if sees else 0
+        self.outputs = np.empty((motion.frame_count, size), dtype=np.float32)  # of D, where the stepper sees them
         self.rolled = 0
         self.character = lru_cache(2)(self._character)
         self.decoded = lru_cache(2)(self._decoded)
@@ -53,6 +56,7 @@ class RolledSpan:
         if same >= HISTORY:  # the pre-roll depends on these
             self.rolled = self.before + same // self.block * self.block
             self.latents[: self.rolled] = other.latents[: self.rolled]
+            self.outputs[: self.rolled] = other.outputs[: self.rolled]
 
     def states(self, stop: int) -> NDArray:
         """Return the latents of the span's frames up to `stop`, shape (stop, latent)."""
@@ -83,8 +87,11 @@ class RolledSpan:
         latents = player.quasi_static(character.static)
         if player.stepper:
             past = self.latents[done - 2 : done] if done else None
-            latents = player.stepper.roll(player.stepper.prepare(latents, character, past))
-        self.rolled = done + len(character.static)
+            inputs = player.stepper.prepare(latents, character, past)
+            latents = player.stepper.roll(inputs)
+            if inputs.outputs is not None:
+                self.outputs[done : done + len(latents)] = inputs.outputs
+        self.rolled = done + len(latents)
         self.latents[done : self.rolled] = latents
 
     def _character(self, number: int) -> CharacterFrames:
@@ -100,8 +107,10 @@ class RolledSpan:
 
     def _decoded(self, number: int) -> DecodedFrames:
         frames = self._frames(number)
-        start, stop = frames.start - self.before, frames.stop - self.before
-        return DecodedFrames(*self.player.decoder.decode(self.states(stop)[start:]))
+        states, decoder = self.states(frames.stop - self.before)[frames.start - self.before :], self.player.decoder
+        if self.outputs.size:
+            return DecodedFrames(*decoder.pose_of(self.outputs[frames].T))
+        return DecodedFrames(*decoder.decode(states))
 
 
 def roll_span(player: NumpyGarment, span: Motion, block: int, pre_roll: float) -> RolledSpan:

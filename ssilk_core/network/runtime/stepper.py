@@ -37,7 +37,7 @@ from ..settings import (
 )
 from .character import CharacterFrames
 from .feedback import BodyCourse, ClothPoints, SeenCloth
-from .networks import Layer, LayerBuffers, Parameters, as_float32, evaluate_tail, layers
+from .networks import Layer, LayerBuffers, Parameters, as_float32, evaluate, evaluate_tail, layers
 
 MAX_SCALED_OUTPUT = OUTPUT_SCALE * MAX_OUTPUT
 SAFE_SQUARED_NORM = MAX_SCALED_OUTPUT**2  # a vector with a smaller one has no entry that needs clamping
@@ -79,12 +79,14 @@ class StepperInputs:
         history: p of frame t and z_{t-2} in row t, so that one subtraction gives w and v, shape (F + 2, 2, latent).
         pose_sums: contribution of the pose to the sums of S's first layer, shape (F, hidden).
         course: the character as the points that S sees have it; None where it sees none.
+        outputs: those of D's network, which S sees, shape (F, outputs); None where it does not.
         first: first frame that the stepper computes; the garment is at rest in earlier ones.
     """
 
     history: NDArray
     pose_sums: NDArray
     course: BodyCourse | None
+    outputs: NDArray | None
     first: int
 
 
@@ -136,20 +138,24 @@ class NumpyStepper(ABC, Generic[Inputs]):
 
     def _given(
         self, rest: NDArray, character: CharacterFrames, before: NDArray | None
-    ) -> tuple[NDArray, BodyCourse | None, int]:
-        """Return history, course and first frame of `StepperInputs`."""
-        course = self.points.course(character.all_matrices, character.bend) if self.points.size else None
+    ) -> tuple[NDArray, BodyCourse | None, NDArray | None, int]:
+        """Return history, course, outputs and first frame of `StepperInputs`."""
+        course, outputs = None, None
+        if self.points.size:
+            course = self.points.course(character.all_matrices, character.bend)
+            outputs = np.empty((len(rest), len(self.points.decoder.layers[-1].bias)), np.float32)
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest
         if before is None:
             history[2:4, 1] = rest[:2]
-            return history, course, 2
+            return history, course, outputs, 2
         history[:2, 1] = before
-        return history, course, 0
+        return history, course, outputs, 0
 
     def roll(self, inputs: Inputs) -> NDArray:
-        """Return the latents of all frames (F, latent), written into `inputs`."""
+        """Return the latents of all frames (F, latent), written into `inputs` with the outputs of D there."""
         z, rest, start = inputs.history[2:, 1], inputs.history[:-2, 0], inputs.first
+        self._decode(inputs, slice(0, start))
         while start < len(z):
             self._advance(inputs, start)
             bad = diverged(z[start:])
@@ -158,7 +164,21 @@ class NumpyStepper(ABC, Generic[Inputs]):
             first = start + int(bad.argmax())
             start = first + RECOVERY_FRAMES
             z[first:start] = rest[first:start]
+            self._decode(inputs, slice(first, start))
         return z
+
+    def _decode(self, inputs: Inputs, frames: slice) -> None:
+        """Write the outputs of D for frames that are at rest."""
+        if inputs.outputs is not None:
+            inputs.outputs[frames] = evaluate(self.points.decoder.layers, inputs.history[2:, 1][frames].T).T
+
+    def _seen_cloth(self, inputs: Inputs, start: int, into: NDArray) -> SeenCloth | None:
+        """Return what writes features of the frames from `start` on into an array; None where S sees no cloth."""
+        if inputs.course is None or inputs.outputs is None:
+            return None
+        return SeenCloth(
+            self.points, inputs.course, start, inputs.history[start : start + 2, 1], inputs.outputs, into
+        )
 
     def _buffers(self) -> list[LayerBuffers]:
         return [LayerBuffers(rows) for rows in (self.first, *(layer.rows for layer in self.later[:-1]))]
@@ -205,13 +225,13 @@ class SpringStepper(NumpyStepper[SpringInputs]):
 
     def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> SpringInputs:
         static, rates = character.static, character.rates
-        history, course, first = self._given(rest, character, before)
+        history, course, outputs, first = self._given(rest, character, before)
         still = self.of_still @ np.hstack([rest, static]).T + self.bias
         pose_sums = np.ascontiguousarray((still + self.of_rates @ rates.T).T)
         output = evaluate_tail(self.later, still).T
         output_at_rest = np.ascontiguousarray(output.clip(-MAX_SCALED_OUTPUT, MAX_SCALED_OUTPUT))
         rate_allowance = RATE_ALLOWANCE * np.linalg.norm(rates, axis=1)
-        return SpringInputs(history, pose_sums, course, first, output_at_rest, rate_allowance)
+        return SpringInputs(history, pose_sums, course, outputs, first, output_at_rest, rate_allowance)
 
     def _advance(self, inputs: SpringInputs, start: int) -> None:
         z, of_velocity, history = self.config.latent, self.config.velocity_allowance, inputs.history[start:]
@@ -224,7 +244,7 @@ class SpringStepper(NumpyStepper[SpringInputs]):
         poses = inputs.pose_sums[start:], inputs.output_at_rest[start:], inputs.rate_allowance[start:].tolist()
         frames = zip(history[:-2], history[:-2, 0], history[1:-1, 1], history[2:, 1], *poses)
         with np.errstate(over="ignore", invalid="ignore"):  # `roll` handles diverged states
-            cloth = inputs.course and SeenCloth(self.points, inputs.course, start, history[:2, 1], seen)
+            cloth = self._seen_cloth(inputs, start, seen)
             for past, rest, now, new, pose_sum, at_rest, rate_limit in frames:
                 np.subtract(now, past, differences)
                 if cloth:
@@ -266,9 +286,9 @@ class VerletStepper(NumpyStepper[StepperInputs]):
         self.bias, self.first = first.bias, as_float32(np.hstack([of_forward, of_now, of_seen]).T)
 
     def prepare(self, rest: NDArray, character: CharacterFrames, before: NDArray | None) -> StepperInputs:
-        history, course, first = self._given(rest, character, before)
+        history, course, outputs, first = self._given(rest, character, before)
         pose = np.hstack([character.static, character.rates])
-        return StepperInputs(history, as_float32((self.of_pose @ pose.T + self.bias).T), course, first)
+        return StepperInputs(history, as_float32((self.of_pose @ pose.T + self.bias).T), course, outputs, first)
 
     def _advance(self, inputs: StepperInputs, start: int) -> None:
         z, history, buffers = self.config.latent, inputs.history[start:, 1], self._buffers()
@@ -277,7 +297,7 @@ class VerletStepper(NumpyStepper[StepperInputs]):
         velocity, added = np.empty(z, np.float32), np.empty(z, np.float32)
         clamp_step, clamp = SoftClamp(self.config.max_latent_step, (z,)), self.config.latent_bound or np.inf
         with np.errstate(over="ignore", invalid="ignore"):  # `roll` handles diverged states
-            cloth = inputs.course and SeenCloth(self.points, inputs.course, start, history[:2], seen)
+            cloth = self._seen_cloth(inputs, start, seen)
             for past, now, new, pose_sum in zip(history, history[1:], history[2:], inputs.pose_sums[start:]):
                 np.subtract(now, past, velocity)
                 np.multiply(self.beta, velocity, velocity)

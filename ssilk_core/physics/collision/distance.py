@@ -152,6 +152,13 @@ def smoothed_planes(
     _, normal, offset, search_radius = _at_vertices(single, body, blocks, patches, within)
     plane, candidates = SmoothedDistance(normal, offset, flat).to(x.dtype), patches.faces if patches else None
     reach = _reach(patches)
+    if loops.available(x.device):
+        found, smoothed = _smoothed_by_loop(x, search_radius, body, candidates, reach)
+        return SmoothedDistance(
+            smoothed.normal.where(found[:, None], plane.normal),
+            smoothed.offset.where(found, plane.offset),
+            smoothed.curvature,
+        )
     many = max(1, frames_at_once(x, body.faces, candidates) // SMOOTHING_MEMORY_FACTOR)
     for frames in torch.arange(x.shape[2], device=x.device).split(many):
         part = x[..., frames], search_radius[:, frames], body.points[..., frames], body.normals[..., frames]
@@ -160,6 +167,21 @@ def smoothed_planes(
         plane.offset[..., frames] = smoothed.offset.where(found, plane.offset[..., frames])
         plane.curvature[..., frames] = smoothed.curvature
     return plane
+
+
+def _smoothed_by_loop(
+    x: Tensor, search_radius: Tensor, body: PosedBody, candidates: Tensor | None, reach: float
+) -> tuple[Tensor, SmoothedDistance]:
+    """Return the result of `smoothed_distance`."""
+    from ..loops.smoothed_distance import smoothed_distance_loop
+
+    assert body.faces is not None
+    found, *smoothed = smoothed_distance_loop(
+        x, search_radius, body.points, body.normals, body.faces, candidates,
+        reach=reach, max_distance=MAX_QUERY_DISTANCE, deep_cosine=DEEP_COSINE, surface_epsilon=SURFACE_EPSILON,
+        exponent=SMOOTHING_EXPONENT, search_margin=SEARCH_MARGIN, edge_epsilon=EDGE_EPSILON,
+    )  # fmt: skip
+    return found, SmoothedDistance(*smoothed)
 
 
 def _smoothed_by_kernel(

@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from ...scene.assets import LOOSE, Scene
-from .. import kernels
+from .. import kernels, loops
 from .limb_axes import MIN_LENGTH, PosedLimbs, along_paths, loose_faces
-from .ray_casting import RayCaster
+from .ray_casting import EDGE_TOLERANCE, RayCaster
 from .samples import ContactSamples
 
 # A tenth of a metre counts as 20 mm of depth. With a quarter of that, solver iterations did not free most hands.
@@ -70,6 +70,10 @@ class Piercing:
             from ..kernels.crossings import crossings_kernel
 
             counts, triangle = crossings_kernel(limbs.start, limbs.end, x, self._caster.faces)
+        elif loops.available(x.device):
+            from ..loops.crossings import crossings_loop
+
+            counts, triangle = crossings_loop(limbs.start, limbs.end, x, self._caster.faces, EDGE_TOLERANCE)
         else:
             counts, _, triangle = self._caster.crossings(limbs.start, limbs.end, x)
         paths = limbs.paths

@@ -31,19 +31,31 @@ def elastic_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> tuple[Tens
     return _Elastic.apply(x, tables, fabric)
 
 
+def elastic_gradient_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> Tensor:
+    """Return the gradient of the sum of both [N], shape (V, 3, N)."""
+    stretch, bending = _run(x, tables, fabric, True)[1]
+    return stretch + bending
+
+
+def _run(x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool) -> tuple[Tensor, Tensor]:
+    """Return both energies (2, N) and, where wanted, their gradients (2, V, 3, N)."""
+    frames = x.shape[2]
+    energy = torch.empty(2, frames)
+    # The gradients of both energies; one vertex stands for all where they are not asked for.
+    slopes = torch.empty(2, len(x) if wanted else 1, 3, frames)
+    woven = fabric.stretch_model != "stvk"
+    moduli = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
+    rest = (tables.faces, tables.face_numbers, tables.hinges, tables.hinge_numbers)
+    numbers = (np.float32(modulus) for modulus in moduli)
+    out = energy.numpy(), slopes.numpy()
+    run_parts(_elastic, blocks_of(frames, LANES), array(x), *map(array, rest), *numbers, woven, wanted, *out)
+    return energy, slopes
+
+
 class _Elastic(Function):
     @staticmethod
     def forward(ctx, x, tables, fabric):
-        frames, wanted = x.shape[2], ctx.needs_input_grad[0]
-        energy = torch.empty(2, frames)
-        # The gradients of both energies; one vertex stands for all where they are not asked for.
-        slopes = torch.empty(2, len(x) if wanted else 1, 3, frames)
-        woven = fabric.stretch_model != "stvk"
-        moduli = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
-        rest = (tables.faces, tables.face_numbers, tables.hinges, tables.hinge_numbers)
-        numbers = (np.float32(modulus) for modulus in moduli)
-        out = energy.numpy(), slopes.numpy()
-        run_parts(_elastic, blocks_of(frames, LANES), array(x), *map(array, rest), *numbers, woven, wanted, *out)
+        energy, slopes = _run(x, tables, fabric, ctx.needs_input_grad[0])
         ctx.save_for_backward(slopes)
         return energy[0], energy[1]
 

@@ -20,15 +20,17 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from ...scene.assets import Scene
+from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
+from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
+from ..kernels.corners import ElasticTables, elastic_tables
 from ..self_contact import ClothContacts, ClothNeighbours, SelfContact
 from .blocks import BlockMatrix, BlockPattern
 from .contact_stiffness import ContactStiffness
-from .hessian import Hessian
+from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
 
@@ -102,6 +104,7 @@ class IncrementalPotential:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
+        self.__dict__.pop("_elastic_tables", None)
 
     @cached_property
     def self_contact(self) -> SelfContact:
@@ -175,9 +178,7 @@ class IncrementalPotential:
 
     def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
-        total = self.membrane.energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
-        if self.hinges:
-            total = total + self.hinges.energy(x)
+        total = self._elastic_energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
         if self.stitching:
             total = total + self.stitching.energy(x)
         for weight, target in self._anchors(inputs):
@@ -198,9 +199,7 @@ class IncrementalPotential:
 
     def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the gradient [N] at all vertices, shape (V, 3, N)."""
-        total = self.membrane.gradient(x) - self.mass[:, None] * inputs.gravity
-        if self.hinges:
-            total += self.hinges.gradient(x)
+        total = self._elastic_gradient(x) - self.mass[:, None] * inputs.gravity
         if self.stitching:
             total += stitch_gradient(self.stitching, x)
         if inputs.contacts is not None:
@@ -249,6 +248,33 @@ class IncrementalPotential:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
         force, mass = gradient[self.free], self.mass[self.free]
         return ((force * force).sum(1) / mass).sum(0).div(mass.sum()).sqrt() / GRAVITY
+
+    def _elastic_energy(self, x: Tensor) -> Tensor:
+        """Return stretch and bending [J], shape (N,)."""
+        if loops.supports(x):
+            from ..loops.elastic import elastic_loop
+
+            stretch, bending = elastic_loop(x, self._elastic_tables, self.fabric)
+            return stretch + bending
+        stretch = self.membrane.energy(x)
+        return stretch + self.hinges.energy(x) if self.hinges else stretch
+
+    def _elastic_gradient(self, x: Tensor) -> Tensor:
+        """Return the gradient of stretch and bending [N], shape (V, 3, N)."""
+        if loops.supports(x):
+            from ..loops.elastic import elastic_gradient_loop
+
+            return elastic_gradient_loop(x, self._elastic_tables, self.fabric)
+        total = self.membrane.gradient(x)
+        return total + self.hinges.gradient(x) if self.hinges else total
+
+    @cached_property
+    def _elastic_tables(self) -> ElasticTables:
+        membrane, hinges = self.membrane, self.hinges
+        corners: Ints = hinges.corners if hinges else NO_CORNERS
+        numbers = torch.cat([hinges.stiffness, hinges.rest], dim=1) if hinges else self.mass.new_zeros(0, 2)
+        weights, areas = membrane.weights.permute(1, 2, 0).numpy(), membrane.area[:, 0].numpy()
+        return elastic_tables(len(self.mass), membrane.corners, weights, areas, corners, numbers)
 
     def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
         """Return stiffness [N/m] (V, 1) and target (V, 3, N) of the tether, inertia and drag, where present."""

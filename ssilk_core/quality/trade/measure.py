@@ -91,6 +91,7 @@ class VariantMeter:
             fps=variant.fps,
             refine=variant.refine,
             feedback=variant.feedback,
+            latents=variant.latents,
             simulated=variant.simulated,
             advanced=advanced,
         )

@@ -25,7 +25,7 @@ ERRORS = {
 }
 # Errors that compare networks; a distance is from one's own whole model.
 ACROSS_MODELS = ("total", "mean_shown_skin", "mean_intersections")
-NAMED = (WHOLE, "level", "refinement", SIMULATOR)  # sweeps whose points are all labelled
+NAMED = (WHOLE, "level", "refinement", "latents", SIMULATOR)  # sweeps whose points are all labelled
 
 
 def trade_panels(points: Sequence[TradePoint], frames: Mapping[str, int]) -> list[list[ChartPanel]]:

@@ -13,6 +13,9 @@ import torch
 from torch import Tensor
 
 from ...errors import SsilkError
+from ...network.checkpoint import network
+from ...network.latent_solver import LatentOptions, LatentRoller
+from ...network.rollout import garment_poses
 from ...network.runtime import Player
 from ...network.runtime.character import character_matrices
 from ...network.runtime.skinning import skin_garment
@@ -37,6 +40,8 @@ class ShotMethod:
         refine: solver iterations per frame; 0 for no refinement. Frames of a solver are played as a bake stores them:
             as joints and blendshapes of the shot's own, or as points where these cannot reach them.
         feedback: as in `RefineOptions`.
+        latents: how states are solved for in latents, in shots at the model's rate; None where the network takes the
+            steps.
         simulated: let the simulator compute the frames; it goes on from the network's own first two.
         advanced: called after each frame of a solver.
 
@@ -55,11 +60,13 @@ class ShotMethod:
         fps: float,
         refine: int = 0,
         feedback: bool = False,
+        latents: LatentOptions | None = None,
         simulated: bool = False,
         advanced: Callable[[], object] = lambda: None,
     ) -> None:
         self.name, self.player, self.dressed, self.take_set, self.fps = name, player, dressed, take_set, fps
         self.refiner, self.simulator, self.advanced = None, dressed.simulator if simulated else None, advanced
+        self.latents = latents
         if refine:
             options = RefineOptions(iterations=refine, feedback=feedback)
             self.refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
@@ -78,13 +85,30 @@ class ShotMethod:
     def _take(self, take: int) -> Floats:
         """Return all frames of a take, shape (N, V, 3)."""
         motion = self.take_set.takes[take].motion
-        points = self.unrefined(motion)
+        points = self._in_latents(take, self.latents) if self.latents else self.unrefined(motion)
         if self.refiner:
             points = self._stored(take, self._solved(frame.points for frame in self.refiner.frames(motion, points)))
         elif self.simulator:
             rest = self._solved(self._carried_on(self.simulator, motion, points[:GIVEN]))
             points = self._stored(take, np.concatenate([points[:GIVEN], rest]))
         return points - first_place(motion, self.dressed.scene.character.skeleton)
+
+    def _in_latents(self, take: int, options: LatentOptions) -> Floats:
+        """Return all frames (N, V, 3) of a take whose states are solved for: joints and blendshapes as they are."""
+        motion = self.take_set.takes[take].motion
+        ends: list[float] = []
+
+        def advanced() -> None:
+            ends.append(time.perf_counter())
+            self.advanced()
+
+        model = network(self.player.file).to(self.dressed.device)
+        roller = LatentRoller(model, self.dressed.fabric, options, advanced=advanced)
+        poses = tuple(garment_poses(model, motion, motion.fps, roller=roller))
+        self.solving.append(1000 * (ends[-1] - ends[0]) / (len(ends) - 1))
+        whole = self.player.deformer()
+        self.shots[take] = Decomposition(whole, poses, rms=0.0, largest=0.0, own_shapes=0, local_shapes=0)
+        return np.concatenate([deform(whole, motion, pose) for pose in poses])
 
     def _solved(self, frames: Iterator[Floats]) -> Floats:
         """Return frames (N, V, 3) that a solver computes as they are asked for; note the time of all but the first.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...network.checkpoint import ModelFile
+from ...network.latent_solver import LatentOptions
 from ...network.packing import dequantize, quantize
 from ..levels import QUALITIES
 from ..reduction import ModelSize
@@ -16,6 +17,7 @@ from ..reduction import ModelSize
 WHOLE, SIMULATOR = "as trained", "simulator"
 SHAPES, JOINTS = (0.75, 0.5, 0.25, 0.125, 0.0), (0.75, 0.5, 0.25, 0.0)  # shares of the model's numbers
 INFLUENCES, RATES, REFINED = (6, 4, 3, 2, 1), (1 / 2, 1 / 3), (1, 2)
+SOLVED = (1, 2, 4)  # iterations in latents
 
 Array = np.ndarray
 PRECISIONS: dict[str, Callable[[Array], Array]] = {
@@ -43,6 +45,7 @@ class Variant:
         fps: frame rate of the shot [1/s].
         refine: solver iterations per frame.
         feedback: refined frames look back on refined ones.
+        latents: how states are solved for in latents; None where the network takes the steps.
         simulated: the simulator computes the shot, from the network's first two states.
     """
 
@@ -53,12 +56,13 @@ class Variant:
     fps: float
     refine: int = 0
     feedback: bool = False
+    latents: LatentOptions | None = None
     simulated: bool = False
 
     @property
     def solved(self) -> bool:
         """Whether a solver makes the shot, or refines it."""
-        return self.simulated or self.refine > 0
+        return self.simulated or self.refine > 0 or self.latents is not None
 
     def in_precision(self, file: ModelFile) -> ModelFile:
         """Return a model with its parameters rounded to this precision."""
@@ -90,6 +94,9 @@ def variants(whole: ModelSize, fps: float, *, solved: bool = True) -> Iterator[V
         yield replace(base, swept="frame rate", name=f"{share * fps:g} frames/s", fps=share * fps)
     for count in REFINED if solved else ():
         yield replace(base, swept="refinement", name=f"{count} iterations", refine=count)
+    for count in SOLVED if solved else ():
+        few = LatentOptions(iterations=count, sampled=True)
+        yield replace(base, swept="latents", name=f"{count} in latents", latents=few)
     yield from _levels(base, solved=solved)
     if solved:
         yield replace(base, swept=SIMULATOR, name=SIMULATOR, simulated=True)
@@ -104,10 +111,9 @@ def other_network(whole: ModelSize, fps: float) -> Iterator[Variant]:
 
 def _levels(base: Variant, *, solved: bool) -> Iterator[Variant]:
     for level in QUALITIES.values():
-        if level.latent_iterations:
-            continue  # shots are played with numpy here, which has no solver
-        if solved or not level.refine:
+        latents = LatentOptions(iterations=level.latent_iterations) if level.latent_iterations else None
+        if solved or not (level.refine or latents):
             kept, fps = level.size.within(base.size), level.rate(base.fps)
             reduced = replace(base, swept="level", precision="int16")  # as 'ssilk reduce' writes models
-            reduced = replace(reduced, refine=level.refine, feedback=level.feedback)
+            reduced = replace(reduced, refine=level.refine, feedback=level.feedback, latents=latents)
             yield replace(reduced, name=level.name, size=kept, fps=fps)

@@ -20,6 +20,7 @@ from ssilk_core.network.latent_solver.warm_start import FrameDescriptors, networ
 from ssilk_core.network.model.decoder import limited
 from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.physics import loops
 from ssilk_core.physics.collision import SmoothedDistance, contacts
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
@@ -90,6 +91,35 @@ def test_it_decodes_as_the_model_does_and_its_jacobian_is_that_of_autograd(frame
 
     jacobian = torch.autograd.functional.jacobian(vertices, found.z)  # (3 U, N, m): frames do not mix
     torch.testing.assert_close(decoded.jacobian, jacobian.transpose(0, 1), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_loops_decode_and_add_up_forces_as_their_reference_in_double_precision(frames, kind) -> None:
+    pytest.importorskip("numba")
+    exact = frames(**KINDS[kind])
+    single = LatentShots(exact.model, CLOTH, EXACT, precision="float32")
+    decoder, potential = single.solver.decoder, single.simulator.potential
+    z, character = exact.z.float(), exact.character.float()
+    assert loops.supports(z)
+    for reach in (decoder.reach, 1e-3):  # far enough for all displacements, and for none
+        decoder.reach = exact.solver.decoder.reach = reach
+        expected, found = exact.solver.decoder.linearise(exact.z, exact.character), decoder.linearise(z, character)
+        torch.testing.assert_close(found.x.double(), expected.x, rtol=0, atol=2e-6)
+        scale = float(expected.jacobian.abs().max())
+        torch.testing.assert_close(found.jacobian.double(), expected.jacobian, rtol=0, atol=2e-5 * scale)
+        torch.testing.assert_close(decoder.positions(z, character).double(), expected.x, rtol=0, atol=2e-6)
+    x = exact.solver.decode(exact.z, exact.character, exact.inputs)
+    inputs = replace(
+        exact.inputs,
+        body=None,
+        gravity=exact.inputs.gravity.float(),
+        **{name: getattr(exact.inputs, name).float() for name in ("predicted", "advected", "skinned")},
+    )
+    energy = exact.potential.energy(x, replace(exact.inputs, body=None), None)
+    torch.testing.assert_close(potential.energy(x.float(), inputs, None).double(), energy, rtol=1e-4, atol=1e-6)
+    gradient = exact.potential.gradient(x, replace(exact.inputs, body=None), None)
+    apart = (potential.gradient(x.float(), inputs, None).double() - gradient).norm()
+    assert apart < 1e-4 * gradient.norm()
 
 
 def test_displacements_are_held_back_with_their_slopes() -> None:

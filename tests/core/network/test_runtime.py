@@ -19,6 +19,8 @@ from ssilk_core.network.parameters import parameter_shapes
 from ssilk_core.network.rollout import decode, garment_poses, roll
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.character import character_matrices
+from ssilk_core.network.runtime.decoder import NumpyDecoder
+from ssilk_core.network.runtime.playback import BLOCK
 from ssilk_core.network.runtime.stepper import SoftClamp
 from ssilk_core.network.schemes import SCHEMES
 from ssilk_core.scene.fabrics import FABRICS
@@ -241,6 +243,20 @@ def test_lost_states_rest_for_a_while_as_in_a_bake(scene, toy_model, motion):
     assert np.isfinite(mine).all() and 100 < np.abs(mine).max() < 1000
     found = np.concatenate([pose.weights for pose in player_of(model).play(motion, block=256).poses()])
     np.testing.assert_allclose(found, theirs, atol=1e-3)
+
+
+@pytest.mark.parametrize("beta", [0.9, 1.6], ids=["steady", "lost at times"])
+def test_what_s_saw_of_each_state_is_what_its_frame_shows(scene, toy_model, motion, beta, monkeypatch):
+    model = toy_model(scene, scale=0.1, latent_bound=0.0, max_latent_step=0.0).eval()
+    with torch.no_grad():
+        model.integrator.beta.fill_(beta)
+    playback, decode_again = player_of(model).play(motion), NumpyDecoder.decode
+    monkeypatch.setattr(NumpyDecoder, "decode", None)  # a second time
+    found = [playback._at(first)[0].decoded for first in range(0, FRAMES, BLOCK)]
+    expected = decode_again(playback.player.decoder, playback.rolled_spans[0].states(FRAMES))
+    for name, value in zip(("activations", "transforms"), expected):
+        shown = np.concatenate([getattr(decoded, name) for decoded in found], axis=-1)
+        np.testing.assert_allclose(shown, value, atol=1e-4)
 
 
 def test_a_motion_of_another_character_is_refused(model, scene, toy_motion):

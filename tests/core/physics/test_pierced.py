@@ -14,6 +14,7 @@ from ssilk_core.authoring.preflight.motion import buried_limbs
 from ssilk_core.physics.collision import CollisionBody, Contacts, RayCaster, limb_axes
 from ssilk_core.physics.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes, inside
 from ssilk_core.physics.collision.pierced import MARGIN, SLOPE, Piercing
+from ssilk_core.physics.collision.ray_casting import EDGE_TOLERANCE
 from ssilk_core.physics.collision.samples import vertex_samples
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.skin.covered_skin import CoveredSkin, ShownCounts
@@ -335,3 +336,18 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
     replace_planes_kernel(piercing._rest.to(DEVICE), piercing._loose.to(DEVICE), where, SLOPE, *own)
     for mine, theirs in zip(own, planes):
         assert torch.equal(mine.cpu(), theirs) and theirs[..., 1].any() and theirs[..., 0].any()
+
+
+def test_the_loop_crosses_what_the_reference_does():
+    pytest.importorskip("numba")
+    from ssilk_core.physics.loops.crossings import crossings_loop
+
+    ball, generator = trimesh.creation.icosphere(subdivisions=2, radius=0.2), torch.Generator().manual_seed(3)
+    caster = RayCaster(Mesh("/ball", ball.vertices, ball.faces), device=CPU)
+    x = torch.tensor(ball.vertices, dtype=torch.float32)[..., None] * torch.tensor([1.0, 0.7, 1.3])
+    starts, ends = 0.3 * torch.randn(2, 40, 3, 3, generator=generator)
+    ends[0] = starts[0]  # no length
+    expected, _, triangle = caster.crossings(starts, ends, x)
+    counts, last = crossings_loop(starts, ends, x, caster.faces, EDGE_TOLERANCE)
+    assert torch.equal(counts, expected) and set(counts.unique().tolist()) == {0, 1, 2}
+    assert torch.equal(last, triangle)

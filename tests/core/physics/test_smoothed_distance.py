@@ -227,6 +227,42 @@ def test_the_kernel_serves_more_frames_than_a_block_some_of_them_far_off(monkeyp
     assert (found.curvature[..., 1::3].norm(dim=(1, 2)) > 0).any()
 
 
+@pytest.mark.parametrize("listed", [False, True])
+@pytest.mark.parametrize("precision", [torch.float32, torch.float64], ids=str)
+def test_the_loop_finds_what_its_reference_does(monkeypatch, listed: bool, precision: torch.dtype) -> None:
+    """Over faces, edges and corners, on creases, inside, far away and where queries are not numbers."""
+    pytest.importorskip("numba")
+    ball, walls = trimesh.creation.icosphere(subdivisions=2, radius=0.05), fold(1.2)
+    both = trimesh.util.concatenate([walls, ball])
+    x = torch.cat([near(ball, 0.01, 40), near(walls, 0.004, 40), in_the_fold(20)[..., 0], torch.full((2, 3), 0.9)])
+    x[-1, 0] = torch.nan
+    x, body = (
+        torch.stack([x, 1.01 * x], dim=-1).to(precision),
+        body_of(both, both.copy().apply_scale([1, 1.05, 0.95])),
+    )
+    body = replace(body, points=body.points.cpu(), normals=body.normals.cpu(), faces=body.faces.cpu())
+    patches = None
+    if listed:
+        vertices = torch.arange(-1, len(body.points)).int().repeat(len(x), 1)
+        vertices[:, 0] = len(body.points)
+        faces = torch.arange(len(body.faces)).repeat(len(x), 1)
+        faces[::2, -200:] = -1
+        patches = Patches(vertices, faces)
+    found = smoothed_planes(x, body, patches=patches)
+    monkeypatch.setattr(distance.loops, "available", lambda device: False)
+    expected = smoothed_planes(x, body, patches=patches)
+    sound = x.isfinite().all(1)
+    apart = (found.distance(x) - expected.distance(x)).abs()[sound]
+    assert apart.max() < (2e-7 if precision == torch.float32 else 1e-13)
+    sure = sound & (expected.distance(x).abs() > 1e-3)  # nearer, float32 does not resolve directions
+    tolerance = 2e-3 if precision == torch.float32 else 1e-9
+    assert (found.normal - expected.normal).norm(dim=1)[sure].max() < tolerance
+    curvatures = [each.curvature.norm(dim=(1, 2)) for each in (found, expected)]
+    bent = (found.curvature - expected.curvature).norm(dim=(1, 2))[sure]
+    assert (bent <= 10 * tolerance * curvatures[1][sure] + 1e4 * tolerance).all() and curvatures[1].max() > 100
+    assert (curvatures[0][~sound] == 0).all() and (expected.distance(x)[sure] < 0).any()
+
+
 def test_only_distances_that_matter_are_searched_for() -> None:
     body = body_of(trimesh.creation.icosphere(2, 0.1))
     x, within = near(trimesh.creation.icosphere(2, 0.1), 0.06)[..., None].to(DEVICE), 0.01

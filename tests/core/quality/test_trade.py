@@ -13,6 +13,8 @@ import torch
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Progress
 from ssilk_core.network.checkpoint import model_file
+from ssilk_core.network.latent_solver import LatentOptions, LatentRoller
+from ssilk_core.network.rollout import decode, garment_poses
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.stored import StoredPlayer
 from ssilk_core.network.sampling import sample_pose
@@ -91,8 +93,18 @@ def test_one_thing_is_swept_at_a_time_and_levels_come_last():
         changed = [k for k, v in vars(variant).items() if v != vars(base)[k] and k not in ("swept", "name", "size")]
         changed += [k for k, v in vars(variant.size).items() if v != vars(whole)[k]]
         assert len(changed) == 1 or variant.swept == "level", variant
-    assert [v.name for v in tried if v.swept == "level"] == ["crowd", "game", "film", "hero"]
-    assert [v.name for v in tried if v.solved] == ["1 iterations", "2 iterations", "hero", "simulator"]
+    assert [v.name for v in tried if v.swept == "level"] == ["crowd", "game", "film", "latent", "hero"]
+    names = [
+        "1 iterations",
+        "2 iterations",
+        "1 in latents",
+        "2 in latents",
+        "4 in latents",
+        "latent",
+        "hero",
+        "simulator",
+    ]
+    assert [v.name for v in tried if v.solved] == names
     assert not any(v.solved for v in variants(whole, FPS, solved=False))
     assert [v.name for v in other_network(whole, FPS)] == ["as trained", "crowd", "game", "film"]
 
@@ -194,6 +206,29 @@ def test_the_simulator_goes_on_from_the_networks_first_two_states(meter, bench, 
     mass = dressed.energy.mass.numpy()
     away = np.sqrt(((points - network)[6] ** 2).sum(-1) @ mass / mass.sum())  # after five frames
     assert missed and missed.position_error[0] == pytest.approx(away, rel=1e-3) and away > 1e-3
+
+
+def test_states_solved_in_latents_are_played_with_the_models_own_shapes(meter, bench, model, points):
+    reducer, dressed, take_set = bench
+    variant, told = chosen(meter, "2 in latents"), []
+    method = ShotMethod(
+        variant.name, reducer.player, dressed, take_set, fps=FPS, latents=variant.latents,
+        advanced=lambda: told.append(1),
+    )  # fmt: skip
+    found, motion = method.vertices(1, range(20)), take_set.takes[1].motion
+    roller = LatentRoller(model, dressed.fabric, LatentOptions(iterations=2, sampled=True))
+    frames = [decode(model, motion, pose) for pose in garment_poses(model, motion, FPS, roller=roller)]
+    expected = np.concatenate(frames) - motion.translations[0, 0]
+    np.testing.assert_allclose(found.permute(2, 0, 1), expected, atol=1e-5)
+    network = reducer.player.play(motion)
+    assert np.abs(network.vertices(19) - motion.translations[0, 0] - expected[19]).max() > 1e-3
+    assert len(told) == 20 and len(method.solving) == 1 and method.solving[0] > 0
+    assert method.shots[1].own_shapes == 0
+
+    solved, whole = meter.point(variant), points["as trained"]
+    assert solved.solving > 0 and solved.torch is None and solved.position > 1e-4
+    shapes = reducer.player.deformer().shape_count
+    assert solved.shot_bytes == 1000 * shapes + 300 * 60 and solved.model_bytes == whole.model_bytes
 
 
 def test_takes_are_cut_to_the_first_frames_of_their_clip(bench):

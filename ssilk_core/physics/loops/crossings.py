@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where segments cross triangles; reference: `collision.ray_casting.RayCaster.crossings`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from .running import array, compiled, run_parts
+
+
+def crossings_loop(
+    starts: Tensor, ends: Tensor, x: Tensor, faces: Tensor, edge_tolerance: float
+) -> tuple[Tensor, Tensor]:
+    """Return how many triangles each segment crosses, and which is the last along it, zero without a crossing.
+
+    Args:
+        starts, ends: of the segments (P, 3, N); x: vertices (V, 3, N); faces: triangles (F, 3).
+        edge_tolerance: by how much a barycentric coordinate may be negative.
+
+    Returns:
+        Counts and indices, int64, both (P, N).
+    """
+    segments, _, frames = starts.shape
+    counts, last = torch.zeros(2, segments, frames, dtype=torch.int64).unbind()
+    given = array(starts.double()), array(ends.double()), array(x), array(faces)
+    run_parts(_crossings, segments, *given, edge_tolerance, counts.numpy(), last.numpy())
+    return counts, last
+
+
+@compiled
+def _crossings(starts, ends, x, faces, edge_tolerance, counts, last, start, stop):
+    for p in range(start, stop):
+        for n in range(starts.shape[2]):
+            ox, oy, oz = starts[p, 0, n], starts[p, 1, n], starts[p, 2, n]
+            dx, dy, dz = ends[p, 0, n] - ox, ends[p, 1, n] - oy, ends[p, 2, n] - oz
+            farthest = -1.0
+            for f in range(len(faces)):
+                i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+                sx, sy, sz = ox - x[i, 0, n], oy - x[i, 1, n], oz - x[i, 2, n]
+                ux, uy, uz = sx + x[j, 0, n] - ox, sy + x[j, 1, n] - oy, sz + x[j, 2, n] - oz
+                wx, wy, wz = sx + x[k, 0, n] - ox, sy + x[k, 1, n] - oy, sz + x[k, 2, n] - oz
+                ax, ay, az = dy * wz - dz * wy, dz * wx - dx * wz, dx * wy - dy * wx
+                tx, ty, tz = sy * uz - sz * uy, sz * ux - sx * uz, sx * uy - sy * ux
+                determinant = ux * ax + uy * ay + uz * az
+                u, v = sx * ax + sy * ay + sz * az, dx * tx + dy * ty + dz * tz
+                share = wx * tx + wy * ty + wz * tz
+                if determinant < 0:
+                    determinant, u, v, share = -determinant, -u, -v, -share
+                slack = edge_tolerance * determinant
+                inside = u >= -slack and v >= -slack and u + v <= determinant + slack
+                if inside and determinant > 0 and 0 <= share <= determinant:  # not where parallel
+                    counts[p, n] += 1
+                    if share / determinant > farthest:
+                        farthest = share / determinant
+                        last[p, n] = f
