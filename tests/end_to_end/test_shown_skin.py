@@ -97,7 +97,7 @@ def test_the_figure_is_that_of_the_written_file(folder, monkeypatch, capsys, wor
     assert main([*bake, *words]) == 0
     said, printed = read_provenance("shot.usdc")["shown_skin"], capsys.readouterr().err
     covered, shows, bare = counted("shot.usdc", SKIN_POINTS, SEED)
-    assert shows.mean() > 1e-3  # or else nothing would be compared
+    assert shows.mean() > 5e-4  # or else nothing would be compared
     few = 1 / covered  # a point may fall on either side where float32 rounds
     assert (said["covered"], said["frames"]) == (pytest.approx(covered, abs=2), FRAMES)
     assert said["mean"] == pytest.approx(shows.mean(), abs=few) and said["bare"] == pytest.approx(

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 AT_ONCE = 1 << 24  # pairs in memory before distances are compared
+MOST_CELLS = 1 << 16  # of the grid along an axis, so that cells of many frames have numbers of 64 bits
 
 
 def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tensor) -> Tensor:
@@ -15,16 +16,15 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
     The cost grows with the number of points times the pairs within the largest reach.
 
     Args:
-        points, others: positions [m], shapes (A, 3, N) and (B, 3, N).
+        points, others: finite positions [m], shapes (A, 3, N) and (B, 3, N).
         reach, other_reach: of each [m], shapes (A,) and (B,).
 
     Returns:
         Frame, point and other of each pair, shape (3, P).
     """
-    frames = points.shape[-1]
-    size = float(reach.max() + other_reach.max())
     low = torch.minimum(points.amin((0, 2)), others.amin((0, 2)))
     span = torch.maximum(points.amax((0, 2)), others.amax((0, 2))) - low
+    size = max(float(reach.max() + other_reach.max()), float(span.max()) / MOST_CELLS)
     cells = (span / size).long() + 3  # an empty layer of cells on each side
     own, theirs = (_cells(x, low, size, cells) for x in (points, others))
     key, order = theirs.flatten().sort(stable=True)
@@ -50,7 +50,6 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
         first = last
     pairs = torch.cat(found, dim=1)
     keys = (pairs[0] * len(points) + pairs[1]) * len(others) + pairs[2]
-    assert frames * len(points) * len(others) < 2**63
     return pairs[:, keys.argsort()]
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...errors import fail
 from ...scene.assets import LOOSE, Scene
 from ...scene.fabrics import Fabric
 from ...scene.mesh import topology
@@ -149,6 +150,8 @@ class SelfContact:
 
     def neighbours(self, last: Tensor, at: Tensor, before: ClothNeighbours | None = None) -> ClothNeighbours:
         """Return what may touch around positions `at`, on the sides of the positions `last`, or older ones."""
+        if not bool(at.isfinite().all()):
+            fail("simulation", "positions that are not finite", "cloth cannot be kept apart from cloth there")
         reach = self.reach
         vertices = torch.full_like(self._vertex_area, reach)
         frame, vertex, face = near_pairs(at, vertices, at[self.faces].mean(1), self._face_reach)
