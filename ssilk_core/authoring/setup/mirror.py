@@ -20,7 +20,11 @@ from ...scene.mesh.topology import edge_use, edges
 
 SAME = 1e-5  # [m] between a vertex and the image of its twin
 LEFT, RIGHT = "_L", "_R"  # USD has no dots in names; Blender flips these too
-_LEFT_NAME, _RIGHT_NAME = (re.compile(rf"{word}|(^|[._\- ]){word[0]}($|[._\- ])", re.I) for word in ("left", "right"))
+# "left_arm", "LeftArm", "arm.L", "l_arm" and "LArm", but neither "cleft" nor "Lip".
+_LEFT_NAME, _RIGHT_NAME = (
+    re.compile(rf"(?<![A-Za-z]){low}|{low.title()}|(^|[._\- ])[{low[0]}{low[0].upper()}]($|[._\- ]|(?=[A-Z][a-z]))")
+    for low in ("left", "right")
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ which they turn, but for the Hessian's part that turning makes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,8 +27,8 @@ class ClothContacts:
 
     Attributes:
         law: how pressure depends on the gap, which is measured from each pair's own start.
-        reach: distance within which all pairs are known [m].
         frames: number N.
+        known: how far apart pairs are at least that are not known [m], shape (N,).
         frame: of each contact, shape (P,).
         vertices: shape (4, P).
         coefficients: c_i, shape (4, P).
@@ -39,8 +39,8 @@ class ClothContacts:
     """
 
     law: ContactLaw
-    reach: float
     frames: int
+    known: Tensor
     frame: Tensor
     vertices: Tensor
     coefficients: Tensor
@@ -94,26 +94,28 @@ class ClothContacts:
     def without_passing(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
         """Return a step (V, 3, N) from x in which no cloth passes through cloth: some vertices are slowed.
 
-        A step is first cut to the distance within which pairs are known.
+        A step is first cut so short that pairs which are not known cannot meet, whatever the whole garment does.
 
         Args:
             yielding: as in `allowed`.
         """
-        longest = step.norm(dim=1).amax(0).clamp_min(TINY)
-        step = step * (self.reach / longest).clamp_max(1)
+        longest = (step - step.mean(0)).norm(dim=1).amax(0).clamp_min(TINY)
+        step = step * (0.5 * CLOSING * self.known / longest).clamp_max(1)
+        done = torch.zeros_like(longest, dtype=torch.bool)
         for _ in range(SLOWED):
             share = self.allowed(x, step, yielding)
-            step = share[:, None] * step
-            if bool((share > UNSLOWED).all()):
+            step = torch.where(done, step, share[:, None] * step)
+            done = done | (share > UNSLOWED).all(0)
+            if bool(done.all()):
                 return step
-        return self.allowed(x, step, yielding).amin(0) * step
+        return torch.where(done, step, self.allowed(x, step, yielding).amin(0) * step)
 
     def select(self, frames: Tensor) -> ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""
         place = torch.full((self.frames,), -1, device=self.frame.device)
         place[frames] = torch.arange(len(frames), device=place.device)
         new = place[self.frame]
-        return self._kept(new >= 0, new, len(frames))
+        return replace(self._kept(new >= 0, new, len(frames)), known=self.known[frames])
 
     def pressing(self, x: Tensor) -> ClothContacts:
         """Return those that have an energy."""
@@ -121,7 +123,7 @@ class ClothContacts:
 
     def _kept(self, kept: Tensor, frame: Tensor, frames: int) -> ClothContacts:
         rows = (frame, self.vertices, self.coefficients, self.second, self.direction, self.start, self.area)
-        return ClothContacts(self.law, self.reach, frames, *(part[..., kept] for part in rows))
+        return ClothContacts(self.law, frames, self.known, *(part[..., kept] for part in rows))
 
     def _relative(self, x: Tensor) -> Tensor:
         """Return the gaps as the law counts them."""

@@ -27,7 +27,8 @@ from .contacts import ClothContacts
 from .neighbours import near_pairs
 from .pairs import Separations, between_edges, over_faces
 
-REACH = 0.01  # [m] beyond the contact distance, within which pairs are known
+REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
+TRIED, MOVED = 0.5, 0.1  # of that, by which vertices may be elsewhere where positions are tried, and moved to
 STRETCH = 1.3  # by which faces and edges may be longer than at rest
 CLOSER = 0.7  # of the distance at rest: pairs that are nearer there touch at this, as along seams and slits
 VERTEX_SHARE = 0.5  # of a vertex's area: both of two layers count
@@ -168,18 +169,21 @@ class SelfContact:
             last, at, faces, self._sided(between_edges, last, at, *pairs, before.edges if before else None)
         )
 
-    def around(self, x: Tensor, known: ClothNeighbours) -> ClothNeighbours:
-        """Return what may touch around positions x: what is known, as long as they are near."""
-        moved = x - known.at
-        apart = (moved - moved.mean(0)).square().sum(1).amax().sqrt()  # what all move alike brings none together
-        return known if apart < 0.5 * REACH else self.neighbours(known.last, x, known)
+    def around(self, x: Tensor, known: ClothNeighbours, allowance: float = TRIED) -> ClothNeighbours:
+        """Return what may touch around positions x: what is known, in frames where vertices are near enough."""
+        stale = ~(_drift(x, known) <= allowance * REACH)
+        if not bool(stale.any()):
+            return known
+        old, new = (~stale).nonzero()[:, 0], stale.nonzero()[:, 0]
+        again = self.neighbours(known.last[..., new], x[..., new], known.select(new))
+        return ClothNeighbours.joined([(old, known.select(old)), (new, again)]) if len(old) else again
 
     def moved(self, x: Tensor, known: ClothNeighbours) -> ClothNeighbours:
         """Return what may touch after the garment has moved to positions x, with the sides there.
 
         What lies further on the wrong side than contact begins belongs there from now on.
         """
-        known = self.around(x, known)
+        known = self.around(x, known, MOVED)
 
         def there(shape: Shape, pairs: KnownPairs) -> KnownPairs:
             now = shape(self._corners(shape, x, pairs))
@@ -194,7 +198,8 @@ class SelfContact:
         parts = [self._part(over_faces, x, known.faces), self._part(between_edges, x, known.edges)]
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
-        return ClothContacts(self.law, self.reach, x.shape[-1], *(part[..., order] for part in joined))
+        unknown = self.reach - 2 * _drift(x, known)
+        return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in joined))
 
     def _vertices(self, shape: Shape, pairs: KnownPairs) -> Tensor:
         """Return the vertices of each pair, shape (4, P)."""
@@ -239,6 +244,15 @@ class SelfContact:
             area = torch.minimum(self._edge_area[pairs.first], self._edge_area[pairs.second])
         moving = now.coefficients[:, kept], second.expand_as(vertices), direction[:, kept]
         return pairs.frame, vertices, *moving, pairs.start, area
+
+
+def _drift(x: Tensor, known: ClothNeighbours) -> Tensor:
+    """Return how far from where pairs are known a vertex of each frame is at most [m], shape (N,).
+
+    What all move alike counts for nothing: it brings none together.
+    """
+    away = x - known.at
+    return (away - away.mean(0)).norm(dim=1).amax(0)
 
 
 def _radii(corners: np.ndarray) -> np.ndarray:

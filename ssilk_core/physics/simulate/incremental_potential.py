@@ -34,7 +34,7 @@ from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
 
-ROUNDS, ARRIVED = 16, 1e-3  # in which a garment goes towards a target, and how near it comes there [m]
+ROUNDS, ARRIVED = 24, 1e-3  # in which a garment goes towards a target, and how near it comes there [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +161,14 @@ class IncrementalPotential:
         """
         inputs = replace(inputs, neighbours=self.self_contact.neighbours(x, x, known))
         inputs = self.with_contacts(x, inputs, moved=True)
+        arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
         for _ in range(ROUNDS):
             assert inputs.contacts is not None
             step = inputs.contacts.without_passing(x, target - x)
-            if bool(step.square().sum(1).max() < ARRIVED**2):
+            arrived = arrived | (step.norm(dim=1).amax(0) < ARRIVED)
+            if bool(arrived.all()):
                 break
-            x = x + step
+            x = torch.where(arrived, x, x + step)
             inputs = self.with_contacts(x, inputs, moved=True)
         return x, inputs
 

@@ -184,6 +184,34 @@ def test_no_step_passes_through_folds(scene, toy_grid):
     torch.testing.assert_close(touching.without_passing(x, alike), alike)
 
 
+def test_layers_that_are_not_known_to_be_near_do_not_meet_in_a_step(layers):
+    _, contact = layers
+    x = stacked(contact.reach + 1e-3)
+    x[4:, 1] += 0.1
+    touching = contact.contacts(x, contact.neighbours(x, x))
+    step = torch.zeros_like(x)
+    step[:3, 1], step[3:, 1] = 0.05, -0.05
+    held = touching.without_passing(x, step)
+    assert not len(touching.frame)
+    assert 1e-3 < float((held[0] - held[3])[1, 0]) < contact.reach
+
+
+def test_a_garment_goes_its_way_alike_beside_others(scene, toy_grid):
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    potential = IncrementalPotential(
+        dressed(scene, points, faces, np.zeros(len(points), dtype=bool)), FABRIC, device=CPU
+    )
+    _, x, _ = crumpled(toy_grid, scene, 2)
+    target = x + torch.tensor([0.002, 0.03], dtype=torch.float64) * (random(*x.shape[:2], 1, seed=3) - 0.5)
+    inputs = StepInputs(None, torch.zeros(3, 2, dtype=torch.float64))
+    together, _ = potential.approach(x, target, inputs, None)
+    for n in range(2):
+        alone, _ = potential.approach(
+            x[..., n : n + 1], target[..., n : n + 1], inputs.select(torch.tensor([n])), None
+        )
+        torch.testing.assert_close(together[..., n : n + 1], alone, rtol=0, atol=1e-12)
+
+
 def test_frames_are_independent(scene, toy_grid):
     contact, x, _ = crumpled(toy_grid, scene, 3)
     x = x + 0.002 * random(*x.shape, seed=9)
@@ -212,7 +240,8 @@ def random_contacts(vertices: int, count: int, frames_of: int) -> ClothContacts:
     law = ContactLaw(1e5, 5.0, 4e-3)
     second = torch.tensor([[False], [True], [True], [True]]).expand(4, count)
     start, area = torch.full((count,), 5.0, dtype=torch.float64), 1e-4 * random(count, seed=5)
-    return ClothContacts(law, 0.01, frames_of, frame, corners, coefficients, second, direction, start, area)
+    known = torch.full((frames_of,), 0.01, dtype=torch.float64)
+    return ClothContacts(law, frames_of, known, frame, corners, coefficients, second, direction, start, area)
 
 
 @pytest.mark.parametrize("frames_of", [1, 3])
