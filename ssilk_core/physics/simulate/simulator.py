@@ -31,7 +31,7 @@ from .newton import Solution, SolverOptions, minimise_from
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
 POSES = 16  # between the bind pose and the first one
-ON_THE_WAY = SolverOptions(iterations=10)  # to each of these
+ON_THE_WAY = 10  # iterations for each of these
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,11 +221,12 @@ class Simulator:
         turned, placed = bind_pose(self.poser.skeleton)
         start = self.poser.pose(np.broadcast_to(turned, first[0].shape), np.broadcast_to(placed, first[1].shape))
         x, lbs, known = start.lbs, start.lbs, None
+        solver = replace(self.options.quasi_static_solver, iterations=ON_THE_WAY)
         for share in np.arange(1, POSES + 1) / POSES:
             between = self.poser.pose(slerp(turned, first[0], share), (1 - share) * placed + share * first[1])
             inputs = self.inputs(between, None)
             x, inputs = self.potential.approach(x, x + between.lbs - lbs, inputs, known)
-            found = minimise_from(self.potential, self.apply_pins(x, between), inputs, ON_THE_WAY)
+            found = minimise_from(self.potential, self.apply_pins(x, between), inputs, solver)
             x, lbs, known = found.x, between.lbs, found.neighbours
         return self.apply_pins(x, poses), known
 

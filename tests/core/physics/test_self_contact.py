@@ -291,13 +291,13 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
 
 
 def twisted(potential: IncrementalPotential, points: np.ndarray, pinned: np.ndarray, apart: bool) -> list[np.ndarray]:
-    """A sheet whose upper edge turns by 30 degrees in each frame and shrinks, so that it becomes a rope."""
+    """A sheet whose upper edge turns by 40 degrees in each frame and shrinks, so that it becomes a rope."""
     down = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
     pins = torch.as_tensor(np.flatnonzero(pinned))
     x = frames(points) + 1e-3 * (random(*points.shape, 1) - 0.5) * frames(~pinned[:, None])
     before, known, found = x, None, []
-    for frame in range(12):
-        angle, width = np.deg2rad(30 * (frame + 1)), 1 - 0.6 * min(1, (frame + 1) / 8)
+    for frame in range(10):
+        angle, width = np.deg2rad(40 * (frame + 1)), 1 - 0.6 * min(1, (frame + 1) / 8)
         edge = points[pinned][:, :1] * width * np.array([np.cos(angle), 0, np.sin(angle)])
         inputs = StepInputs(None, down, 2 * x - before, x, 1 / 30)
         start = (2 * x - before).index_copy(0, pins, frames(edge))
@@ -311,13 +311,13 @@ def twisted(potential: IncrementalPotential, points: np.ndarray, pinned: np.ndar
 
 
 def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
-    points, faces = toy_grid(10, 10, height=0.5, width=0.5)
+    points, faces = toy_grid(8, 8, height=0.5, width=0.5)
     pinned = points[:, 1] > -1e-9
     potential = IncrementalPotential(dressed(scene, points, faces, pinned), FABRIC, device=CPU)
     through = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=False)]
     apart = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=True)]
     assert sum(through) > 10
-    assert apart == [0] * 12
+    assert apart == [0] * 10
 
 
 def test_shots_of_different_lengths_go_on_with_it(scene, toy_motion):
