@@ -34,8 +34,6 @@ CLOSER = 0.7  # of the distance at rest: pairs that are nearer there touch at th
 VERTEX_SHARE = 0.5  # of a vertex's area: both of two layers count
 EDGE_SHARE = 0.25  # of an edge's area: it makes the smaller part of the pressure of two layers
 
-Shape = Callable[[Tensor], Separations]
-
 
 @dataclass(frozen=True, eq=False)
 class KnownPairs:
@@ -122,6 +120,57 @@ class ClothNeighbours:
         return self.select(torch.arange(frames, device=self.at.device))
 
 
+@dataclass(frozen=True, eq=False)
+class PairKind:
+    """A kind of pair: vertices and faces, or edges and edges.
+
+    Attributes:
+        measure: returns the separations of pairs from the positions of their vertices (4, 3, P).
+        first, second: vertices of what comes first in a pair, and second, shapes (A, a) and (B, b) with a + b = 4;
+            the same tensor where both are of one sort.
+        first_reach, second_reach: distance of vertices from the middle, at most [m], shapes (A,) and (B,).
+        first_area, second_area: of which the smaller one counts for a pair [m2], shapes (A,) and (B,).
+    """
+
+    measure: Callable[[Tensor], Separations]
+    first: Tensor
+    second: Tensor
+    first_reach: Tensor
+    second_reach: Tensor
+    first_area: Tensor
+    second_area: Tensor
+
+    def near(self, at: Tensor, reach: float) -> KnownPairs:
+        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0."""
+        middles = at[self.first].mean(1), at[self.second].mean(1)
+        frame, first, second = near_pairs(middles[0], self.first_reach + reach, middles[1], self.second_reach)
+        apart = (self.first[first][:, :, None] != self.second[second][:, None]).flatten(1).all(1)
+        if self.first is self.second:
+            apart &= first < second
+        none = at.new_zeros(len(frame))
+        return KnownPairs(frame, first, second, none, none).kept(apart)
+
+    def vertices(self, pairs: KnownPairs) -> Tensor:
+        """Return the vertices of each pair, shape (4, P)."""
+        return torch.cat([self.first[pairs.first].T, self.second[pairs.second].T])
+
+    def at(self, x: Tensor, pairs: KnownPairs) -> Separations:
+        """Return how pairs are separated at positions (V, 3, N), or at (V, 3, 1) for all frames."""
+        frame = pairs.frame if x.shape[-1] > 1 else torch.zeros_like(pairs.frame)
+        return self.measure(x[self.vertices(pairs), :, frame].movedim(-1, 1))
+
+    def contacts(self, x: Tensor, pairs: KnownPairs) -> tuple[Tensor, ...]:
+        """Return the frames, and what `ClothContacts` holds of pairs that touch or nearly do at positions x."""
+        now = self.at(x, pairs)
+        gap, direction = now.gaps(pairs.side)
+        kept = gap < pairs.start + REACH
+        pairs = pairs.kept(kept)
+        vertices = self.vertices(pairs)
+        second = (torch.arange(4, device=x.device) >= self.first.shape[1])[:, None].expand_as(vertices)
+        area = torch.minimum(self.first_area[pairs.first], self.second_area[pairs.second])
+        return pairs.frame, vertices, now.coefficients[:, kept], second, direction[:, kept], pairs.start, area
+
+
 class SelfContact:
     """Contact of a garment with itself; positions are (V, 3, N).
 
@@ -141,33 +190,30 @@ class SelfContact:
         self.law = ContactLaw(fabric.loose_contact, fabric.thickness + gap, gap)
         self.reach = self.law.start + REACH
         self.rest = tensor(points)[:, :, None]
-        self.faces, self.edges = tensor(faces, torch.long), tensor(edges, torch.long)
         self._loose = tensor(scene.classes == LOOSE, torch.bool)
-        self._face_reach, self._edge_reach = (tensor(STRETCH * _radii(points[part])) for part in (faces, edges))
-        areas = topology.face_areas(points, faces)
         own = np.searchsorted(topology.edge_keys(edges), topology.edge_keys(half))
-        self._vertex_area = VERTEX_SHARE * tensor(topology.vertex_areas(points, faces))
-        self._edge_area = EDGE_SHARE * tensor(np.bincount(own, np.repeat(areas / 3, 3), len(edges)))
+        of_edges = np.bincount(own, np.repeat(topology.face_areas(points, faces) / 3, 3), len(edges))
+        vertices, corners, ends = (
+            tensor(rows, torch.long) for rows in (np.arange(len(points))[:, None], faces, edges)
+        )
+        reach, area = tensor(STRETCH * _radii(points[edges])), EDGE_SHARE * tensor(of_edges)
+        self._faces = PairKind(
+            over_faces,
+            vertices,
+            corners,
+            tensor(np.zeros(len(points))),
+            tensor(STRETCH * _radii(points[faces])),
+            VERTEX_SHARE * tensor(topology.vertex_areas(points, faces)),
+            tensor(np.full(len(faces), np.inf)),
+        )
+        self._edges = PairKind(between_edges, ends, ends, reach, reach, area, area)
 
     def neighbours(self, last: Tensor, at: Tensor, before: ClothNeighbours | None = None) -> ClothNeighbours:
         """Return what may touch around positions `at`, on the sides of the positions `last`, or older ones."""
         if not bool(at.isfinite().all()):
             fail("simulation", "positions that are not finite", "cloth cannot be kept apart from cloth there")
-        reach = self.reach
-        vertices = torch.full_like(self._vertex_area, reach)
-        frame, vertex, face = near_pairs(at, vertices, at[self.faces].mean(1), self._face_reach)
-        apart = (vertex != self.faces[face].T).all(0)
-        faces = self._sided(
-            over_faces, last, at, frame[apart], vertex[apart], face[apart], before.faces if before else None
-        )
-        middle = at[self.edges].mean(1)
-        frame, first, second = near_pairs(middle, self._edge_reach + reach, middle, self._edge_reach)
-        shared = self.edges[first][:, :, None] == self.edges[second][:, None]
-        apart = (first < second) & ~shared.flatten(1).any(1)
-        pairs = frame[apart], first[apart], second[apart]
-        return ClothNeighbours(
-            last, at, faces, self._sided(between_edges, last, at, *pairs, before.edges if before else None)
-        )
+        faces = self._sided(self._faces, last, at, before.faces if before else None)
+        return ClothNeighbours(last, at, faces, self._sided(self._edges, last, at, before.edges if before else None))
 
     def around(self, x: Tensor, known: ClothNeighbours, allowance: float = TRIED) -> ClothNeighbours:
         """Return what may touch around positions x: what is known, in frames where vertices are near enough."""
@@ -185,65 +231,32 @@ class SelfContact:
         """
         known = self.around(x, known, MOVED)
 
-        def there(shape: Shape, pairs: KnownPairs) -> KnownPairs:
-            now = shape(self._corners(shape, x, pairs))
+        def there(kind: PairKind, pairs: KnownPairs) -> KnownPairs:
+            now = kind.at(x, pairs)
             away = pairs.side * now.height < -self.law.start
             side = torch.where((pairs.side == 0) | away, now.height.sign(), pairs.side)
             return replace(pairs, side=torch.where(now.facing, side, 0))
 
-        return ClothNeighbours(x, known.at, there(over_faces, known.faces), there(between_edges, known.edges))
+        return ClothNeighbours(x, known.at, there(self._faces, known.faces), there(self._edges, known.edges))
 
     def contacts(self, x: Tensor, known: ClothNeighbours) -> ClothContacts:
         """Return the contacts at positions x, among pairs that are known around them."""
-        parts = [self._part(over_faces, x, known.faces), self._part(between_edges, x, known.edges)]
+        parts = self._faces.contacts(x, known.faces), self._edges.contacts(x, known.edges)
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
         unknown = self.reach - 2 * _drift(x, known)
         return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in joined))
 
-    def _vertices(self, shape: Shape, pairs: KnownPairs) -> Tensor:
-        """Return the vertices of each pair, shape (4, P)."""
-        first = pairs.first[None] if shape is over_faces else self.edges[pairs.first].T
-        second = self.faces if shape is over_faces else self.edges
-        return torch.cat([first, second[pairs.second].T])
-
-    def _corners(self, shape: Shape, x: Tensor, pairs: KnownPairs) -> Tensor:
-        frame = pairs.frame if x.shape[-1] > 1 else torch.zeros_like(pairs.frame)
-        return x[self._vertices(shape, pairs), :, frame].movedim(-1, 1)
-
-    def _sided(
-        self,
-        shape: Shape,
-        last: Tensor,
-        at: Tensor,
-        frame: Tensor,
-        first: Tensor,
-        second: Tensor,
-        before: KnownPairs | None,
-    ) -> KnownPairs:
-        none = at.new_zeros(frame.shape)
-        pairs = KnownPairs(frame, first, second, none, none)
-        pairs = pairs.kept(self._loose[self._vertices(shape, pairs)].any(0))
-        pairs = pairs.kept(shape(self._corners(shape, at, pairs)).distance < self.reach)
-        at_rest = shape(self._corners(shape, self.rest, pairs)).distance
-        pairs = replace(pairs, start=(CLOSER * at_rest).clamp_max(self.law.start))
-        then = shape(self._corners(shape, last, pairs))
+    def _sided(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
+        """Return the pairs of a kind that `neighbours` tells of."""
+        pairs = kind.near(at, self.reach)
+        pairs = pairs.kept(self._loose[kind.vertices(pairs)].any(0))
+        pairs = pairs.kept(kind.at(at, pairs).distance < self.reach)
+        start = (CLOSER * kind.at(self.rest, pairs).distance).clamp_max(self.law.start)
+        then = kind.at(last, pairs)
         side = torch.where(then.facing, then.height.sign(), 0)
         older = torch.zeros_like(side) if before is None else before.sides_of(pairs)
-        return replace(pairs, side=torch.where(older == 0, side, older))
-
-    def _part(self, shape: Shape, x: Tensor, pairs: KnownPairs) -> tuple[Tensor, ...]:
-        now = shape(self._corners(shape, x, pairs))
-        gap, direction = now.gaps(pairs.side)
-        kept = gap < pairs.start + REACH
-        pairs, vertices = pairs.kept(kept), self._vertices(shape, pairs)[:, kept]
-        second = torch.arange(4, device=x.device)[:, None] >= (1 if shape is over_faces else 2)
-        if shape is over_faces:
-            area = self._vertex_area[pairs.first]
-        else:
-            area = torch.minimum(self._edge_area[pairs.first], self._edge_area[pairs.second])
-        moving = now.coefficients[:, kept], second.expand_as(vertices), direction[:, kept]
-        return pairs.frame, vertices, *moving, pairs.start, area
+        return replace(pairs, start=start, side=torch.where(older == 0, side, older))
 
 
 def _drift(x: Tensor, known: ClothNeighbours) -> Tensor:
