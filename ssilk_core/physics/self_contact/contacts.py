@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from ..energy.collision import ContactLaw
+from .neighbours import places_among
 
 CLOSING = 0.8  # of a gap, by which it may close in one step
 SLACK = 0.2  # of what pairs begin to touch later than others: these lie near each other at rest, as along seams
@@ -112,9 +113,7 @@ class ClothContacts:
 
     def select(self, frames: Tensor) -> ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""
-        place = torch.full((self.frames,), -1, device=self.frame.device)
-        place[frames] = torch.arange(len(frames), device=place.device)
-        new = place[self.frame]
+        new = places_among(self.frame, frames, self.frames)
         return replace(self._kept(new >= 0, new, len(frames)), known=self.known[frames])
 
     def pressing(self, x: Tensor) -> ClothContacts:

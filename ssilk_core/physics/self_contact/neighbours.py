@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of points that lie near each other, frame by frame, found in a grid."""
+"""Pairs of points that lie near each other, frame by frame, found in a grid; and pairs of some frames alone."""
 
 from __future__ import annotations
 
@@ -51,6 +51,17 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
     pairs = torch.cat(found, dim=1)
     keys = (pairs[0] * len(points) + pairs[1]) * len(others) + pairs[2]
     return pairs[:, keys.argsort()]
+
+
+def places_among(frame: Tensor, frames: Tensor, count: int) -> Tensor:
+    """Return where the frame of each pair (P,) is among frames with indices (M,), -1 where it is not, shape (P,).
+
+    Args:
+        count: of all frames.
+    """
+    place = torch.full((count,), -1, device=frame.device)
+    place[frames] = torch.arange(len(frames), device=frame.device)
+    return place[frame]
 
 
 def _cells(x: Tensor, low: Tensor, size: float, cells: Tensor) -> Tensor:

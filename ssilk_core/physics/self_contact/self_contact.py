@@ -24,7 +24,7 @@ from ...scene.fabrics import Fabric
 from ...scene.mesh import topology
 from ..energy.collision import ContactLaw
 from .contacts import ClothContacts
-from .neighbours import near_pairs
+from .neighbours import near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
 
 REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
@@ -59,9 +59,7 @@ class KnownPairs:
 
     def select(self, frames: Tensor, count: int) -> KnownPairs:
         """Return those in the frames with indices (M,), in ascending order, of a number of frames."""
-        place = torch.full((count,), -1, device=frames.device)
-        place[frames] = torch.arange(len(frames), device=frames.device)
-        new = place[self.frame]
+        new = places_among(self.frame, frames, count)
         return self.kept(new >= 0, new)
 
     def sides_of(self, other: KnownPairs) -> Tensor:
