@@ -3,13 +3,12 @@
 
 A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
 error is, and what happens: it works, falls back to rest, or is refused with a sentence. The exit code is 3 where
-anything else happens.
+anything else happens. --output writes each case when it has run; the same command, given again, goes on from there.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,6 +18,7 @@ from ..events import Countdown, Message, Reporter, Result, Started
 from .options import check_output
 
 if TYPE_CHECKING:
+    from ..quality.kept_rows import KeptRows
     from ..quality.stress.outcome import CaseOutcome
     from ..quality.stress.subject import StressSubject
 
@@ -44,7 +44,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
-    """Run the cases and tabulate them."""
+    """Run the cases, each kept when it has run, and tabulate them."""
     from ..quality.stress.cases import CASES
     from ..quality.stress.outcome import markdown
 
@@ -58,19 +58,31 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             "'ssilk stress --help' names the option",
             f"groups are {', '.join(dict.fromkeys(case.group for case in CASES))}",
         )
-    report(Started("stress", len(cases)))
-    found, faults, told = [], [], Countdown(len(cases), report)
-    for case in cases:
-        outcome = case.run(subject)
-        found.append(outcome)
-        if outcome.verdict not in case.allowed:
-            faults.append(f"{case.group}: {case.name}")
-            report(Message(f"{faults[-1]} {outcome.verdict}: {outcome.said}", "warning"))
-        told()
-    report(Message(markdown(found)))
-    if options.output:
-        _write(options, found)
-    report(Result("stress", {"cases": len(found), "faults": ", ".join(faults) or "none"}))
+    kept = _kept(options)
+    found = {(outcome.group, outcome.name): outcome for outcome in kept.known(report)}
+    missing = [case for case in cases if (case.group, case.name) not in found]
+    report(Started("stress", len(missing)))
+    told = Countdown(len(missing), report)
+
+    def write(*, finished: bool) -> None:
+        rows = [asdict(found[case.group, case.name]) for case in CASES if (case.group, case.name) in found]
+        kept.write({"model": options.model.name}, rows, finished=finished)
+
+    try:
+        for case in missing:
+            outcome = found[case.group, case.name] = case.run(subject)
+            if outcome.verdict not in case.allowed:
+                report(Message(f"{case.label} {outcome.verdict}: {outcome.said}", "warning"))
+            write(finished=False)
+            told()
+    except KeyboardInterrupt:
+        kept.tell_kept(len(found), report)
+        raise
+    write(finished=True)
+    outcomes = [found[case.group, case.name] for case in cases]
+    faults = [case.label for case, outcome in zip(cases, outcomes) if outcome.verdict not in case.allowed]
+    report(Message(markdown(outcomes)))
+    report(Result("stress", {"cases": len(outcomes), "faults": ", ".join(faults) or "none"}))
     return EXIT_VERIFICATION if faults else EXIT_OK
 
 
@@ -89,19 +101,22 @@ def _subject(options: argparse.Namespace) -> StressSubject:
     return StressSubject(file, scene, clip, QUICK if options.quick else FULL)
 
 
-def _write(options: argparse.Namespace, outcomes: list[CaseOutcome]) -> None:
-    from .. import __version__
-    from ..devices import device_name, select_device
-    from ..events import finite
-    from ..files import replacing, sha256
+def _kept(options: argparse.Namespace) -> KeptRows[CaseOutcome]:
+    """Return where the outcomes are kept."""
+    from ..quality.kept_rows import KeptRows
+    from ..quality.stress.outcome import CaseOutcome
+    from ._measured import measured_inputs
 
-    document: dict[str, Any] = {
-        "ssilk": __version__,
-        "model": options.model.name,
-        "model_sha256": sha256(options.model),
-        "hardware": device_name(select_device("cpu")),
-        "quick": options.quick,
-        "outcomes": [asdict(outcome) for outcome in outcomes],
-    }
-    with replacing(options.output) as temporary:
-        temporary.write_text(json.dumps(finite(document), indent=1, allow_nan=False) + "\n")
+    inputs: dict[str, Any] = {}
+    if options.output:
+        clips = {"motion": options.motion} if options.motion else {}
+        inputs = measured_inputs(models=[options.model], stage=options.stage, clips=clips, device="cpu", others={})
+        inputs |= {"root": options.root, "quick": options.quick}
+    return KeptRows(
+        path=options.output,
+        verb="stress",
+        kind=CaseOutcome,
+        names=("group", "name"),
+        inputs=inputs,
+        rows_at="outcomes",
+    )

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 
@@ -54,7 +54,7 @@ def _types(kind: type) -> dict[str, Any]:
 
 
 def _value(kind: Any, name: str, value: object, figures: bool) -> Any:
-    """Return a plain value as `kind`: a dataclass, a tuple or dictionary of one type, a union, or a plain type."""
+    """Return a plain value as `kind`: a dataclass, a tuple or dictionary, a union, a literal, or a plain type."""
     if get_origin(kind) is UnionType:
         if value is None and type(None) in get_args(kind):
             return None
@@ -67,6 +67,9 @@ def _value(kind: Any, name: str, value: object, figures: bool) -> Any:
         return _dataclass(kind, f"{name}.", value, figures)  # type: ignore[arg-type]
     if value is None and kind is float and figures:
         return math.nan
-    if isinstance(value, kind if kind is not float else (int, float)) and isinstance(value, bool) == (kind is bool):
+    if get_origin(kind) is Literal:
+        if value in get_args(kind):
+            return value
+    elif isinstance(value, kind if kind is not float else (int, float)) and isinstance(value, bool) == (kind is bool):
         return value
     raise TypeError(f"{name!r} is {str(value)[:40]!r}")

@@ -15,12 +15,39 @@ def test_figures_of_every_case_that_was_asked_for(toy, tmp_path, capsys):
     assert stress(toy, "--only", "motion: NaN", "upside", "precision: float16", "-o", str(tmp_path / "out.json")) == 0
     document = json.loads((tmp_path / "out.json").read_text())
     found = {outcome["name"]: outcome for outcome in document["outcomes"]}
-    assert len(found) == 3 and document["quick"] and len(document["model_sha256"]) == 64
+    assert len(found) == 3 and document["inputs"]["quick"] and document["model"] == "model.safetensors"
     assert found["NaN in frame 7"]["verdict"] == "refuses"
     assert found["upside down"]["measured"]["extent"]["finite"]
     assert 0 < found["float16"]["measured"]["error"] < 0.2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("| motion: ")]
     assert len(lines) == 2
+
+
+def test_an_interrupted_run_goes_on(toy, tmp_path, capsys, monkeypatch):
+    from ssilk_core.quality.stress.cases import Case
+
+    output, run, ran = tmp_path / "out.json", Case.run, []
+
+    def interrupted(case, subject):
+        if len(ran) == 1:
+            raise KeyboardInterrupt
+        ran.append(case.label)
+        return run(case, subject)
+
+    words = ("--only", "motion: NaN", "upside", "-o", str(output))
+    with monkeypatch.context() as patch:
+        patch.setattr(Case, "run", interrupted)
+        assert stress(toy, *words) == 130
+    before = json.loads(output.read_text())
+    assert "unfinished" in before and [row["name"] for row in before["outcomes"]] == ["upside down"]
+    assert "1 rows are kept" in capsys.readouterr().err
+    assert stress(toy, *words) == 0
+    after = json.loads(output.read_text())
+    assert "unfinished" not in after and after["outcomes"][0] == before["outcomes"][0]
+    assert [row["name"] for row in after["outcomes"]] == ["upside down", "NaN in frame 7"]
+    assert "the others are measured" in capsys.readouterr().err
+    assert stress(toy, "--only", "precision: float64", "-o", str(output)) == 0  # other cases join those in the file
+    assert len(json.loads(output.read_text())["outcomes"]) == 3
 
 
 def test_a_motion_can_be_given(toy, tmp_path):

@@ -16,6 +16,7 @@ from ...quality.kept_rows import GO_ON, UNFINISHED
 from ...quality.stress.outcome import HEADER, CaseOutcome
 from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
+from ...scene.plain import from_plain
 from ...training.step_errors import StepErrors
 from .page import Section, facts, flattened, table
 from .terms import BARE, SHARE, SHOWN
@@ -73,10 +74,10 @@ def _made(path: Path, make: Callable[[Mapping[str, Any]], Section], document: Ma
 
 def extremes(document: Mapping[str, Any]) -> Section:
     """Return the table of 'ssilk stress'."""
-    found = [CaseOutcome.of(each) for each in document["outcomes"]]
+    found = [from_plain(CaseOutcome, each, figures=True) for each in document["outcomes"]]
     bad = [number for number, outcome in enumerate(found) if outcome.verdict == "breaks"]
-    rest = facts({name: value for name, value in document.items() if name != "outcomes"})
-    return Section("Extremes", table(HEADER, [outcome.row() for outcome in found], bad) + rest)
+    rows = table(HEADER, [outcome.row() for outcome in found], bad)
+    return _section("Extremes", rows + facts(document["inputs"]), document)
 
 
 def trade(document: Mapping[str, Any]) -> Section:

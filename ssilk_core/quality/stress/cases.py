@@ -53,9 +53,14 @@ class Case:
     measure: Measure
     allowed: tuple[Verdict, ...] = ("works",)
 
+    @property
+    def label(self) -> str:
+        """What messages and `ssilk stress --only` call the case."""
+        return f"{self.group}: {self.name}"
+
     def matches(self, words: Sequence[str]) -> bool:
         """Return whether the case's name contains one of `words`; True if there are none."""
-        return not words or any(word in f"{self.group}: {self.name}" for word in words)
+        return not words or any(word in self.label for word in words)
 
     def run(self, subject: StressSubject) -> CaseOutcome:
         """Run the case and return its outcome."""

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import nan
-from typing import Any, Literal
+from typing import Literal
 
 from .meter import Extent
 
@@ -51,15 +50,6 @@ class CaseOutcome:
     said: str
     measured: CaseMeasurement
     seconds: float
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> CaseOutcome:
-        """Return an outcome from its JSON document, in which None replaces values that are not finite."""
-        found = dict(document["measured"])
-        if found["extent"]:
-            figures: dict[str, Any] = {k: nan if value is None else value for k, value in found["extent"].items()}
-            found["extent"] = Extent(**figures)
-        return cls(**{**document, "measured": CaseMeasurement(**found)})
 
     def row(self) -> list[str]:
         """Return the cells of the row."""

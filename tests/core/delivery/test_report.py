@@ -205,7 +205,7 @@ POINT = {
                       "regions": {}},
 }  # fmt: skip
 FIGURES = {
-    "Extremes": ({"ssilk": "1", "outcomes": [OUTCOME]}, "breaks"),
+    "Extremes": ({"model": "m", "inputs": {"quick": True}, "outcomes": [OUTCOME]}, "breaks"),
     "Trade": ({"asked": {"clips": ["a"]}, "points": [POINT]}, "0.002"),
     "Evaluation": ({"units": "SI", "figures": [{"method": "LBS", "figures": {"total": 2.5}}]}, "figures.total"),
 }
@@ -234,7 +234,7 @@ def test_an_unfinished_evaluation_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [("{", "not a JSON file"), ("[1]", "not figures of a known kind"), ('{"points": [{}]}', "incomplete ('garment')"),
-     ('{"outcomes": [{"name": 1}]}', "incomplete ('measured')")],
+     ('{"outcomes": [{"name": 1}]}', "'group' is missing")],
 )  # fmt: skip
 def test_other_files_are_refused(tmp_path, text, said):
     path = tmp_path / "figures.json"
