@@ -102,7 +102,9 @@ class ShotMethod:
             ends.append(time.perf_counter())
             self.advanced()
 
-        model = network(self.player.file).to(self.dressed.device)
+        file = self.player.file  # keeps the body near the garment, and that of the demo's models none
+        scene = replace(file.scene, character=self.dressed.scene.character)
+        model = network(file, scene).to(self.dressed.device)
         roller = LatentRoller(model, self.dressed.fabric, options, advanced=advanced)
         poses = tuple(garment_poses(model, motion, motion.fps, roller=roller))
         self.solving.append(1000 * (ends[-1] - ends[0]) / (len(ends) - 1))
