@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ..operators import csr
 from ..self_contact import ClothContacts
 
 
@@ -50,20 +50,11 @@ class ContactStiffness:
         order = column.argsort(stable=True)
         flat = values.flatten()
         return cls(
-            _csr(lines, column, flat, (len(slopes), size)),
-            _csr(column[order], lines[order], flat[order], (size, len(slopes))),
+            csr(lines, column, flat, (len(slopes), size)),
+            csr(column[order], lines[order], flat[order], (size, len(slopes))),
             block.permute(0, 2, 3, 1).contiguous(),
         )
 
     def add_product(self, vectors: Tensor, to: Tensor) -> None:
         """Add the product with vectors to others, both contiguous."""
         to.view(-1).add_(self.columns @ (self.rows @ vectors.reshape(-1)))
-
-
-def _csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return a matrix from entries in ascending rows."""
-    starts = torch.zeros(shape[0] + 1, dtype=torch.int32, device=rows.device)
-    starts[1:] = torch.bincount(rows, minlength=shape[0]).cumsum(0)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse (CSR|invariant)")
-        return torch.sparse_csr_tensor(starts, columns.int(), values, size=shape)

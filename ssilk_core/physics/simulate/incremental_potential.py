@@ -144,9 +144,12 @@ class IncrementalPotential:
         """
         if inputs.neighbours is None:
             return inputs
-        contact = self.self_contact
-        neighbours = (contact.moved if moved else contact.around)(x, inputs.neighbours)
-        return replace(inputs, neighbours=neighbours, contacts=contact.contacts(x, neighbours))
+        if moved:
+            neighbours, contacts = self.self_contact.moved(x, inputs.neighbours)
+        else:
+            neighbours = self.self_contact.around(x, inputs.neighbours)
+            contacts = self.self_contact.contacts(x, neighbours)
+        return replace(inputs, neighbours=neighbours, contacts=contacts)
 
     def approach(
         self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
