@@ -35,6 +35,7 @@ from .membrane import outer
 from .stitches import stitch_gradient
 
 ROUNDS, ARRIVED = 24, 1e-3  # in which a garment goes towards a target, and how near it comes there [m]
+HELD = 1e3  # weight of a vertex that is not free, in the rigid motion that a garment begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,12 +157,15 @@ class IncrementalPotential:
     ) -> tuple[Tensor, StepInputs]:
         """Return how far the garment comes from x towards a target, both (V, 3, N), without passing through itself.
 
+        It first moves as a rigid body with what is pinned, which brings no cloth nearer to other cloth.
+
         Args:
             known: which cloth may touch which at x, on older sides than those at x; None where there are none.
 
         Returns:
             The positions, and the inputs with what may touch there.
         """
+        x = moved_rigidly(x, target, torch.full_like(self.mass, HELD).index_fill_(0, self.free, 1.0))
         inputs = replace(inputs, neighbours=self.self_contact.neighbours(x, x, known))
         inputs = self.with_contacts(x, inputs, moved=True)
         arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
@@ -295,3 +299,17 @@ class IncrementalPotential:
     def _push(self, x: Tensor, body_distance: SmoothedDistance) -> Tensor:
         """Return the force along the gradient of the distance on each sample [N], shape (S, N)."""
         return self.cloth.area * self.law.pressure(body_distance.distance(self.cloth.positions(x)))
+
+
+def moved_rigidly(x: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Return positions x (V, 3, N), moved as a rigid body in each frame so that they are nearest to a target.
+
+    The least sum of squares, each with its weight (V, 1), has the rotation of Kabsch (Acta Cryst. A32, 1976).
+    """
+    share = (weight / weight.sum())[:, None]
+    own, goal = ((share * points).sum(0) for points in (x, target))
+    spread = torch.einsum("vin,vjn->nij", share * (target - goal), x - own)
+    left, _, right = torch.linalg.svd(spread)
+    mirrored = torch.linalg.det(left @ right) < 0
+    left[:, :, 2] = torch.where(mirrored[:, None], -left[:, :, 2], left[:, :, 2])
+    return torch.einsum("nij,vjn->vin", left @ right, x - own) + goal

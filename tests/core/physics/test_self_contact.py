@@ -212,6 +212,26 @@ def test_a_garment_goes_its_way_alike_beside_others(scene, toy_grid):
         torch.testing.assert_close(together[..., n : n + 1], alone, rtol=0, atol=1e-12)
 
 
+def test_a_garment_turns_with_what_is_pinned(scene, toy_grid):
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    pinned = points[:, 1] > -1e-9
+    potential = IncrementalPotential(dressed(scene, points, faces, pinned), FABRIC, device=CPU)
+    _, x, _ = crumpled(toy_grid, scene, 2)
+    turned = torch.stack([frame @ _about_z(angle).T for frame, angle in zip(x.unbind(-1), (0.7, 2.5))], dim=-1)
+    still = StepInputs(None, torch.zeros(3, 2, dtype=torch.float64))
+    arrived, _ = potential.approach(x, turned, still, None)
+    torch.testing.assert_close(arrived, turned, rtol=0, atol=1e-9)
+    stays = torch.where(torch.as_tensor(pinned)[:, None, None], turned, x)  # the rest would stay where it was
+    held, inputs = potential.approach(x, stays, still, None)
+    assert (held - turned)[pinned].norm(dim=1).max() < 5e-3
+    assert inputs.contacts.gap(held).min() > 0
+
+
+def _about_z(angle: float) -> torch.Tensor:
+    c, s = np.cos(angle), np.sin(angle)
+    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+
+
 def test_frames_are_independent(scene, toy_grid):
     contact, x, _ = crumpled(toy_grid, scene, 3)
     x = x + 0.002 * random(*x.shape, seed=9)
