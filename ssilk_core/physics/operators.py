@@ -42,8 +42,8 @@ class SparseOperator:
     ) -> None:
         def sorted_by(first: Ints, second: Ints, size: tuple[int, int]) -> Tensor:
             order = np.lexsort((second, first))
-            entries = (torch.as_tensor(np.asarray(part)[order], device=device) for part in (first, second))
-            return csr(*entries, torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device), size)
+            row, column = (torch.as_tensor(np.asarray(part)[order], device=device) for part in (first, second))
+            return csr(row, column, torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device), size)
 
         self.matrix = sorted_by(rows, columns, shape)
         self.transposed = sorted_by(columns, rows, (shape[1], shape[0]))

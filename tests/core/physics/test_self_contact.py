@@ -271,7 +271,7 @@ def test_stiffness_is_that_of_dense_algebra(frames_of):
     free = np.array([0, 1, 2, 4, 5, 7, 8, 9, 11])
     place = torch.full((vertices,), -1)
     place[free] = torch.arange(len(free))
-    found = ContactStiffness.of(contacts, x, place, len(free))
+    found = ContactStiffness.of(contacts.slopes(x), frames_of, place, len(free))
     for n in range(frames_of):
         dense = torch.zeros(3 * vertices, 3 * vertices, dtype=torch.float64)
         for p in torch.nonzero(contacts.frame == n)[:, 0].tolist():
@@ -295,7 +295,7 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     pattern = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, CPU)
     blocks = 3.0 * torch.eye(3)[:, :, None].repeat(vertices, 1, 1, frames_of)
     x, place = random(vertices, 3, frames_of, seed=7), torch.arange(vertices)
-    contacts = ContactStiffness.of(random_contacts(vertices, 20, frames_of), x, place, vertices)
+    contacts = ContactStiffness.of(random_contacts(vertices, 20, frames_of).slopes(x), frames_of, place, vertices)
     matrix = BlockMatrix(pattern, blocks, contacts)
     right = random(vertices, 3, frames_of, seed=9).float()
     inverse = inverse_blocks((blocks + contacts.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
