@@ -25,6 +25,7 @@ KINDS = [
     (heat.PENETRATION, "Penetration", "How deep vertices lie inside the body"),
     (heat.SKIN, "Skin", "Where covered skin shows through the cloth; on the body, by the depth of the cloth beneath"),
     (heat.STRETCH, "Stretch", "How much longer the cloth is than at rest"),
+    (heat.INTERSECTIONS, "Intersections", "Where the cloth passes through itself or through other garments"),
 ]
 PUSHED_OUT = (heat.PUSHED_OUT, "Pushed Out", "How far Push Out moved the rest shape")
 MARKER = "SSILK "  # begins the names of markers
@@ -58,7 +59,7 @@ class MeasuringOperator(tasks.OutsideOperator):
 
 
 class ShowHeat(MeasuringOperator, bpy.types.Operator):
-    """Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading"""
+    """Colour the garment by penetration, stretch, intersections or Push Out, the body by skin; in Solid shading"""
 
     bl_idname = "ssilk.show_heat"
     bl_label = "Show Heat"
@@ -85,7 +86,7 @@ class ShowHeat(MeasuringOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         meters = context.scene.unit_settings.scale_length
-        red = self.longest if self.kind == heat.STRETCH else self.deepest * meters
+        red = {heat.STRETCH: self.longest, heat.INTERSECTIONS: 1.0}.get(self.kind, self.deepest * meters)
         heat.show(found_again(self.garment, self.called), self.measured, red)
         overlay.hide()  # classes would tint the heat
         if context.space_data and context.space_data.type == "VIEW_3D":
@@ -108,7 +109,7 @@ class HideHeat(QualityOperator, bpy.types.Operator):
 
 
 class FindWorst(MeasuringOperator, bpy.types.Operator):
-    """Go through the scene's frames and mark those in which penetration, stretch or skin that shows is worst"""
+    """Go through the scene's frames and mark those in which most is wrong of the kind that the button shows"""
 
     bl_idname = "ssilk.find_worst"
     bl_label = "Mark Worst Frames"

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..quality.heat import PENETRATION, PUSHED_OUT, SKIN, STRETCH
+from ..quality.heat import INTERSECTIONS, PENETRATION, PUSHED_OUT, SKIN, STRETCH
 from ..quality.lbs_copy import find_copy
 from ..quality.repairs import DISPLACEMENT
 from .base import PlayableGarmentPanel, draw_text, saying_errors
@@ -30,6 +30,7 @@ class QualityPanel(PlayableGarmentPanel, bpy.types.Panel):
         draw_kind(layout, PENETRATION, text="Show Penetration")
         draw_kind(layout, SKIN, text="Show Skin")
         draw_kind(layout, STRETCH, text="Show Stretch")
+        draw_kind(layout, INTERSECTIONS, text="Show Intersections")
         if DISPLACEMENT in context.object.data.attributes:
             layout.operator("ssilk.show_heat", text="Show Pushed Out", icon="SHADING_RENDERED").kind = PUSHED_OUT
         if context.object.ssilk.heat_told:

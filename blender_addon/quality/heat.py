@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Penetration, stretch, skin that shows and what Push Out moved, in the frame that is shown, as colours on meshes.
+"""Penetration, stretch, skin that shows, intersections and what Push Out moved, as colours on meshes.
 
-Measuring comes a little at a time: to find what is nearest to 20,000 vertices takes a tenth of a second.
+They are those of the frame that is shown. Measuring comes a little at a time: to find what is nearest to 20,000
+vertices takes a tenth of a second.
 """
 
 from __future__ import annotations
@@ -23,12 +24,14 @@ from ..scene.linked import give_own_mesh, is_override, need_local
 from ..scene.masks import need_unmasked
 from ..scene.meshes import mixed_points, rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
+from .intersections import crossing_triangles
 from .repairs import displacements
 
 ATTRIBUTE = "SSILK Heat"
 IN_FRONT_BEFORE = "ssilk_in_front"  # custom property of a garment that is drawn over the skin: whether it was before
 ACTIVE_BEFORE = "ssilk_active_color"  # custom property of a coloured mesh: its active colour attribute before
 PENETRATION, STRETCH, SKIN, PUSHED_OUT = "PENETRATION", "STRETCH", "SKIN", "PUSHED_OUT"
+INTERSECTIONS = "INTERSECTIONS"
 CHUNK = 1000  # vertices at a time
 
 Result = TypeVar("Result")
@@ -39,13 +42,16 @@ class HeatMap:
     """A garment in one frame.
 
     Attributes:
-        kind: PENETRATION, STRETCH, SKIN or PUSHED_OUT.
+        kind: PENETRATION, STRETCH, SKIN, PUSHED_OUT or INTERSECTIONS.
         values: of each vertex: depth inside the body [m], negative outside; elongation; or how far it was pushed out
-            of the body [m]; shape (V,). For SKIN those of `heat.shown_depths` [m], of all bodies' vertices.
+            of the body [m]; or 1 where its triangles intersect others; shape (V,). For SKIN those of
+            `heat.shown_depths` [m], of all bodies' vertices.
+        shares: of the triangles that intersect others of the garment, and other garments; for INTERSECTIONS.
     """
 
     kind: str
     values: np.ndarray
+    shares: tuple[float, float] = (0.0, 0.0)
 
     @property
     def most(self) -> float:
@@ -53,7 +59,10 @@ class HeatMap:
 
     @property
     def badness(self) -> float:
-        """What frames are compared by: the share of the covered skin that shows, or the largest value."""
+        """What frames are compared by: the share of the covered skin that shows, or of what intersects, or the
+        largest value."""
+        if self.kind == INTERSECTIONS:
+            return sum(self.shares)
         if self.kind != SKIN:
             return self.most
         return self._share(self.values > 0)
@@ -75,6 +84,10 @@ class HeatMap:
         if self.kind == SKIN:
             shows = f"{self.badness:.2%} of the covered skin shows" if self.badness else "No skin shows"
             return f"{shows}, {self.bare:.2%} is bare" if self.bare else shows
+        if self.kind == INTERSECTIONS:
+            names = "others", "other garments"
+            found = [f"{share:.2%} intersect {name}" for share, name in zip(self.shares, names) if share]
+            return f"Of the triangles {', '.join(found)}" if found else "Nothing intersects"
         inside = int((self.values > 0).sum())
         return f"{inside} vertices inside, {1000 * self.most:.1f} mm at most" if inside else "Nothing is inside"
 
@@ -94,6 +107,11 @@ def measuring(
         return HeatMap(kind, displacements(garment))
     if kind == SKIN:
         return HeatMap(kind, (yield from _shown(garment, depsgraph)))
+    if kind == INTERSECTIONS:
+        found = crossing_triangles(garment, depsgraph)
+        values = np.zeros(len(garment.data.vertices))
+        values[triangles_of(garment.data)[found[0] | found[1]]] = 1.0
+        return HeatMap(kind, values, (float(found[0].mean()), float(found[1].mean())))
     points = cage_points(garment, depsgraph)
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]

@@ -413,14 +413,19 @@ WORDS = {
     ),
     "Show Stretch": "Dehnung zeigen",
     "How much longer the cloth is than at rest": "Um wie viel länger der Stoff ist als in Ruhe",
+    "Show Intersections": "Durchdrungenen Stoff zeigen",
+    "Intersections": "Durchdrungener Stoff",
+    "Where the cloth passes through itself or through other garments": (
+        "Wo der Stoff durch sich selbst oder durch andere Kleidungsstücke geht"
+    ),
     "Show Pushed Out": "Herausgedrücktes zeigen",
     "Pushed Out": "Herausgedrückt",
     "How far Push Out moved the rest shape": "Wie weit Herausdrücken die Ruheform verschoben hat",
     "Show": "Zeigen",
     "Show Heat": "Wärmebild zeigen",
-    "Colour the garment by penetration, stretch or Push Out, the body by skin that shows; in Solid shading": (
-        "Das Kleidungsstück nach Durchdringung, Dehnung oder Herausdrücken färben, oder den Körper nach Haut, die "
-        "durchtritt; in der Solid-Ansicht"
+    "Colour the garment by penetration, stretch, intersections or Push Out, the body by skin; in Solid shading": (
+        "Das Kleidungsstück nach Durchdringung, Dehnung, durchdrungenem Stoff oder Herausdrücken färben, oder den "
+        "Körper nach Haut, die durchtritt; in der Solid-Ansicht"
     ),
     "Red Depth": "Rote Tiefe",
     "Depth that is red": "Tiefe, die rot ist",
@@ -432,9 +437,9 @@ WORDS = {
     "Markers": "Marken",
     "How many frames are marked at most": "Wie viele Bilder höchstens markiert werden",
     "Mark Worst Frames": "Schlechteste Bilder markieren",
-    "Go through the scene's frames and mark those in which penetration, stretch or skin that shows is worst": (
-        "Die Bilder der Szene durchgehen und jene markieren, in denen Durchdringung, Dehnung oder durchtretende Haut "
-        "am größten ist"
+    "Go through the scene's frames and mark those in which most is wrong of the kind that the button shows": (
+        "Die Bilder der Szene durchgehen und jene markieren, in denen am meisten von dem falsch ist, was der Knopf "
+        "zeigt"
     ),
     "Clear Marks": "Marken entfernen",
     "Remove the markers of worst frames": "Die Marken der schlechtesten Bilder entfernen",

@@ -140,6 +140,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     _take_fabric(options, report)
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
+    if fabric.friction:
+        words = f"friction = {fabric.friction:g}: 'ssilk simulate' knows it; the network is trained without friction"
+        report(Message(words, "warning"))
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)

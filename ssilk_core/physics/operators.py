@@ -40,8 +40,13 @@ class SparseOperator:
         device: torch.device,
         dtype: torch.dtype,
     ) -> None:
-        self.matrix = _csr(rows, columns, values, shape, device, dtype)
-        self.transposed = _csr(columns, rows, values, (shape[1], shape[0]), device, dtype)
+        def sorted_by(first: Ints, second: Ints, size: tuple[int, int]) -> Tensor:
+            order = np.lexsort((second, first))
+            row, column = (torch.as_tensor(np.asarray(part)[order], device=device) for part in (first, second))
+            return csr(row, column, torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device), size)
+
+        self.matrix = sorted_by(rows, columns, shape)
+        self.transposed = sorted_by(columns, rows, (shape[1], shape[0]))
 
     def __call__(self, x: Tensor) -> Tensor:
         """Apply the operator to `x`, shape (vertices, 3, frames)."""
@@ -53,21 +58,13 @@ class SparseOperator:
         return (self.transposed @ y.flatten(1)).reshape(-1, *y.shape[1:])
 
 
-def _csr(
-    rows: Ints, columns: Ints, values: Floats, shape: tuple[int, int], device: torch.device, dtype: torch.dtype
-) -> Tensor:
-    order = np.lexsort((columns, rows))
-    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=shape[0]))])
+def csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return a sparse matrix from entries in ascending rows: their rows, columns and values, each of shape (E,)."""
+    starts = torch.zeros(shape[0] + 1, dtype=torch.int32, device=rows.device)
+    starts[1:] = torch.bincount(rows, minlength=shape[0]).cumsum(0)
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Sparse (CSR|invariant)"
-        )  # beta notice; the indices are sorted here
-        return torch.sparse_csr_tensor(
-            torch.as_tensor(starts, dtype=torch.int32, device=device),
-            torch.as_tensor(np.asarray(columns)[order], dtype=torch.int32, device=device),
-            torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device),
-            size=shape,
-        )
+        warnings.filterwarnings("ignore", message="Sparse (CSR|invariant)")  # a notice that they are in beta
+        return torch.sparse_csr_tensor(starts, columns.int(), values, size=shape)
 
 
 def difference_operator(

@@ -37,6 +37,8 @@ class Fabric:
             millimetre.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
+        friction: Coulomb's coefficient, of cloth on the body and on cloth. The simulator alone knows it: networks
+            are trained without.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Fabric:
     tether: float = 1e3
     stitch: float = 1e6
     drag: float = 0.3
+    friction: float = 0.0
 
     def __post_init__(self) -> None:
         if self.stretch_model not in STRETCH_MODELS:

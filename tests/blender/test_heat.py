@@ -233,6 +233,32 @@ def test_skin_that_shows_is_coloured_on_the_body(bpy, dressed):
     assert "SSILK Heat" not in pillar.data.color_attributes and not dressed.ssilk.heat
 
 
+def test_what_intersects_is_coloured(bpy, dressed):
+    """Tubes that stand in one another; the inner one is bent through the outer one, and then through itself."""
+    outer = add_mesh(bpy, "Coat", *tube(24, 9, (0.6, 1.0, 1.3), (0.3, 0.3, 0.3)))
+    outer.ssilk.armature = dressed.ssilk.armature
+    activate(bpy, dressed)
+    assert bpy.ops.ssilk.show_heat(kind="INTERSECTIONS") == {"FINISHED"}
+    assert dressed.ssilk.heat_told == "Nothing intersects"
+    dressed.shape_key_add(name="Basis")
+    key = dressed.shape_key_add(name="Wrong")
+    moved = [point.co.z > 1.2 for point in key.data]
+    for point, high in zip(key.data, moved):
+        point.co.x += 0.25 * high  # the top goes through the coat
+    key.value = 1.0
+    assert bpy.ops.ssilk.show_heat(kind="INTERSECTIONS") == {"FINISHED"}
+    assert dressed.ssilk.heat_told.endswith("% intersect other garments") and "others" not in dressed.ssilk.heat_told
+    coloured = np.abs(colors(dressed)[:, :3] - heat.GREY).max(axis=1) > 0.1
+    np.testing.assert_allclose(colors(dressed)[coloured, :3], np.tile(RED, (coloured.sum(), 1)), atol=2e-3)
+    z = np.array([vertex.co.z for vertex in dressed.data.vertices])
+    assert coloured.any() and z[coloured].min() > 1.0
+    bpy.data.objects.remove(outer)
+    for point, high in zip(key.data, moved):
+        point.co.x, point.co.z = point.co.x - 0.25 * high + 0.05 * high, point.co.z - 0.4 * high  # into the skirt
+    assert bpy.ops.ssilk.show_heat(kind="INTERSECTIONS") == {"FINISHED"}
+    assert dressed.ssilk.heat_told.endswith("% intersect others")
+
+
 def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch):
     from blender_addon.scene import overlay
 
@@ -245,7 +271,7 @@ def test_heat_is_not_tinted_by_the_overlay_of_classes(bpy, dressed, monkeypatch)
 def test_the_panel_offers_to_hide_what_is_shown(bpy, dressed):
     from blender_addon.panels.quality import QualityPanel
 
-    shown = ["ssilk.show_heat", "ssilk.find_worst"] * 3
+    shown = ["ssilk.show_heat", "ssilk.find_worst"] * 4
     assert drawn(QualityPanel, bpy.context) == [*shown, "ssilk.clear_worst", "ssilk.toggle_lbs"]
     bpy.ops.ssilk.show_heat()
     told = dressed.ssilk.heat_told

@@ -23,6 +23,27 @@ TINY = 1e-12  # [m]
 
 
 @dataclass(frozen=True, eq=False)
+class Slopes:
+    """Rows whose squares add up to a Hessian: the sum over R rows of each row with itself.
+
+    Attributes:
+        frame: of each, shape (R,).
+        vertices: shape (4, R).
+        values: the row's part at each vertex [(N/m)^1/2], shape (4, 3, R).
+    """
+
+    frame: Tensor
+    vertices: Tensor
+    values: Tensor
+
+    @classmethod
+    def joined(cls, *parts: Slopes) -> Slopes:
+        """Return all together."""
+        names = "frame", "vertices", "values"
+        return cls(*(torch.cat([getattr(part, name) for part in parts], dim=-1) for name in names))
+
+
+@dataclass(frozen=True, eq=False)
 class ClothContacts:
     """Contacts of P pairs in N frames, by ascending frame.
 
@@ -65,8 +86,7 @@ class ClothContacts:
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
-        push = -self.area * self.law.pressure(self._relative(x))
-        force = (push * self.coefficients)[:, None] * self.direction
+        force = (-self.pressure(x) * self.coefficients)[:, None] * self.direction
         found = x.new_zeros(len(x), x.shape[-1], 3)
         at = self.vertices, self.frame.expand_as(self.vertices)
         return found.index_put_(at, force.movedim(1, -1), accumulate=True).movedim(-1, 1).contiguous()
@@ -74,6 +94,16 @@ class ClothContacts:
     def stiffness(self, x: Tensor) -> Tensor:
         """Return the second derivative of each contact's energy by its gap [N/m], shape (P,)."""
         return self.area * self.law.curvature(self._relative(x))
+
+    def pressure(self, x: Tensor) -> Tensor:
+        """Return the force of each contact [N], shape (P,)."""
+        return self.area * self.law.pressure(self._relative(x))
+
+    def slopes(self, x: Tensor) -> Slopes:
+        """Return what the Hessian at x is made of."""
+        own = self.pressing(x)
+        values = (own.stiffness(x).sqrt() * own.coefficients)[:, None] * own.direction
+        return Slopes(own.frame, own.vertices, values)
 
     def allowed(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
         """Return by which share of a step (V, 3, N) each vertex may move, shape (V, N).

@@ -113,6 +113,13 @@ class ClothNeighbours:
         last, at = (torch.cat([getattr(part, name) for _, part in parts], -1)[..., order] for name in ("last", "at"))
         return cls(last, at, pairs("faces"), pairs("edges"))
 
+    def replace_frames(self, frames: Tensor, other: ClothNeighbours) -> ClothNeighbours:
+        """Return those with frames (M,), in ascending order, replaced by those of another."""
+        kept = torch.ones(self.at.shape[-1], dtype=torch.bool, device=self.at.device)
+        kept[frames] = False
+        own = kept.nonzero()[:, 0]
+        return ClothNeighbours.joined([(own, self.select(own)), (frames, other)]) if len(own) else other
+
     def first(self, frames: int) -> ClothNeighbours:
         """Return those of the first frames."""
         return self.select(torch.arange(frames, device=self.at.device))
@@ -157,14 +164,13 @@ class PairKind:
         frame = pairs.frame if x.shape[-1] > 1 else torch.zeros_like(pairs.frame)
         return self.measure(x[self.vertices(pairs), :, frame].movedim(-1, 1))
 
-    def contacts(self, x: Tensor, pairs: KnownPairs) -> tuple[Tensor, ...]:
-        """Return the frames, and what `ClothContacts` holds of pairs that touch or nearly do at positions x."""
-        now = self.at(x, pairs)
+    def contacts(self, now: Separations, pairs: KnownPairs) -> tuple[Tensor, ...]:
+        """Return the frames, and what `ClothContacts` holds, of pairs that touch or nearly do as they lie `now`."""
         gap, direction = now.gaps(pairs.side)
         kept = gap < pairs.start + REACH
         pairs = pairs.kept(kept)
         vertices = self.vertices(pairs)
-        second = (torch.arange(4, device=x.device) >= self.first.shape[1])[:, None].expand_as(vertices)
+        second = (torch.arange(4, device=gap.device) >= self.first.shape[1])[:, None].expand_as(vertices)
         area = torch.minimum(self.first_area[pairs.first], self.second_area[pairs.second])
         return pairs.frame, vertices, now.coefficients[:, kept], second, direction[:, kept], pairs.start, area
 
@@ -218,28 +224,31 @@ class SelfContact:
         stale = ~(_drift(x, known) <= allowance * REACH)
         if not bool(stale.any()):
             return known
-        old, new = (~stale).nonzero()[:, 0], stale.nonzero()[:, 0]
-        again = self.neighbours(known.last[..., new], x[..., new], known.select(new))
-        return ClothNeighbours.joined([(old, known.select(old)), (new, again)]) if len(old) else again
+        new = stale.nonzero()[:, 0]
+        return known.replace_frames(new, self.neighbours(known.last[..., new], x[..., new], known.select(new)))
 
-    def moved(self, x: Tensor, known: ClothNeighbours) -> ClothNeighbours:
-        """Return what may touch after the garment has moved to positions x, with the sides there.
+    def moved(self, x: Tensor, known: ClothNeighbours) -> tuple[ClothNeighbours, ClothContacts]:
+        """Return what may touch after the garment has moved to positions x, with the sides there, and the contacts.
 
         What lies further on the wrong side than contact begins belongs there from now on.
         """
         known = self.around(x, known, MOVED)
 
-        def there(kind: PairKind, pairs: KnownPairs) -> KnownPairs:
-            now = kind.at(x, pairs)
+        def there(pairs: KnownPairs, now: Separations) -> KnownPairs:
             away = pairs.side * now.height < -self.law.start
             side = torch.where((pairs.side == 0) | away, now.height.sign(), pairs.side)
             return replace(pairs, side=torch.where(now.facing, side, 0))
 
-        return ClothNeighbours(x, known.at, there(self._faces, known.faces), there(self._edges, known.edges))
+        now = self._faces.at(x, known.faces), self._edges.at(x, known.edges)
+        known = ClothNeighbours(x, known.at, there(known.faces, now[0]), there(known.edges, now[1]))
+        return known, self._contacts(x, known, *now)
 
     def contacts(self, x: Tensor, known: ClothNeighbours) -> ClothContacts:
         """Return the contacts at positions x, among pairs that are known around them."""
-        parts = self._faces.contacts(x, known.faces), self._edges.contacts(x, known.edges)
+        return self._contacts(x, known, self._faces.at(x, known.faces), self._edges.at(x, known.edges))
+
+    def _contacts(self, x: Tensor, known: ClothNeighbours, faces: Separations, edges: Separations) -> ClothContacts:
+        parts = self._faces.contacts(faces, known.faces), self._edges.contacts(edges, known.edges)
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
         unknown = self.reach - 2 * _drift(x, known)

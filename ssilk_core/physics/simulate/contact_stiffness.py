@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stiffness of cloth against cloth as a sparse matrix G'G, whose pattern changes from step to step."""
+"""The stiffness of cloth against cloth, and of friction, as a sparse matrix G'G; its pattern varies with steps."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from ..self_contact import ClothContacts
+from ..operators import csr
+from ..self_contact.contacts import Slopes
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class ContactStiffness:
     """Stiffness over U free vertices in N frames, float32; vectors are (U, 3, N).
 
     Attributes:
-        rows: G, the square root of each contact's stiffness times its slopes, CSR (P, 3 U N).
+        rows: G, the slopes, CSR (R, 3 U N).
         columns: its transpose, CSR.
         diagonal: blocks on the diagonal, shape (U, 3, 3, N).
     """
@@ -27,21 +27,19 @@ class ContactStiffness:
     diagonal: Tensor
 
     @classmethod
-    def of(cls, contacts: ClothContacts, x: Tensor, place: Tensor, count: int) -> ContactStiffness:
-        """Return that of contacts at positions x (V, 3, N).
+    def of(cls, found: Slopes, frames: int, place: Tensor, count: int) -> ContactStiffness:
+        """Return that of slopes in a number of frames.
 
         Args:
             place: of each vertex among the free ones, -1 for others, shape (V,).
             count: number U of free vertices.
         """
-        contacts = contacts.pressing(x)
-        frames, device = contacts.frames, x.device
-        slopes = (contacts.stiffness(x).sqrt() * contacts.coefficients)[:, None] * contacts.direction
-        slopes = slopes.float().permute(2, 0, 1)  # (P, 4, 3)
-        own = place[contacts.vertices.T]
+        device = place.device
+        slopes = found.values.float().permute(2, 0, 1)  # (R, 4, 3)
+        own = place[found.vertices.T]
         kept = own >= 0
         row = kept.nonzero()[:, 0]
-        vertex, frame, values = own[kept], contacts.frame[row], slopes[kept]
+        vertex, frame, values = own[kept], found.frame[row], slopes[kept]
         block = values.new_zeros(count, frames, 3, 3)
         block.index_put_((vertex, frame), values[:, :, None] * values[:, None], accumulate=True)
         axis = torch.arange(3, device=device)
@@ -50,20 +48,11 @@ class ContactStiffness:
         order = column.argsort(stable=True)
         flat = values.flatten()
         return cls(
-            _csr(lines, column, flat, (len(slopes), size)),
-            _csr(column[order], lines[order], flat[order], (size, len(slopes))),
+            csr(lines, column, flat, (len(slopes), size)),
+            csr(column[order], lines[order], flat[order], (size, len(slopes))),
             block.permute(0, 2, 3, 1).contiguous(),
         )
 
     def add_product(self, vectors: Tensor, to: Tensor) -> None:
         """Add the product with vectors to others, both contiguous."""
         to.view(-1).add_(self.columns @ (self.rows @ vectors.reshape(-1)))
-
-
-def _csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:
-    """Return a matrix from entries in ascending rows."""
-    starts = torch.zeros(shape[0] + 1, dtype=torch.int32, device=rows.device)
-    starts[1:] = torch.bincount(rows, minlength=shape[0]).cumsum(0)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse (CSR|invariant)")
-        return torch.sparse_csr_tensor(starts, columns.int(), values, size=shape)

@@ -6,9 +6,10 @@ Implicit Euler with time step dt is the minimum of
     stretch + bending + gravity + collision + tether + stitches
     + m/(2 dt^2) |x - (2 x' - x'')|^2 + drag a/(2 dt) |x - advected|^2
 
-(`energy.GarmentEnergy`); a quasi-static state has none of the last two terms. The distance to the body is that to the
-whole surface that a vertex can touch. In training tight cloth has only the triangles around the nearest vertex. It is
-smoothed on its creases (`collision.smoothed_distance`), so that the gradient vanishes at minima there.
+(`energy.GarmentEnergy`), and what friction takes (`friction`); a quasi-static state has none of the last two terms,
+and no friction. The distance to the body is that to the whole surface that a vertex can touch. In training tight
+cloth has only the triangles around the nearest vertex. It is smoothed on its creases (`collision.smoothed_distance`),
+so that the gradient vanishes at minima there.
 """
 
 from __future__ import annotations
@@ -24,17 +25,21 @@ from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
+from ..collision.closest_point import closest_on_faces
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
 from ..self_contact import ClothContacts, ClothNeighbours, SelfContact
+from ..self_contact.contacts import Slopes
 from .blocks import BlockMatrix, BlockPattern
 from .contact_stiffness import ContactStiffness
+from .friction import CREEP, Friction
 from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
 
 ROUNDS, ARRIVED = 24, 1e-3  # in which a garment goes towards a target, and how near it comes there [m]
+HELD = 1e3  # weight of a vertex that is not free, in the rigid motion that a garment begins with
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +55,7 @@ class StepInputs:
         skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
         neighbours: which cloth may touch which, or None where cloth may pass through cloth.
         contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
+        friction: of what pressed in the step before; None without.
     """
 
     body: PosedBody | None
@@ -60,6 +66,7 @@ class StepInputs:
     skinned: Tensor | None = None
     neighbours: ClothNeighbours | None = None
     contacts: ClothContacts | None = None
+    friction: Friction | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
         """Return the inputs of the frames with indices (M,)."""
@@ -68,10 +75,12 @@ class StepInputs:
             v if v is None else v[..., frames] for v in (self.predicted, self.advected, self.skinned)
         )
         neighbours = self.neighbours and self.neighbours.select(frames)
-        contacts = self.contacts and self.contacts.select(frames)
-        return StepInputs(
-            body, self.gravity[..., frames], predicted, advected, self.dt, skinned, neighbours, contacts
+        contacts, friction = (
+            self.contacts and self.contacts.select(frames),
+            self.friction and self.friction.select(frames),
         )
+        gravity = self.gravity[..., frames]
+        return StepInputs(body, gravity, predicted, advected, self.dt, skinned, neighbours, contacts, friction)
 
 
 class IncrementalPotential:
@@ -144,14 +153,19 @@ class IncrementalPotential:
         """
         if inputs.neighbours is None:
             return inputs
-        contact = self.self_contact
-        neighbours = (contact.moved if moved else contact.around)(x, inputs.neighbours)
-        return replace(inputs, neighbours=neighbours, contacts=contact.contacts(x, neighbours))
+        if moved:
+            neighbours, contacts = self.self_contact.moved(x, inputs.neighbours)
+        else:
+            neighbours = self.self_contact.around(x, inputs.neighbours)
+            contacts = self.self_contact.contacts(x, neighbours)
+        return replace(inputs, neighbours=neighbours, contacts=contacts)
 
     def approach(
         self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
     ) -> tuple[Tensor, StepInputs]:
         """Return how far the garment comes from x towards a target, both (V, 3, N), without passing through itself.
+
+        It first moves as a rigid body with what is pinned, which brings no cloth nearer to other cloth.
 
         Args:
             known: which cloth may touch which at x, on older sides than those at x; None where there are none.
@@ -159,6 +173,7 @@ class IncrementalPotential:
         Returns:
             The positions, and the inputs with what may touch there.
         """
+        x = moved_rigidly(x, target, torch.full_like(self.mass, HELD).index_fill_(0, self.free, 1.0))
         inputs = replace(inputs, neighbours=self.self_contact.neighbours(x, x, known))
         inputs = self.with_contacts(x, inputs, moved=True)
         arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
@@ -171,6 +186,38 @@ class IncrementalPotential:
             x = torch.where(arrived, x, x + step)
             inputs = self.with_contacts(x, inputs, moved=True)
         return x, inputs
+
+    def friction(self, x: Tensor, body: PosedBody, neighbours: ClothNeighbours | None, dt: float) -> Friction | None:
+        """Return the friction in the step of dt [s] after positions x on a body; None for cloth without friction."""
+        mu = self.fabric.friction
+        if not mu:
+            return None
+        samples, found = self.cloth.positions(x), self.body_distance(x, StepInputs(body, x.new_zeros(3, x.shape[-1])))
+        assert found is not None and body.faces is not None
+        distance = found.distance(samples)
+        force = self.cloth.area * self.law.pressure(distance)
+        reach = torch.where(force > 0, 2 * distance.abs() + self.law.start, -1.0).float()
+        row, frame, corners, weights = closest_on_faces(samples.float(), reach, body.points, body.faces)
+        vertices = torch.as_tensor(self.cloth.samples.corners, device=x.device)[row].T
+        coefficients = torch.as_tensor(self.cloth.samples.weights, dtype=x.dtype, device=x.device)[row].T
+        normal = torch.nn.functional.normalize(found.normal[row, :, frame].T, dim=0)
+        weights = weights.to(x.dtype)
+        on_body = (weights[:, None] * body.points[corners, :, frame].movedim(-1, 1)).sum(0)
+        rubbing = Friction(
+            x.shape[-1],
+            CREEP * dt,
+            frame,
+            torch.cat([vertices, vertices[:1]]),
+            torch.cat([coefficients, torch.zeros_like(coefficients[:1])]),
+            corners,
+            weights,
+            normal,
+            mu * force[row, frame],
+            samples[row, :, frame].T - on_body,
+        )
+        if neighbours is None:
+            return rubbing
+        return Friction.joined(rubbing, Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
 
     def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""
@@ -185,8 +232,9 @@ class IncrementalPotential:
             total = total + self.stitching.energy(x)
         for weight, target in self._anchors(inputs):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
-        if inputs.contacts is not None:
-            total = total + inputs.contacts.energy(x)
+        for part in (inputs.contacts, inputs.friction):
+            if part is not None:
+                total = total + part.energy(x)
         return total + self.collision(x, body_distance).sum(0)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
@@ -204,8 +252,9 @@ class IncrementalPotential:
         total = self._elastic_gradient(x) - self.mass[:, None] * inputs.gravity
         if self.stitching:
             total += stitch_gradient(self.stitching, x)
-        if inputs.contacts is not None:
-            total += inputs.contacts.gradient(x)
+        for part in (inputs.contacts, inputs.friction):
+            if part is not None:
+                total += part.gradient(x)
         for weight, target in self._anchors(inputs):
             total += weight[:, None] * (x - target)
         if body_distance:
@@ -238,13 +287,14 @@ class IncrementalPotential:
             contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
         fixed = None if fixed is None else fixed[self.free]
         found = self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
-        return found if inputs.contacts is None else replace(found, contacts=self._stiffness(x, inputs.contacts))
+        parts = [part.slopes(x) for part in (inputs.contacts, inputs.friction) if part is not None]
+        return replace(found, contacts=self._stiffness(x, Slopes.joined(*parts))) if parts else found
 
-    def _stiffness(self, x: Tensor, contacts: ClothContacts) -> ContactStiffness:
-        """Return the Hessian of contacts of cloth with cloth."""
+    def _stiffness(self, x: Tensor, slopes: Slopes) -> ContactStiffness:
+        """Return the Hessian that slopes add up to."""
         place = torch.full((len(x),), -1, device=x.device)
         place[self.free] = torch.arange(len(self.free), device=x.device)
-        return ContactStiffness.of(contacts, x, place, len(self.free))
+        return ContactStiffness.of(slopes, x.shape[-1], place, len(self.free))
 
     def residual(self, gradient: Tensor) -> Tensor:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""
@@ -292,3 +342,17 @@ class IncrementalPotential:
     def _push(self, x: Tensor, body_distance: SmoothedDistance) -> Tensor:
         """Return the force along the gradient of the distance on each sample [N], shape (S, N)."""
         return self.cloth.area * self.law.pressure(body_distance.distance(self.cloth.positions(x)))
+
+
+def moved_rigidly(x: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Return positions x (V, 3, N), moved as a rigid body in each frame so that they are nearest to a target.
+
+    The least sum of squares, each with its weight (V, 1), has the rotation of Kabsch (Acta Cryst. A32, 1976).
+    """
+    share = (weight / weight.sum())[:, None]
+    own, goal = ((share * points).sum(0) for points in (x, target))
+    spread = torch.einsum("vin,vjn->nij", share * (target - goal), x - own)
+    left, _, right = torch.linalg.svd(spread)
+    mirrored = torch.linalg.det(left @ right) < 0
+    left[:, :, 2] = torch.where(mirrored[:, None], -left[:, :, 2], left[:, :, 2])
+    return torch.einsum("nij,vjn->vin", left @ right, x - own) + goal

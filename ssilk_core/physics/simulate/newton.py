@@ -99,26 +99,31 @@ class State:
         x: positions [m], shape (V, 3, N).
         body_distance: their distances to the body.
         energy: [J], shape (N,).
+        neighbours: which cloth may touch which around them, where inputs say so.
     """
 
     x: Tensor
     body_distance: SmoothedDistance | None
     energy: Tensor
+    neighbours: ClothNeighbours | None = None
 
     @classmethod
     def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
         body_distance = potential.body_distance(x, inputs)
-        return cls(x, body_distance, potential.energy(x, inputs, body_distance))
+        return cls(x, body_distance, potential.energy(x, inputs, body_distance), inputs.neighbours)
 
     def tensors(self) -> list[Tensor]:
-        """Return all tensors, frames last."""
+        """Return all tensors but those of the neighbours, frames last."""
         return [self.x, self.energy, *(self.body_distance.tensors() if self.body_distance else [])]
 
     def select(self, frames: Tensor) -> State:
         """Return the state of the frames with indices (M,)."""
         return State(
-            self.x[..., frames], self.body_distance and self.body_distance.select(frames), self.energy[frames]
+            self.x[..., frames],
+            self.body_distance and self.body_distance.select(frames),
+            self.energy[frames],
+            self.neighbours and self.neighbours.select(frames),
         )
 
     def replace_frames(self, frames: Tensor, other: State) -> State:
@@ -126,7 +131,10 @@ class State:
         x, energy, *body_distance = (
             own.index_copy(-1, frames, new) for own, new in zip(self.tensors(), other.tensors(), strict=True)
         )
-        return State(x, SmoothedDistance(*body_distance) if body_distance else None, energy)
+        neighbours = self.neighbours
+        if neighbours and other.neighbours:
+            neighbours = neighbours.replace_frames(frames, other.neighbours)
+        return State(x, SmoothedDistance(*body_distance) if body_distance else None, energy, neighbours)
 
 
 @torch.no_grad()
@@ -262,7 +270,8 @@ class _Search:
     def _evaluate(self) -> None:
         """Evaluate contacts of cloth with cloth, gradient and residual of the current states."""
         if self.inputs.neighbours is not None:
-            self.inputs = self.potential.with_contacts(self.state.x, self.inputs, moved=True)
+            around = replace(self.inputs, neighbours=self.state.neighbours)
+            self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
         gradient = self.potential.gradient(self.state.x, self.inputs, self.state.body_distance)
         self.gradient = gradient.masked_fill(self.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)

@@ -25,6 +25,7 @@ from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
+from .friction import Friction
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
 
@@ -106,6 +107,7 @@ class StepHistory:
         root: the character's root one step ago [m], float64, shape (3, N).
         lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
         neighbours: which cloth may touch which, where that is looked at.
+        friction: of what presses at the last positions, for the next step; None without.
     """
 
     last: Tensor
@@ -113,12 +115,15 @@ class StepHistory:
     root: Tensor
     lbs: Tensor
     neighbours: ClothNeighbours | None = None
+    friction: Friction | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
         before = None if self.before is None else self.before[..., :count]
         neighbours = self.neighbours and self.neighbours.first(count)
-        return StepHistory(self.last[..., :count], before, self.root[:, :count], self.lbs[..., :count], neighbours)
+        friction = self.friction and self.friction.select(torch.arange(count, device=self.last.device))
+        root, lbs = self.root[:, :count], self.lbs[..., :count]
+        return StepHistory(self.last[..., :count], before, root, lbs, neighbours, friction)
 
     @property
     def local(self) -> Tensor:
@@ -195,8 +200,13 @@ class Simulator:
     def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
         """Return the states after those of the past, and their solution."""
         solution = self.step(poses, past)
+        return self._history(solution, poses, past.last), solution
+
+    def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
+        """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
+        friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
         world = solution.x.double() + poses.root
-        return StepHistory(world, past.last, poses.root, poses.lbs, solution.neighbours), solution
+        return StepHistory(world, before, poses.root, poses.lbs, solution.neighbours, friction)
 
     def _first(self, poses: PosedCharacters, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
@@ -208,8 +218,7 @@ class Simulator:
             start, known = self._from_bind_pose(poses, spans)
             inputs = replace(inputs, neighbours=known)
         solution = minimise_from(self.potential, start, inputs, solver, advanced=told)
-        world = solution.x.double() + poses.root
-        return StepHistory(world, None, poses.root, poses.lbs, solution.neighbours), solution
+        return self._history(solution, poses, None), solution
 
     def _from_bind_pose(
         self, poses: PosedCharacters, spans: Sequence[MotionSpan]
@@ -241,7 +250,9 @@ class Simulator:
             return StepInputs(poses.body, gravity, skinned=poses.lbs)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        return StepInputs(poses.body, gravity, predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs)
+        friction = past.friction and past.friction.after(poses.body.points)
+        predicted = predicted.to(past.lbs.dtype)
+        return StepInputs(poses.body, gravity, predicted, past.local, self.dt, poses.lbs, friction=friction)
 
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""

@@ -142,9 +142,9 @@ def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
     _, contact = layers
     known = contact.neighbours(stacked(0.004), stacked(-0.002))
     x = stacked(-0.003)
-    assert contact.contacts(x, contact.moved(x, known)).gap(x).min().item() == pytest.approx(-0.003)
+    assert contact.moved(x, known)[1].gap(x).min().item() == pytest.approx(-0.003)
     deep = stacked(-START - 0.002)
-    assert contact.contacts(deep, contact.moved(deep, known)).gap(deep).min() > 0
+    assert contact.moved(deep, known)[1].gap(deep).min() > 0
 
 
 def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
@@ -212,6 +212,26 @@ def test_a_garment_goes_its_way_alike_beside_others(scene, toy_grid):
         torch.testing.assert_close(together[..., n : n + 1], alone, rtol=0, atol=1e-12)
 
 
+def test_a_garment_turns_with_what_is_pinned(scene, toy_grid):
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    pinned = points[:, 1] > -1e-9
+    potential = IncrementalPotential(dressed(scene, points, faces, pinned), FABRIC, device=CPU)
+    _, x, _ = crumpled(toy_grid, scene, 2)
+    turned = torch.stack([frame @ _about_z(angle).T for frame, angle in zip(x.unbind(-1), (0.7, 2.5))], dim=-1)
+    still = StepInputs(None, torch.zeros(3, 2, dtype=torch.float64))
+    arrived, _ = potential.approach(x, turned, still, None)
+    torch.testing.assert_close(arrived, turned, rtol=0, atol=1e-9)
+    stays = torch.where(torch.as_tensor(pinned)[:, None, None], turned, x)  # the rest would stay where it was
+    held, inputs = potential.approach(x, stays, still, None)
+    assert (held - turned)[pinned].norm(dim=1).max() < 5e-3
+    assert inputs.contacts.gap(held).min() > 0
+
+
+def _about_z(angle: float) -> torch.Tensor:
+    c, s = np.cos(angle), np.sin(angle)
+    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
+
+
 def test_frames_are_independent(scene, toy_grid):
     contact, x, _ = crumpled(toy_grid, scene, 3)
     x = x + 0.002 * random(*x.shape, seed=9)
@@ -251,7 +271,7 @@ def test_stiffness_is_that_of_dense_algebra(frames_of):
     free = np.array([0, 1, 2, 4, 5, 7, 8, 9, 11])
     place = torch.full((vertices,), -1)
     place[free] = torch.arange(len(free))
-    found = ContactStiffness.of(contacts, x, place, len(free))
+    found = ContactStiffness.of(contacts.slopes(x), frames_of, place, len(free))
     for n in range(frames_of):
         dense = torch.zeros(3 * vertices, 3 * vertices, dtype=torch.float64)
         for p in torch.nonzero(contacts.frame == n)[:, 0].tolist():
@@ -275,7 +295,7 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     pattern = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, CPU)
     blocks = 3.0 * torch.eye(3)[:, :, None].repeat(vertices, 1, 1, frames_of)
     x, place = random(vertices, 3, frames_of, seed=7), torch.arange(vertices)
-    contacts = ContactStiffness.of(random_contacts(vertices, 20, frames_of), x, place, vertices)
+    contacts = ContactStiffness.of(random_contacts(vertices, 20, frames_of).slopes(x), frames_of, place, vertices)
     matrix = BlockMatrix(pattern, blocks, contacts)
     right = random(vertices, 3, frames_of, seed=9).float()
     inverse = inverse_blocks((blocks + contacts.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
@@ -290,13 +310,15 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     torch.testing.assert_close(by_kernel, expected, rtol=1e-3, atol=1e-5)
 
 
-def twisted(potential: IncrementalPotential, points: np.ndarray, pinned: np.ndarray, apart: bool) -> list[np.ndarray]:
+def twisted(
+    potential: IncrementalPotential, points: np.ndarray, pinned: np.ndarray, apart: bool, count: int = 10
+) -> list[np.ndarray]:
     """A sheet whose upper edge turns by 40 degrees in each frame and shrinks, so that it becomes a rope."""
     down = torch.tensor([[0.0], [-9.81], [0.0]], dtype=torch.float64)
     pins = torch.as_tensor(np.flatnonzero(pinned))
     x = frames(points) + 1e-3 * (random(*points.shape, 1) - 0.5) * frames(~pinned[:, None])
     before, known, found = x, None, []
-    for frame in range(10):
+    for frame in range(count):
         angle, width = np.deg2rad(40 * (frame + 1)), 1 - 0.6 * min(1, (frame + 1) / 8)
         edge = points[pinned][:, :1] * width * np.array([np.cos(angle), 0, np.sin(angle)])
         inputs = StepInputs(None, down, 2 * x - before, x, 1 / 30)
@@ -318,6 +340,22 @@ def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
     apart = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=True)]
     assert sum(through) > 10
     assert apart == [0] * 10
+
+
+def test_pairs_are_looked_for_once_at_the_same_positions(scene, toy_grid, monkeypatch):
+    points, faces = toy_grid(8, 8, height=0.5, width=0.5)
+    pinned = points[:, 1] > -1e-9
+    potential = IncrementalPotential(dressed(scene, points, faces, pinned), FABRIC, device=CPU)
+    looked, neighbours = [], SelfContact.neighbours
+
+    def counted(self, last, at, before=None):
+        looked.append((last.numpy().tobytes(), at.numpy().tobytes()))
+        return neighbours(self, last, at, before)
+
+    monkeypatch.setattr(SelfContact, "neighbours", counted)
+    twisted(potential, points, pinned, apart=True, count=3)
+    assert len(looked) > 20
+    assert len(set(looked)) == len(looked)
 
 
 def test_shots_of_different_lengths_go_on_with_it(scene, toy_motion):

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Coulomb friction of cloth on the body and on cloth, as a potential of the slip in one step.
+
+What pressed at the end of the last step rubs in this one: its forces and directions stay as they were then. So the
+friction of a step is a convex potential, as in IPC (Li et al. 2020, Section 5). With the coefficient mu, a force p,
+and a slip of the length y, its derivative by y rises smoothly from zero to mu p at y = `CREEP` dt, and stays there:
+cloth that sticks creeps, at most so fast.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..self_contact import ClothContacts
+from ..self_contact.contacts import Slopes
+from ..self_contact.neighbours import places_among
+
+CREEP = 2e-3  # [m/s]
+TINY = 1e-12  # [m]
+
+
+@dataclass(frozen=True, eq=False)
+class Friction:
+    """What rubs in N frames, in P places.
+
+    Attributes:
+        frames: number N.
+        creep: slip from which on friction is full [m].
+        frame: of each place, shape (P,).
+        vertices: of the cloth, shape (4, P).
+        coefficients: of these in a position c . x, or in the difference of two, shape (4, P).
+        corners: vertices of the body, shape (3, P).
+        weights: of these, likewise; zero where cloth rubs on cloth, shape (3, P).
+        direction: across which it slips, unit vectors, shape (3, P).
+        limit: mu p [N], shape (P,).
+        held: c . x - w . b at the end of the last step [m], for vertices b of the body; then, for a step, c . x where
+            nothing would slip, shape (3, P).
+    """
+
+    frames: int
+    creep: float
+    frame: Tensor
+    vertices: Tensor
+    coefficients: Tensor
+    corners: Tensor
+    weights: Tensor
+    direction: Tensor
+    limit: Tensor
+    held: Tensor
+
+    @classmethod
+    def joined(cls, on_body: Friction, on_cloth: Friction) -> Friction:
+        """Return both together."""
+        parts = [torch.cat(pair, dim=-1) for pair in zip(on_body._rows(), on_cloth._rows(), strict=True)]
+        return cls(on_body.frames, on_body.creep, *parts)
+
+    @classmethod
+    def of_contacts(cls, contacts: ClothContacts, x: Tensor, mu: float, dt: float) -> Friction:
+        """Return that of contacts of cloth with cloth at positions x (V, 3, N)."""
+        own = contacts.pressing(x)
+        none = torch.zeros(3, len(own.frame), dtype=torch.long, device=x.device)
+        held = _combined(own.coefficients, x, own.vertices, own.frame)
+        rows = own.vertices, own.coefficients, none, none.to(x.dtype), own.direction, mu * own.pressure(x), held
+        return cls(own.frames, CREEP * dt, own.frame, *rows)
+
+    def after(self, body: Tensor) -> Friction:
+        """Return that of a step in which the body has moved to points (B, 3, N)."""
+        return replace(self, held=self.held + _combined(self.weights, body, self.corners, self.frame))
+
+    def select(self, frames: Tensor) -> Friction:
+        """Return that of the frames with indices (M,), in ascending order."""
+        place = places_among(self.frame, frames, self.frames)
+        kept = place >= 0
+        _, *rest = (part[..., kept] for part in self._rows())
+        return Friction(len(frames), self.creep, place[kept], *rest)
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Return the potential of each frame [J], shape (N,), at positions x (V, 3, N); zero where nothing slips."""
+        slip = self._slip(x).norm(dim=0)
+        part = slip.clamp_max(self.creep) / self.creep
+        potential = self.limit * self.creep * (part**2 - part**3 / 3) + self.limit * (slip - self.creep).clamp_min(0)
+        return potential.new_zeros(self.frames).index_put_((self.frame,), potential, accumulate=True)
+
+    def gradient(self, x: Tensor) -> Tensor:
+        """Return its gradient [N], shape (V, 3, N)."""
+        slip = self._slip(x)
+        force = self._along(slip.norm(dim=0)) * slip
+        found = x.new_zeros(len(x), x.shape[-1], 3)
+        at = self.vertices, self.frame.expand_as(self.vertices)
+        found.index_put_(at, (self.coefficients[:, None] * force).movedim(1, -1), accumulate=True)
+        return found.movedim(-1, 1).contiguous()
+
+    def slopes(self, x: Tensor) -> Slopes:
+        """Return what its Hessian at x is made of: along the slip, and across it."""
+        slip = self._slip(x)
+        length = slip.norm(dim=0)
+        other = torch.eye(3, dtype=x.dtype, device=x.device)[self.direction.abs().argmin(0)].T
+        any_way = torch.nn.functional.normalize(torch.linalg.cross(self.direction, other, dim=0), dim=0)
+        along = torch.where(length > TINY, slip / length.clamp_min(TINY), any_way)
+        across = torch.linalg.cross(self.direction, along, dim=0)
+        stiffness = 2 / self.creep * (1 - length / self.creep).clamp_min(0) * self.limit
+        parts = [
+            (root.sqrt() * self.coefficients)[:, None] * axis
+            for root, axis in ((stiffness, along), (self._along(length), across))
+        ]
+        return Slopes(self.frame.repeat(2), self.vertices.repeat(1, 2), torch.cat(parts, dim=-1))
+
+    def _slip(self, x: Tensor) -> Tensor:
+        """Return by what cloth slips [m], shape (3, P)."""
+        moved = _combined(self.coefficients, x, self.vertices, self.frame) - self.held
+        return moved - (self.direction * moved).sum(0) * self.direction
+
+    def _along(self, length: Tensor) -> Tensor:
+        """Return the force of friction over the length of the slip [N/m], shape (P,)."""
+        part = length / self.creep
+        return self.limit / self.creep * torch.where(part < 1, 2 - part, 1 / part.clamp_min(1))
+
+    def _rows(self) -> tuple[Tensor, ...]:
+        return (
+            self.frame,
+            self.vertices,
+            self.coefficients,
+            self.corners,
+            self.weights,
+            self.direction,
+            self.limit,
+            self.held,
+        )
+
+
+def _combined(coefficients: Tensor, points: Tensor, index: Tensor, frame: Tensor) -> Tensor:
+    """Return sums (3, P) of points (V, 3, N), each of the index (C, P) in its frame (P,)."""
+    return (coefficients[:, None] * points[index, :, frame].movedim(-1, 1).to(coefficients.dtype)).sum(0)
