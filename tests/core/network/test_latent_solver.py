@@ -16,7 +16,7 @@ from ssilk_core.network.latent_solver import LatentOptions, LatentSolver, shots,
 from ssilk_core.network.latent_solver.free_decoder import DecodedPoints
 from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.latent_solver.slopes import limited_slopes, mlp_slopes
-from ssilk_core.network.latent_solver.warm_start import FrameDescriptors, network_step
+from ssilk_core.network.latent_solver.warm_start import NetworkSteps
 from ssilk_core.network.model.decoder import limited
 from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
@@ -346,16 +346,17 @@ def test_the_network_steps_in_its_own_precision_and_sees_the_cloth(scene, toy_mo
     static = model.initialiser[0].in_features
     pose = model.stepper[0].in_features - 3 * model.config.latent - 3 * model.feedback.count
     rest = model.initial(torch.zeros(1, static)).detach()
-    seen, body, now = FrameDescriptors(rest, torch.zeros(1, pose)), toy_body(scene, 3, 1), rest + 0.1
-    found = network_step(model, rest.double(), now.double(), seen, body)
+    steps, body, now = NetworkSteps(model), toy_body(scene, 3, 1), rest + 0.1
+    pose = torch.zeros(1, pose)
+    seen = steps.described(rest, pose)
+
+    def step(body: BodyFrames) -> Tensor:
+        course = tuple(steps.decoded(z.double(), body.matrices[at].double()) for at, z in enumerate((rest, now)))
+        return steps.step(rest.double(), now.double(), course, seen, body[2:])
+
+    found = step(body)
     assert found.dtype == torch.float64
-    expected = model.roll([rest, now], rest[None], seen.pose[None], body)[-1]
+    expected = model.roll([rest, now], rest[None], pose[None], body)[-1]
     torch.testing.assert_close(found, expected.double())
-    held = network_step(
-        model,
-        rest.double(),
-        now.double(),
-        seen,
-        BodyFrames(body.matrices[:1].expand(3, -1, -1, -1, -1), 0 * body.bend),
-    )
+    held = step(BodyFrames(body.matrices[:1].expand(3, -1, -1, -1, -1), 0 * body.bend))
     assert (found - held).abs().max() > 1e-4
