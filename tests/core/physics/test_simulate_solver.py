@@ -273,6 +273,29 @@ def test_loops_assemble_the_hessian_of_the_reference_in_double_precision(
     torch.testing.assert_close(squares, weight.repeat_interleave(3) @ jacobian.square())
 
 
+@pytest.mark.parametrize("paper", [False, True])
+def test_loops_add_up_energies_and_forces_of_points_as_the_reference_in_double_precision(
+    scene: Scene, paper: bool
+) -> None:
+    pytest.importorskip("numba")
+    law = {"contact_model": "vertex"} if paper else {}
+    fabric = Fabric("toy", bending=1e-3, margin=0.02, tether=500.0, drag=0.3, **law)
+    both = [IncrementalPotential(scene, fabric, device=CPU, dtype=dtype) for dtype in (torch.float64, torch.float32)]
+    x, inputs = moving(scene)
+    distance = both[0].body_distance(x, inputs)
+    assert distance is not None and float(both[0].collision(x, distance).sum()) > 1e-4
+    names = "gravity", "predicted", "advected", "skinned"
+    single = replace(inputs, **{name: getattr(inputs, name).float() for name in names})
+    given = [(x, inputs, distance), (x.float(), single, distance.to(torch.float32))]
+    expected, found = (made.energy(*each) for made, each in zip(both, given))
+    torch.testing.assert_close(found.double(), expected, rtol=2e-6, atol=0)
+    expected, found = (made.gradient(*each) for made, each in zip(both, given))
+    assert float((found - expected).norm()) < 1e-5 * float(expected.norm())  # positions are rounded, too
+    broken = x.float()
+    broken[3, 1, 0] = torch.nan
+    assert both[1].energy(broken, *given[1][1:]).isnan().tolist() == [True, False]
+
+
 def test_blocks_are_inverted() -> None:
     roots = torch.randn(40, 3, 3, generator=torch.Generator().manual_seed(3)).double()
     blocks = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(3)
