@@ -64,8 +64,8 @@ class NormalEquations:
         factor, failed = torch.linalg.cholesky_ex(damped)
         step = -torch.cholesky_solve(gradient.expand(len(dampings), -1, -1)[..., None], factor)[..., 0]
         step = torch.where((failed == 0)[..., None] & step.isfinite(), step, 0) * free
-        slope = (gradient * step).sum(-1)
-        return step, -slope - 0.5 * (step * (hessian @ step[..., None])[..., 0]).sum(-1)
+        # s'Hs = -g's - shift s's, since s solves the system.
+        return step, 0.5 * (shift * step.square().sum(-1) - (gradient * step).sum(-1))
 
 
 def reduce_forces(jacobian: Tensor, gradient: Tensor) -> Tensor:
