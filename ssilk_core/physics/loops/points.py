@@ -12,8 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..collision import SmoothedDistance
-from ..energy.collision import ContactLaw
 from .running import array, compiled, run_parts
 
 
@@ -23,9 +21,9 @@ def points_loop(
     gravity: Tensor,
     anchors: Sequence[tuple[Tensor, Tensor]],
     samples: Tensor,
-    distance: SmoothedDistance | None,
+    planes: tuple[Tensor, Tensor] | None,
     area: Tensor,
-    law: ContactLaw,
+    law: tuple[float, float, float],
     wanted: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the energy of gravity, anchors and contact [J] (N,) and, where wanted, its gradient at vertices without
@@ -34,17 +32,19 @@ def points_loop(
     Args:
         x: positions (V, 3, N); mass: (V, 1); gravity: (3, N).
         anchors: stiffness (V, 1) and target (V, 3, N) of each spring to a point.
-        samples: positions (S, 3, N), at a `distance` from the body; area: of each, (S, 1).
+        samples: positions (S, 3, N); area: of each, (S, 1).
+        planes: normals (S, 3, N) and offsets (S, N) of the distance to the body, or None without contact.
+        law: stiffness, start and ramp of `energy.collision.ContactLaw`.
     """
     vertices, _, frames = x.shape
-    touching = len(samples) if distance is not None else 0
+    normal, offset = (x[:0], x[:0, 0]) if planes is None else planes
+    touching = len(normal)
     weights = torch.cat([weight for weight, _ in anchors], dim=1) if anchors else x.new_zeros(vertices, 0)
     targets = torch.stack([target for _, target in anchors]) if anchors else x.new_zeros(0, vertices, 3, frames)
     energy = x.new_empty(frames)
     slopes = x.new_empty(vertices if wanted else 0, 3, frames), x.new_empty(touching if wanted else 0, 3, frames)
-    planes = (distance.normal, distance.offset) if distance is not None else (x[:0], x[:0, 0])
     given = array(x), array(mass[:, 0]), array(gravity), array(weights), array(targets)
-    contact = array(samples), *map(array, planes), array(area[:, 0]), law.stiffness, law.start, law.ramp
+    contact = array(samples), array(normal), array(offset), array(area[:, 0]), *law
     run_parts(_points, frames, *given, *contact, energy.numpy(), *(slope.numpy() for slope in slopes))
     return energy, *slopes
 

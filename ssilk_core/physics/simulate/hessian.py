@@ -170,7 +170,7 @@ class Hessian:
         corners: Ints = hinges.corners if hinges else NO_CORNERS
         roots = (2 * hinges.stiffness[:, 0]).sqrt().double().numpy() if hinges else np.zeros(0)
 
-        def slots(elements: Ints, sides: list[tuple[int, ...]]) -> Ints:
+        def slots(elements: Ints, sides: list[tuple[int, int]]) -> Ints:
             return np.stack([self.pattern.slots(elements[:, side]) for side in sides], axis=1)
 
         weights = membrane.weights.double().numpy().transpose(1, 0, 2).reshape(-1, 6)

@@ -199,7 +199,9 @@ class IncrementalPotential:
         from ..loops.points import points_loop
 
         given = x, self.mass, inputs.gravity, self._anchors(inputs), self.cloth.positions(x)
-        return points_loop(*given, body_distance, self.cloth.area, self.law, wanted)
+        planes = (body_distance.normal, body_distance.offset) if body_distance else None
+        law = self.law.stiffness, self.law.start, self.law.ramp
+        return points_loop(*given, planes, self.cloth.area, law, wanted)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the collision energy of each sample [J], shape (S, N)."""
