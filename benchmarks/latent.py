@@ -2,8 +2,10 @@
 """Time the solver in latents on a garment that ships, in motions of the demo, with growing numbers of iterations.
 
     OMP_NUM_THREADS=1 python benchmarks/latent.py --garment cape --threads 1
+    python benchmarks/latent.py --device cuda --motion walk --elements chosen --shots 1 16 64 256
 
-All shots of a motion are solved at once, each a frame later in the motion than the one before. Times are those of a
+All shots of a motion are solved at once, each a frame later in the motion than the one before; those that would not
+end within the motion begin again at the first one. Times are those of a
 frame of one shot, in processor time on a processor: medians over frames, without the first two. What it takes to
 choose elements for a motion comes before the first frame ("begins"). Energies are means over frames and shots, of the
 best start, and as solved, on the elements that the solver has; each row has its own past, so rows differ in these.
@@ -40,8 +42,9 @@ from ssilk_core.physics.simulate import SimulationOptions, simulate
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import Floats, Motion
 
-HEADER = ("motion", "elements", "iterations", "begins [s]", "ms a frame and shot", "energy before [J]", "energy [J]",
-          "whole [J]", "inside [%]", "left", "not converged", "failed", "from the simulator [mm]")  # fmt: skip
+HEADER = ("motion", "shots", "elements", "iterations", "begins [s]", "ms a frame and shot", "energy before [J]",
+          "energy [J]", "whole [J]", "inside [%]", "left", "not converged", "failed",
+          "from the simulator [mm]")  # fmt: skip
 SHOWN = 5, -1  # frames whose distances are told
 
 
@@ -80,7 +83,7 @@ def rows(
     """Yield the network's row, then one for each of the options."""
     name, first = shots[0].path, shots[0]
     played = np.concatenate([decode(model, first, pose) for pose in garment_poses(model, first, first.fps)])
-    yield name, "", "network", *[""] * (len(HEADER) - 4), rms(played, reference)
+    yield name, "", "", "network", *[""] * (len(HEADER) - 5), rms(played, reference)
     clock = time.perf_counter if next(model.parameters()).is_cuda else time.process_time
     for options in tried:
         solver, tally = LatentShots(model, file.fabric, options), LatentTally()
@@ -92,10 +95,11 @@ def rows(
         points, whole, inside = on_all_elements(solver, first, states)
         yield (
             name,
+            str(len(shots)),
             "chosen" if options.sampled else "all",
             str(options.iterations),
             f"{ends[1] - ends[0]:.1f}",
-            f"{1000 * float(np.median(np.diff(ends[2:]))) / len(shots):.1f}",
+            f"{1000 * float(np.median(np.diff(ends[2:]))) / len(shots):.3g}",
             f"{tally.mean('start_energy'):.4f}",
             f"{tally.mean('energy'):.4f}",
             f"{whole:.4f}",
@@ -113,7 +117,7 @@ def main() -> None:
     parser.add_argument("--motion", nargs="+", choices=MOTIONS, default=["walk", "cartwheel"], help="of the demo")
     parser.add_argument("--first", type=int, default=20, help="first frame of the first shot (default 20)")
     parser.add_argument("--frames", type=int, default=30, help="of each shot (default 30)")
-    parser.add_argument("--shots", type=int, default=1, help="solved at once (default 1)")
+    parser.add_argument("--shots", type=int, nargs="+", default=[1], help="solved at once (default 1)")
     parser.add_argument("--iterations", type=int, nargs="+", default=[1, 2, 4], help="of the solver (default 1 2 4)")
     parser.add_argument("--elements", nargs="+", choices=("all", "chosen"), default=["all", "chosen"])
     parser.add_argument("--simulate", action="store_true", help="tell distances from the simulator")
@@ -132,13 +136,14 @@ def main() -> None:
     ]
     for name in options.motion:
         whole = build_motion(name, character.skeleton)
-        starts = range(options.first, options.first + options.shots)
-        shots = [whole.clip(start, start + options.frames) for start in starts]
-        shots = [replace(shot, path=name) for shot in shots if shot.frame_count == options.frames]
-        reference = None
+        starts = max(1, whole.frame_count - options.first - options.frames + 1)
+        clips = [whole.clip(options.first + start, options.first + start + options.frames) for start in range(starts)]
+        clips, reference = [replace(clip, path=name) for clip in clips], None
         if options.simulate:
-            reference = simulate(scene, file.fabric, shots[:1], SimulationOptions(fps=shots[0].fps), device=device)[0]
-        found.extend(rows(model, file, shots, tried, reference))
+            reference = simulate(scene, file.fabric, clips[:1], SimulationOptions(fps=clips[0].fps), device=device)[0]
+        for count in options.shots:
+            shots = [clips[number % len(clips)] for number in range(count)]
+            found.extend(rows(model, file, shots, tried, reference))
     print(table(HEADER, found))
 
 

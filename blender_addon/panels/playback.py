@@ -12,6 +12,8 @@ from ..playback.overrides import overriding
 from ..scene.garment import armature_of
 from .base import PlayableGarmentPanel, draw_text, saying_errors
 
+NOT_LIVE = "Plays the network. A solver's motion needs PyTorch, which Blender lacks: bake it with the quality Latent"
+
 
 def live_line(garment: bpy.types.Object) -> str:
     """Return what live playback is at; empty where there is nothing to say."""
@@ -43,6 +45,7 @@ class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
             row.operator("ssilk.refresh_live", text="", icon="FILE_REFRESH")
         else:
             layout.operator("ssilk.play_live", icon="PLAY")
+            draw_text(layout, NOT_LIVE)
         if line:
             draw_text(layout, line)
 

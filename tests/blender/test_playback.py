@@ -43,9 +43,10 @@ def test_every_frame_shows_what_a_bake_would(ready, trained, wanted):
 
 
 def test_the_panel_says_what_live_playback_is_at(ready, trained):
-    from blender_addon.panels.playback import PlaybackPanel
+    from blender_addon.panels.playback import NOT_LIVE, PlaybackPanel
 
-    assert drawn(PlaybackPanel, ready.context) == ["ssilk.play_live"]
+    operator, *said = drawn(PlaybackPanel, ready.context)
+    assert operator == "ssilk.play_live" and " ".join(said) == NOT_LIVE
     ready.ops.ssilk.play_live()
     live = playing().live(trained)
     assert drawn(PlaybackPanel, ready.context) == ["ssilk.stop_live", "ssilk.refresh_live", "Follows the armature"]

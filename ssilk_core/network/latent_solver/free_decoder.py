@@ -85,12 +85,16 @@ class FreeDecoder(nn.Module):
             z: latents, shape (N, m).
             character: skinning matrices of the character's joints, shape (J, 3, 4, N).
         """
-        output = self.output(z)
+        return self.placed(self.output(z), character)
+
+    @torch.no_grad()
+    def placed(self, output: Tensor, character: Tensor) -> Tensor:
+        """Return positions [m], shape (U, 3, N), of outputs (N, outputs); `character` as for `positions`."""
         activation = self.bounded(output[:, : self.activation_count].T)
         values = self._values(output.T[self.activation_count :])
         if loops.supports(values) and values.numel():
             matrices, _ = self._proxies_by_loop(
-                values, values.new_empty(len(z), values[..., 0].numel(), 0), character
+                values, values.new_empty(len(output), values[..., 0].numel(), 0), character
             )
         else:
             moved = limited(values[:, 6:], self.reach) if self.proxy_outputs > 6 else torch.zeros_like(values[:, :3])

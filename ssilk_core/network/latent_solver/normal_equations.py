@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ...physics import loops
 from ...physics.simulate.blocks import BlockMatrix
 
 TINY = 1e-9  # of the mean diagonal, so that what no latent moves stays where it is
@@ -36,14 +37,12 @@ class NormalEquations:
             hessian: over the free vertices [N/m].
             weight: inertia of the free vertices, m / dt^2 [N/m], shape (U,).
         """
-        frames, rows, latents = jacobian.shape
-        product = (hessian.rows.to(jacobian.dtype) @ jacobian.reshape(frames * rows, latents)).view_as(jacobian)
+        product, squares = _products(jacobian, hessian, weight.to(jacobian.dtype))
         reduced = (jacobian.mT @ product).double()
-        squares = jacobian.square().sum(2).reshape(frames, -1, 3).sum(2)
         return cls(
             gradient=reduce_forces(jacobian, gradient),
             hessian=0.5 * (reduced + reduced.mT),
-            inertia=(squares @ weight.to(squares.dtype)).double() / latents,
+            inertia=squares.double().mean(1),
         )
 
     def steps(self, dampings: Tensor, held: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,10 +64,20 @@ class NormalEquations:
         factor, failed = torch.linalg.cholesky_ex(damped)
         step = -torch.cholesky_solve(gradient.expand(len(dampings), -1, -1)[..., None], factor)[..., 0]
         step = torch.where((failed == 0)[..., None] & step.isfinite(), step, 0) * free
-        slope = (gradient * step).sum(-1)
-        return step, -slope - 0.5 * (step * (hessian @ step[..., None])[..., 0]).sum(-1)
+        # s'Hs = -g's - shift s's, since s solves the system.
+        return step, 0.5 * (shift * step.square().sum(-1) - (gradient * step).sum(-1))
 
 
 def reduce_forces(jacobian: Tensor, gradient: Tensor) -> Tensor:
     """Return J' g (N, m), in float64, of a Jacobian (N, 3 U, m) and a gradient (U, 3, N)."""
     return (jacobian.mT @ gradient.permute(2, 0, 1).flatten(1)[..., None])[..., 0].double()
+
+
+def _products(jacobian: Tensor, hessian: BlockMatrix, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Return H_x J (N, 3 U, m), and |dx/dz|^2 of each latent weighted by vertices (N, m)."""
+    if loops.supports(jacobian):
+        from ...physics.loops.block_products import block_product_loop
+
+        return block_product_loop(hessian.blocks, hessian.pattern.block_rows, jacobian, weight)
+    product = hessian.rows.to(jacobian.dtype) @ jacobian.flatten(0, 1)
+    return product.view_as(jacobian), weight.repeat_interleave(3) @ jacobian.square()

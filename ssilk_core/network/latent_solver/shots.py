@@ -25,13 +25,13 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import motion_transforms
 from ..descriptors import pose_features
 from ..model.descriptors import upright_descriptors
-from ..model.feedback import BodyFrames
+from ..model.feedback import BodyFrames, DecodedState
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
 from .elements import choose_elements
 from .options import LatentOptions
 from .solver import LatentSolution, LatentSolver
-from .warm_start import FrameDescriptors, warm_starts
+from .warm_start import Course, FrameDescriptors, NetworkSteps
 
 LOOK_BACK = 2  # earlier frames that descriptors need
 DESCRIBED, POSED = 256, 16  # frames of each motion at once
@@ -59,28 +59,29 @@ class _Past:
 
     Attributes:
         before, now: latents two frames and one frame ago, shape (N, m).
+        course: both, as the network looks back on them.
         cloth: positions.
-        matrices: skinning matrices of the character in both frames, about its root, shape (2, J, 3, 4, N).
-        roots: its positions there [m], float64, shape (2, 3, N).
+        roots: of the character in both frames [m], float64, shape (2, 3, N).
         recovering: frames for which a lost shot still rests, shape (N,).
     """
 
     before: Tensor
     now: Tensor
+    course: Course
     cloth: StepHistory
-    matrices: Tensor
     roots: Tensor
     recovering: Tensor
 
     def first(self, count: int) -> _Past:
         """Return those of the first shots."""
-        own = self.before[:count], self.now[:count], self.cloth.first(count)
-        return _Past(*own, self.matrices[..., :count], self.roots[..., :count], self.recovering[:count])
+        before, now = (DecodedState(each.output[:count], each.points[..., :count]) for each in self.course)
+        own = self.before[:count], self.now[:count], (before, now), self.cloth.first(count)
+        return _Past(*own, self.roots[..., :count], self.recovering[:count])
 
     def followed_by(self, poses: PosedCharacters) -> BodyFrames:
-        """Return the character in both frames and in the next one."""
+        """Return the character in the next frame."""
         bend = poses.root - 2 * self.roots[1] + self.roots[0]
-        return BodyFrames(torch.cat([self.matrices, poses.matrices[None]]), bend.expand(3, -1, -1))
+        return BodyFrames(poses.matrices[None], bend[None])
 
 
 class LatentShots:
@@ -104,6 +105,7 @@ class LatentShots:
             model.scene, fabric, SimulationOptions(fps=self.fps, precision=precision), device=device
         )
         self.solver = LatentSolver(model, self.simulator.potential, options)
+        self.steps = NetworkSteps(model)
 
     @torch.no_grad()
     def sampled(self, motions: Sequence[Motion]) -> tuple[Simulator, LatentSolver]:
@@ -127,8 +129,11 @@ class LatentShots:
 
     def _rolled(self, motion: Motion) -> Tensor:
         """Return the network's states over a motion (F, m), its quasi-static ones where it is lost."""
-        seen, skeleton = list(self._descriptors([motion])), self.model.scene.character.skeleton
-        rest, pose = (torch.stack([getattr(frame, name) for frame in seen]) for name in ("rest", "pose"))
+        skeleton = self.model.scene.character.skeleton
+        parts = [
+            self._described(motion, start, start + DESCRIBED) for start in range(0, motion.frame_count, DESCRIBED)
+        ]
+        rest, pose = (torch.cat(values)[:, None] for values in zip(*parts))
         body = BodyFrames.of(motion_transforms(motion, skeleton.parents), skeleton, rest)
         states = torch.stack(self.model.roll([rest[0], *rest[1:LOOK_BACK]], rest[LOOK_BACK:], pose[LOOK_BACK:], body))
         sound = states.abs().amax(dim=2, keepdim=True) < DIVERGENCE_BOUND
@@ -176,16 +181,20 @@ class LatentShots:
         """Yield what the network sees in each frame of the motions that have not ended."""
         for start in range(0, motions[0].frame_count, DESCRIBED):
             stop = start + DESCRIBED
-            parts = [self._described(motion, start, stop) for motion in motions if motion.frame_count > start]
+            parts = [
+                self.steps.described(*self._described(motion, start, stop))
+                for motion in motions
+                if motion.frame_count > start
+            ]
             for frame in range(len(parts[0].rest)):
                 running = [part for part in parts if len(part.rest) > frame]
                 yield FrameDescriptors(
                     torch.stack([part.rest[frame] for part in running]),
-                    torch.stack([part.pose[frame] for part in running]),
+                    tuple(torch.stack([v[frame] for v in values]) for values in zip(*(p.given for p in running))),
                 )
 
-    def _described(self, motion: Motion, start: int, stop: int) -> FrameDescriptors:
-        """Return what the network sees in consecutive frames of a motion."""
+    def _described(self, motion: Motion, start: int, stop: int) -> tuple[Tensor, Tensor]:
+        """Return quasi-static latents (F, m) and dynamic descriptors (F, D) in consecutive frames of a motion."""
         model, parameter = self.model, next(self.model.parameters())
         seen = motion.clip(max(0, start - LOOK_BACK), stop)
         count = min(stop, motion.frame_count) - start
@@ -195,7 +204,7 @@ class LatentShots:
         rest = model.initial(static)
         sound = rest.abs().amax(dim=1, keepdim=True) < DIVERGENCE_BOUND  # NaN is not less than anything
         rest = torch.where(sound, rest, torch.zeros_like(rest))
-        return FrameDescriptors(rest, dynamic)
+        return rest, dynamic
 
     def _advance(
         self,
@@ -213,7 +222,7 @@ class LatentShots:
             starts, iterations = [rest], self.options.first_iterations
         else:
             body = past.followed_by(poses)
-            starts, iterations = warm_starts(self.model, past.before, past.now, seen, body), None
+            starts, iterations = self.steps.starts(past.before, past.now, past.course, seen, body), None
         found = solver.solve(starts, poses.matrices, inputs, iterations)
         lost = ~(found.energy.isfinite() & found.z.isfinite().all(1))
         recovering = torch.zeros_like(found.iterations) if past is None else past.recovering
@@ -222,8 +231,7 @@ class LatentShots:
         if bool(lost.any()):
             found = found.where(lost, solver.given(rest, poses.matrices, inputs))
         cloth = StepHistory(found.x.double() + poses.root, past.cloth.last if past else None, poses.root, poses.lbs)
-        before, earlier, root = found.z, poses.matrices, poses.root
-        if past:
-            before, earlier, root = past.now, past.matrices[1], past.roots[1]
-        course = torch.stack([earlier, poses.matrices]), torch.stack([root, poses.root])
-        return LatentFrame(number, found, lost), _Past(before, found.z, cloth, *course, (recovering - 1).clamp_min(0))
+        now = self.steps.decoded(found.z, poses.matrices)
+        before, earlier, root = (past.now, past.course[1], past.roots[1]) if past else (found.z, now, poses.root)
+        roots, recovering = torch.stack([root, poses.root]), (recovering - 1).clamp_min(0)
+        return LatentFrame(number, found, lost), _Past(before, found.z, (earlier, now), cloth, roots, recovering)

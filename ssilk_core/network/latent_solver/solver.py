@@ -35,6 +35,7 @@ from .options import LatentOptions
 # Factors of a frame's damping, each of which is tried, and the length of the step. States curve: more damping often
 # finds less energy than a shorter step.
 TRIALS = ((1.0, 1.0), (0.1, 1.0), (10.0, 1.0), (100.0, 1.0), (100.0, 0.25))
+DAMPINGS = tuple(dict.fromkeys(factor for factor, _ in TRIALS))  # each of which is solved for once
 ADAPTED = 0.5  # the exponent of the best trial's factor, by which a frame's damping changes
 TIGHTENED = 100.0  # the factor where no trial was good
 DAMPING_RANGE = (1e-6, 1e9)
@@ -248,9 +249,10 @@ class _LatentSearch:
             self.stale = False
         factors = self.damping.new_tensor([factor for factor, _ in TRIALS])
         usual = torch.full_like(self.damping, self.solver.options.damping)
-        dampings = torch.cat([factors[:, None] * self.damping, usual[None]])
-        steps, promised = self.model.steps(dampings, self._held(self.model.gradient))
-        steps, wanted = steps[:-1], promised[-1] > self.allowed
+        dampings = self.damping.new_tensor(DAMPINGS)[:, None] * self.damping
+        steps, promised = self.model.steps(torch.cat([dampings, usual[None]]), self._held(self.model.gradient))
+        wanted = promised[-1] > self.allowed
+        steps = torch.stack([steps[DAMPINGS.index(factor)] for factor, _ in TRIALS])
         if not bool(wanted.any()):
             return False
         found, trial = self._least(steps)

@@ -95,14 +95,31 @@ class Feedback(nn.Module):
         Args:
             body: the character in that frame alone, F = 1, which only points need.
         """
-        points = [self._points_seen(decoder, past, body)] if body is not None and self.count else []
+        carried = None
+        if body is not None and self.count:
+            before, now = past
+            carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0]).points
+        return self.features(decoder, past, carried, body)
+
+    def features(
+        self,
+        decoder: Decoder,
+        past: tuple[DecodedState, DecodedState],
+        carried: Tensor | None,
+        body: BodyFrames | None,
+    ) -> Tensor:
+        """Return the result of `seen`.
+
+        Args:
+            carried: points (M, 3, N) of the outputs on the course of both states, in the frame of `body`.
+        """
+        points = [] if carried is None or body is None else [self._points_seen(past, carried, body)]
         proxies = [_proxies(decoder, state.output) for state in past] if self.size > 3 * self.count else []
         return torch.cat([*points, *proxies], dim=1)
 
-    def _points_seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames) -> Tensor:
+    def _points_seen(self, past: tuple[DecodedState, DecodedState], carried: Tensor, body: BodyFrames) -> Tensor:
         before, now = past
-        carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0])
-        away = 2 * now.points - before.points - carried.points - body.bend[0]
+        away = 2 * now.points - before.points - carried - body.bend[0]
         turn = body.matrices[0, self.hub, :, :3]  # of the root, but for a constant
         own = torch.einsum("ban,mbn->man", turn, away)
         return LIMIT * torch.tanh(own.flatten(0, 1).T / (UNIT * LIMIT))

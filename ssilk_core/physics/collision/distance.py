@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import kernels, loops
@@ -57,6 +59,14 @@ class PosedBody:
     faces: Tensor | None = None
     patches: Tensor | None = None
     limbs: PosedLimbs | None = None
+
+    @cached_property
+    def sphere_bounds(self) -> tuple[NDArray, NDArray]:
+        """Spheres around its triangles, for loops: one body is queried several times."""
+        from ..loops.smoothed_distance import sphere_bounds
+
+        assert self.faces is not None
+        return sphere_bounds(self.points, self.faces)
 
     def select(self, frames: Tensor) -> PosedBody:
         """Return the body in the frames with indices (M,)."""
@@ -177,7 +187,7 @@ def _smoothed_by_loop(
 
     assert body.faces is not None
     found, *smoothed = smoothed_distance_loop(
-        x, search_radius, body.points, body.normals, body.faces, candidates,
+        x, search_radius, body.points, body.normals, body.faces, candidates, body.sphere_bounds,
         reach=reach, max_distance=MAX_QUERY_DISTANCE, deep_cosine=DEEP_COSINE, surface_epsilon=SURFACE_EPSILON,
         exponent=SMOOTHING_EXPONENT, search_margin=SEARCH_MARGIN, edge_epsilon=EDGE_EPSILON,
     )  # fmt: skip

@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .running import array, compiled, run_parts
+
+# A crossing lies outside of its triangle by at most this many times the tolerance and the rounding error, relative to
+# the triangle's size; segments whose boxes do not reach so far are not looked at.
+WIDENED, ROUNDING = 4.0, 1e-9
 
 
 def crossings_loop(
@@ -30,12 +35,30 @@ def crossings_loop(
 
 @compiled
 def _crossings(starts, ends, x, faces, edge_tolerance, counts, last, start, stop):
-    for p in range(start, stop):
-        for n in range(starts.shape[2]):
+    low, high = np.empty((len(faces), 3)), np.empty((len(faces), 3))  # boxes of triangles, somewhat widened
+    for n in range(starts.shape[2]):
+        for f in range(len(faces)):
+            i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+            widest = 0.0
+            for axis in range(3):
+                a, b, c = np.float64(x[i, axis, n]), np.float64(x[j, axis, n]), np.float64(x[k, axis, n])
+                low[f, axis], high[f, axis] = min(a, b, c), max(a, b, c)
+                widest = max(widest, high[f, axis] - low[f, axis])
+            for axis in range(3):
+                low[f, axis] -= WIDENED * (edge_tolerance + ROUNDING) * widest
+                high[f, axis] += WIDENED * (edge_tolerance + ROUNDING) * widest
+        for p in range(start, stop):
             ox, oy, oz = starts[p, 0, n], starts[p, 1, n], starts[p, 2, n]
             dx, dy, dz = ends[p, 0, n] - ox, ends[p, 1, n] - oy, ends[p, 2, n] - oz
+            left, right = min(ox, ox + dx), max(ox, ox + dx)
+            below, above = min(oy, oy + dy), max(oy, oy + dy)
+            back, front = min(oz, oz + dz), max(oz, oz + dz)
             farthest = -1.0
             for f in range(len(faces)):
+                if low[f, 0] > right or high[f, 0] < left or low[f, 1] > above or high[f, 1] < below:
+                    continue
+                if low[f, 2] > front or high[f, 2] < back:
+                    continue
                 i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
                 sx, sy, sz = ox - x[i, 0, n], oy - x[i, 1, n], oz - x[i, 2, n]
                 ux, uy, uz = sx + x[j, 0, n] - ox, sy + x[j, 1, n] - oy, sz + x[j, 2, n] - oz

@@ -11,6 +11,7 @@ from math import exp, log, sqrt
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from .running import array, compiled, run_parts
@@ -28,6 +29,7 @@ def smoothed_distance_loop(
     normals: Tensor,
     faces: Tensor,
     candidates: Tensor | None,
+    bounds: tuple[NDArray, NDArray],
     *,
     reach: float,
     max_distance: float,
@@ -41,6 +43,9 @@ def smoothed_distance_loop(
     (V, 3, 3, N), as `collision.smoothed_distance.smoothed_distance` does.
 
     Arguments are those of that function, and limits as for `kernels.smoothed_distance.smoothed_distance_kernel`.
+
+    Args:
+        bounds: of the body, as `sphere_bounds` returns them.
     """
     rows, _, frames = x.shape
     found, normal, offset = (
@@ -50,15 +55,24 @@ def smoothed_distance_loop(
     )
     curvature = x.new_zeros(rows, 3, 3, frames, dtype=torch.float32)
     listed = faces.new_zeros(0, 0) if candidates is None else candidates
-    spheres = np.empty((frames, len(faces), 4))
-    groups = np.empty((frames, -(-len(faces) // GROUP), 4))
-    body = array(points), array(faces)
-    run_parts(_bound, frames, *body, spheres, groups)
-    given = array(x), array(search_radius), *body, array(normals), array(listed), spheres, groups
+    body = array(points), array(faces), array(normals)
+    given = array(x), array(search_radius), *body, array(listed), *bounds
     limits = reach, max_distance, deep_cosine, surface_epsilon, exponent, 1 + search_margin, edge_epsilon
     out = found.numpy(), normal.numpy(), offset.numpy(), curvature.numpy()
     run_parts(_search, rows, *given, candidates is not None, *limits, *out)
     return found, normal, offset, curvature
+
+
+def sphere_bounds(points: Tensor, faces: Tensor) -> tuple[NDArray, NDArray]:
+    """Return centres and radii of spheres around triangles (N, F, 4) and around groups of them (N, G, 4).
+
+    Args:
+        points: of a body (B, 3, N); faces: (F, 3).
+    """
+    spheres = np.empty((points.shape[2], len(faces), 4))
+    groups = np.empty((points.shape[2], -(-len(faces) // GROUP), 4))
+    run_parts(_bound, points.shape[2], array(points), array(faces), spheres, groups)
+    return spheres, groups
 
 
 @compiled

@@ -24,6 +24,7 @@ from .contact_stiffness import ContactStiffness
 
 if TYPE_CHECKING:
     from ..kernels.conjugate_gradient import BlockTable
+    from ..loops.block_products import BlockRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,14 @@ class BlockPattern:
             torch.as_tensor(values, device=self.device) for values in (columns, places, counts.astype(np.int32))
         )
         return BlockTable(*tables)
+
+    @cached_property
+    def block_rows(self) -> BlockRows:
+        """Return the blocks of each row, for loops."""
+        from ..loops.block_products import BlockRows
+
+        row, column, stored, below = self._blocks()
+        return BlockRows(np.searchsorted(row, np.arange(self.count + 1)), column, stored, below)
 
     @cached_property
     def _row_entries(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from itertools import combinations_with_replacement
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,6 +13,7 @@ from torch import Tensor
 
 from ...scene.assets import PINNED, Ints, Scene
 from ...scene.mesh import topology
+from .. import loops
 from ..collision.samples import ContactSamples
 from ..energy import GarmentEnergy
 from ..energy.stitching import Stitching
@@ -19,6 +22,9 @@ from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer
 from .stitches import stitch_slopes
+
+if TYPE_CHECKING:
+    from ..loops.stiffness import StiffnessTables
 
 FIXED_STIFFNESS_FACTOR = 1e6
 NO_CORNERS = np.zeros((0, 4), dtype=np.int64)
@@ -46,7 +52,7 @@ class Hessian:
     ) -> None:
         device = membrane.area.device
         self.membrane, self.hinges, self.stitching, self.free_count = membrane, hinges, stitching, len(free)
-        self.free = torch.as_tensor(free, device=device)
+        self.free, self.samples = torch.as_tensor(free, device=device), samples
         faces, corners = membrane.corners, hinges.corners if hinges else NO_CORNERS
         near = np.concatenate([faces[:, pair] for pair in combinations_with_replacement(range(3), 2)])
         stitched = stitching.corners if stitching else NO_CORNERS
@@ -124,19 +130,13 @@ class Hessian:
             fixed: free vertices that are stiffened so that a solution hardly moves them, shape (U, N), or None.
             exact_hessian: see `Membrane.stiffness`.
         """
-        blocks = self.sum_faces(self.membrane.stiffness(x, exact_hessian))
-        if self.hinges:
-            slopes = self.hinges.slopes(x)
-            blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
+        blocks = self._unstitched(x, weight, contact, exact_hessian)
         if self.stitching:
             slopes = stitch_slopes(self.stitching, x)
             product = slopes[self.held][:, :, :, None] * slopes[self.holding][:, :, None]
             blocks += self.sum_stitches(product.sum(1))
-        if contact is not None:
-            blocks += self.sum_samples(contact.float().flatten(1, 2)).view_as(blocks)
-        diagonal = blocks[: self.free_count]
-        diagonal += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
         if fixed is not None:
+            diagonal = blocks[: self.free_count]
             stiff = (
                 FIXED_STIFFNESS_FACTOR
                 * diagonal.square().sum((1, 2)).sqrt()[:, None, None]
@@ -144,6 +144,47 @@ class Hessian:
             )
             diagonal.copy_(torch.where(fixed[:, None, None], stiff, diagonal))
         return BlockMatrix(self.pattern, blocks)
+
+    def _unstitched(self, x: Tensor, weight: Tensor, contact: Tensor | None, exact_hessian: Tensor | None) -> Tensor:
+        """Return the blocks (stored, 3, 3, N) without those of stitches."""
+        if loops.supports(x):
+            from ..loops.stiffness import stiffness_loop
+
+            stored, fabric = self.pattern.block_count, self.membrane.fabric
+            return stiffness_loop(x, self._tables, fabric, stored, weight, contact, exact_hessian)
+        blocks = self.sum_faces(self.membrane.stiffness(x, exact_hessian))
+        if self.hinges:
+            slopes = self.hinges.slopes(x)
+            blocks += self.sum_hinges(outer(slopes[self.left], slopes[self.right]))
+        if contact is not None:
+            blocks += self.sum_samples(contact.float().flatten(1, 2)).view_as(blocks)
+        blocks[: self.free_count] += weight[:, None, None] * torch.eye(3, device=x.device)[:, :, None]
+        return blocks
+
+    @cached_property
+    def _tables(self) -> StiffnessTables:
+        from ..loops.stiffness import StiffnessTables
+
+        membrane, hinges, samples = self.membrane, self.hinges, self.samples
+        near = list(combinations_with_replacement(range(3), 2))
+        corners: Ints = hinges.corners if hinges else NO_CORNERS
+        roots = (2 * hinges.stiffness[:, 0]).sqrt().double().numpy() if hinges else np.zeros(0)
+
+        def slots(elements: Ints, sides: list[tuple[int, int]]) -> Ints:
+            return np.stack([self.pattern.slots(elements[:, side]) for side in sides], axis=1)
+
+        weights = membrane.weights.double().numpy().transpose(1, 0, 2).reshape(-1, 6)
+        return StiffnessTables(
+            membrane.corners,
+            slots(membrane.corners, near),
+            np.column_stack([weights, membrane.area.double().numpy()]),
+            corners,
+            np.argsort(corners, axis=1, kind="stable"),
+            slots(np.sort(corners, axis=1), SIDES),
+            roots,
+            slots(samples.corners, near),
+            np.stack([samples.weights[:, i] * samples.weights[:, j] for i, j in near], axis=1),
+        )
 
 
 def _pairs(corners: Ints) -> Ints:

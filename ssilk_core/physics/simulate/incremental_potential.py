@@ -227,15 +227,29 @@ class IncrementalPotential:
 
     def energy(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
-        total = self._elastic_energy(x) - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
+        total = self._elastic_energy(x)
         if self.stitching:
             total = total + self.stitching.energy(x)
-        for weight, target in self._anchors(inputs):
-            total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
         for part in (inputs.contacts, inputs.friction):
             if part is not None:
                 total = total + part.energy(x)
+        if loops.supports(x) and not x.requires_grad:
+            return total + self._points(x, inputs, body_distance, False)[0]
+        total = total - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
+        for weight, target in self._anchors(inputs):
+            total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
         return total + self.collision(x, body_distance).sum(0)
+
+    def _points(
+        self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None, wanted: bool
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `loops.points.points_loop` does for gravity, anchors and contact with the body."""
+        from ..loops.points import points_loop
+
+        given = x, self.mass, inputs.gravity, self._anchors(inputs), self.cloth.positions(x)
+        planes = (body_distance.normal, body_distance.offset) if body_distance else None
+        law = self.law.stiffness, self.law.start, self.law.ramp
+        return points_loop(*given, planes, self.cloth.area, law, wanted)
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the collision energy of each sample [J], shape (S, N)."""
@@ -249,12 +263,17 @@ class IncrementalPotential:
 
     def gradient(self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the gradient [N] at all vertices, shape (V, 3, N)."""
-        total = self._elastic_gradient(x) - self.mass[:, None] * inputs.gravity
+        total = self._elastic_gradient(x)
         if self.stitching:
             total += stitch_gradient(self.stitching, x)
         for part in (inputs.contacts, inputs.friction):
             if part is not None:
                 total += part.gradient(x)
+        if loops.supports(x):
+            _, slopes, pushes = self._points(x, inputs, body_distance, True)
+            total += slopes
+            return total + self.cloth.to_vertices(pushes) if body_distance else total
+        total -= self.mass[:, None] * inputs.gravity
         for weight, target in self._anchors(inputs):
             total += weight[:, None] * (x - target)
         if body_distance:

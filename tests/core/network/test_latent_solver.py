@@ -14,9 +14,10 @@ from torch import Tensor
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.latent_solver import LatentOptions, LatentSolver, shots, solver
 from ssilk_core.network.latent_solver.free_decoder import DecodedPoints
+from ssilk_core.network.latent_solver.normal_equations import TINY, NormalEquations
 from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.latent_solver.slopes import limited_slopes, mlp_slopes
-from ssilk_core.network.latent_solver.warm_start import FrameDescriptors, network_step
+from ssilk_core.network.latent_solver.warm_start import NetworkSteps
 from ssilk_core.network.model.decoder import limited
 from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
@@ -165,6 +166,26 @@ def test_its_hessian_is_that_of_the_simulator_seen_by_the_latents(frames) -> Non
         mean = (jacobian[frame].T @ (inertia[:, None] * jacobian[frame])).diagonal().mean()
         torch.testing.assert_close(model.inertia[frame], mean)
     assert torch.linalg.eigvalsh(model.hessian).min() > 0
+
+
+def test_steps_are_those_of_dense_algebra_and_promise_what_the_model_says() -> None:
+    generator = torch.Generator().manual_seed(3)
+    roots = torch.randn(3, 9, 9, generator=generator).double()
+    hessian, gradient = roots @ roots.mT, torch.randn(3, 9, generator=generator).double()
+    hessian[2] -= 100 * torch.eye(9)  # no step of the last frame lowers it
+    held = torch.rand(3, 9, generator=generator) < 0.3
+    dampings, inertia = torch.tensor([[0.1] * 3, [3.0] * 3]).double(), torch.tensor([1.0, 2.0, 1.0]).double()
+    steps, promised = NormalEquations(gradient, hessian, inertia).steps(dampings, held)
+    for frame in range(2):
+        free, own = ~held[frame], hessian[frame]
+        for trial in range(2):
+            shift = dampings[trial, frame] * inertia[frame] + TINY * own.diagonal().mean()
+            damped = own[free][:, free] + shift * torch.eye(int(free.sum()))
+            step = torch.zeros(9).double()
+            step[free] = -torch.linalg.solve(damped, gradient[frame][free])
+            torch.testing.assert_close(steps[trial, frame], step)
+            torch.testing.assert_close(promised[trial, frame], -gradient[frame] @ step - 0.5 * step @ own @ step)
+    assert not steps[:, 2].any() and not promised[:, 2].any()
 
 
 @pytest.mark.parametrize(("exact", "precision"), [(True, "float64"), (False, "float32")])
@@ -346,16 +367,17 @@ def test_the_network_steps_in_its_own_precision_and_sees_the_cloth(scene, toy_mo
     static = model.initialiser[0].in_features
     pose = model.stepper[0].in_features - 3 * model.config.latent - 3 * model.feedback.count
     rest = model.initial(torch.zeros(1, static)).detach()
-    seen, body, now = FrameDescriptors(rest, torch.zeros(1, pose)), toy_body(scene, 3, 1), rest + 0.1
-    found = network_step(model, rest.double(), now.double(), seen, body)
+    steps, body, now = NetworkSteps(model), toy_body(scene, 3, 1), rest + 0.1
+    pose = torch.zeros(1, pose)
+    seen = steps.described(rest, pose)
+
+    def step(body: BodyFrames) -> Tensor:
+        course = tuple(steps.decoded(z.double(), body.matrices[at].double()) for at, z in enumerate((rest, now)))
+        return steps.step(rest.double(), now.double(), course, seen, body[2:])
+
+    found = step(body)
     assert found.dtype == torch.float64
-    expected = model.roll([rest, now], rest[None], seen.pose[None], body)[-1]
+    expected = model.roll([rest, now], rest[None], pose[None], body)[-1]
     torch.testing.assert_close(found, expected.double())
-    held = network_step(
-        model,
-        rest.double(),
-        now.double(),
-        seen,
-        BodyFrames(body.matrices[:1].expand(3, -1, -1, -1, -1), 0 * body.bend),
-    )
+    held = step(BodyFrames(body.matrices[:1].expand(3, -1, -1, -1, -1), 0 * body.bend))
     assert (found - held).abs().max() > 1e-4

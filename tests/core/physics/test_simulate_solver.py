@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import minimize
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.physics import loops
 from ssilk_core.physics.collision import CollisionBody, PosedBody, SmoothedDistance
 from ssilk_core.physics.energy import TERMS, GarmentEnergy
 from ssilk_core.physics.energy.bending import dihedral_angles
@@ -245,6 +246,55 @@ def test_no_hessian_has_a_negative_eigenvalue(potential: IncrementalPotential, s
     side = 3 * len(potential.free)
     values = torch.linalg.eigvalsh(matrix.reshape(side, side).double())
     assert values[0] > -1e-6 * values[-1]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+@pytest.mark.parametrize("size", [1.15, 0.7])  # stretched, and squeezed
+def test_loops_assemble_the_hessian_of_the_reference_in_double_precision(
+    potential: IncrementalPotential, scene: Scene, size: float, whole: bool
+) -> None:
+    pytest.importorskip("numba")
+    from ssilk_core.physics.loops.block_products import block_product_loop
+
+    x, inputs = moving(scene)
+    x = size * x
+    distance = potential.body_distance(x, inputs)
+    exact = torch.tensor([whole, False])
+    expected = potential.hessian(x, inputs, distance, exact_hessian=exact).blocks
+    single = IncrementalPotential(scene, potential.fabric, device=CPU, dtype=torch.float32)
+    assert distance is not None and loops.supports(x.float())
+    found = single.hessian(x.float(), inputs, distance.to(torch.float32), exact_hessian=exact).blocks
+    assert float((found - expected).norm()) < 2e-5 * float(expected.norm())
+    jacobian = torch.randn(2, 3 * len(potential.free), 7, generator=torch.Generator().manual_seed(1))
+    weight = torch.rand(len(potential.free), generator=torch.Generator().manual_seed(2))
+    product, squares = block_product_loop(found, single.block_pattern.block_rows, jacobian, weight)
+    rows = single.block_pattern.rows(found).to_dense().double()
+    wanted = (rows @ jacobian.double().flatten(0, 1)).view_as(jacobian)
+    torch.testing.assert_close(product.double(), wanted, rtol=0, atol=1e-5 * float(wanted.abs().max()))
+    torch.testing.assert_close(squares, weight.repeat_interleave(3) @ jacobian.square())
+
+
+@pytest.mark.parametrize("paper", [False, True])
+def test_loops_add_up_energies_and_forces_of_points_as_the_reference_in_double_precision(
+    scene: Scene, paper: bool
+) -> None:
+    pytest.importorskip("numba")
+    law = {"contact_model": "vertex"} if paper else {}
+    fabric = Fabric("toy", bending=1e-3, margin=0.02, tether=500.0, drag=0.3, **law)
+    both = [IncrementalPotential(scene, fabric, device=CPU, dtype=dtype) for dtype in (torch.float64, torch.float32)]
+    x, inputs = moving(scene)
+    distance = both[0].body_distance(x, inputs)
+    assert distance is not None and float(both[0].collision(x, distance).sum()) > 1e-4
+    names = "gravity", "predicted", "advected", "skinned"
+    single = replace(inputs, **{name: getattr(inputs, name).float() for name in names})
+    given = [(x, inputs, distance), (x.float(), single, distance.to(torch.float32))]
+    expected, found = (made.energy(*each) for made, each in zip(both, given))
+    torch.testing.assert_close(found.double(), expected, rtol=2e-6, atol=0)
+    expected, found = (made.gradient(*each) for made, each in zip(both, given))
+    assert float((found - expected).norm()) < 1e-5 * float(expected.norm())  # positions are rounded, too
+    broken = x.float()
+    broken[3, 1, 0] = torch.nan
+    assert both[1].energy(broken, *given[1][1:]).isnan().tolist() == [True, False]
 
 
 def test_blocks_are_inverted() -> None:
