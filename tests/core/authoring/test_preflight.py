@@ -80,7 +80,7 @@ def still(frames: int = 60, fps: float = 30.0) -> Motion:
 
 
 def turning(frames: int = 60) -> Motion:
-    angle = np.linspace(0, 1, frames)[:, None] * [1, 1, 1]
+    angle = np.linspace(0, 0.5, frames)[:, None] * [1, 1, 1]
     rotations = np.stack([np.cos(angle), np.sin(angle), 0 * angle, 0 * angle], -1)
     return replace(still(frames), rotations=rotations)
 
