@@ -229,6 +229,48 @@ def test_a_garment_in_its_own_file_goes_from_its_bind_pose_to_the_characters(tmp
     np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
 
 
+@pytest.mark.parametrize(("other", "is_off"), [([5, 10, 0], False), ([5, 10, 3], True)])
+def test_an_animation_of_its_own_moves_a_garment_as_the_characters_or_is_refused(tmp_path, other, is_off):
+    path = outfit(tmp_path, "another pose, animated")
+    stage = Usd.Stage.Open(str(path))
+    animate(stage, "/Hero/Own", BIND, [10, 20, -30], UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Outfit/Rig")))
+    for walk, turn in (("/Hero/Walk", [5, 10, 0]), ("/Hero/Own", other)):
+        animation = UsdSkel.Animation(stage.GetPrimAtPath(walk))
+        turned = Rotation.from_euler("x", np.array(turn)[:, None], degrees=True).as_matrix()
+        quats = Rotation.from_matrix(kinematics.local_transforms(BIND, PARENTS)[:, :3, :3] @ turned).as_quat()
+        animation.GetRotationsAttr().Set([Gf.Quatf(float(w), *map(float, v)) for *v, w in quats], 12)
+    stage.Save()
+    if is_off:
+        with pytest.raises(SsilkError, match=r"/Hero/Own moves Hips/Leg otherwise than .* at time code 12"):
+            read_scene(path, garment="Cape")
+        return
+    garment = read_scene(path, garment="Cape")[1]
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+
+
+SKIN = ("points", "primvars:skel:jointIndices", "primvars:skel:jointWeights", "primvars:skel:geomBindTransform")
+
+
+@pytest.mark.parametrize("name", SKIN)
+@pytest.mark.parametrize("of", ["/Hero/Body", "/Hero/Outfit/Cape"])
+def test_what_skinning_begins_with_may_be_a_time_sample_and_may_not_change(tmp_path, of, name):
+    path = outfit(tmp_path, "geomBindTransform")
+    stage = Usd.Stage.Open(str(path))
+    attribute = stage.GetPrimAtPath(of).GetAttribute(name)
+    value = attribute.Get()
+    attribute.Clear()
+    attribute.Set(value, 3)
+    attribute.Set(value, 9)
+    stage.Save()
+    garment = read_scene(path, garment="Cape")[1]
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+    found = np.array(value)
+    attribute.Set(type(value)((found[::-1] if name.endswith("Indices") else found * 1.1).tolist()), 9)
+    stage.Save()
+    with pytest.raises(SsilkError, match=f"its {name} changes at time code 9"):
+        read_scene(path, garment="Cape")
+
+
 def test_other_axes_of_the_same_joints_move_no_garment_in_its_own_file(tmp_path):
     """Programs turn the axes of joints as they like; where the joints stand is the pose."""
     hero, own = tmp_path / "hero.usda", tmp_path / "cape.usda"
