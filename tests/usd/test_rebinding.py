@@ -138,7 +138,7 @@ def seen(stage: Usd.Stage, path: str, code=0) -> np.ndarray:
     """World positions of a mesh as UsdSkel alone computes them."""
     prim = stage.GetPrimAtPath(path)
     cache = UsdSkel.Cache()
-    cache.Populate(UsdSkel.Root.Find(prim), Usd.PrimDefaultPredicate)
+    cache.Populate(UsdSkel.Root.Find(prim), Usd.TraverseInstanceProxies())
     bound = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
     points = UsdGeom.Mesh(prim).GetPointsAttr().Get()
     transforms = cache.GetSkelQuery(bound).ComputeSkinningTransforms(code)
@@ -246,6 +246,32 @@ def test_an_animation_of_its_own_moves_a_garment_as_the_characters_or_is_refused
         return
     garment = read_scene(path, garment="Cape")[1]
     np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_one_of_two_instances_of_a_character_is_read_and_rigged_where_it_is(tmp_path, name):
+    hero, path, out = (tmp_path / f"{each}.usda" for each in ("hero", "two", "rigged"))
+    stage = Usd.Stage.CreateNew(str(hero))
+    rig = character(stage)
+    mesh(stage, "/Hero/Cape", CLOTH, FACES, OF_JOINTS, "/Hero/Rig")
+    animate(stage, "/Hero/Walk", BIND, [10, 20, -30], rig)
+    stage.Save()
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    for instance, place in (("A", xform()), ("B", xform((0, 70, 0), at=(3, 0, 1)))):
+        prim = stage.DefinePrim(f"/{instance}", "SkelRoot")
+        UsdGeom.Xformable(prim).AddTransformOp().Set(gf(place))
+        prim.GetReferences().AddReference("hero.usda")
+        prim.SetInstanceable(True)
+    stage.Save()
+    found, garment, _ = read_scene(path, root=f"/{name}", garment=f"/{name}/Cape")
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+    none = ProxyRig(garment.mesh.path, (), np.zeros(0, int), np.zeros((0, 4, 4)), garment.skin)
+    write_rigged_stage(path, Scene(found, Garment(garment.mesh, garment.skin, np.full(len(CLOTH), 1)), none), out)
+    after = Usd.Stage.Open(str(out))
+    for each in ("A", "B"):
+        np.testing.assert_allclose(seen(after, f"/{each}/Cape"), seen(stage, f"/{each}/Cape"), atol=3e-6)
 
 
 SKIN = ("points", "primvars:skel:jointIndices", "primvars:skel:jointWeights", "primvars:skel:geomBindTransform")
