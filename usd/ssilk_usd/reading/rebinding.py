@@ -15,15 +15,17 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Skeleton
 from ssilk_core.scene.kinematics import world_transforms
 
-from ..opening.stage import EARLIEST, PRIMS, column_matrix, location
+from ..opening.stage import EARLIEST, PRIMS, column_matrix, location, value
 from ..opening.times import change_times
 from ..units import scaling
 from .animation import NEEDED, animation_source
+from .clips import spread
 from .skeleton import skeleton_at, skeletons
 from .skin import AuthoredInfluences, match_joints
 from .spaces import SkelSource
 
 SAME = 1e-5  # [m], and of rotation matrices: two bind poses that differ by less are one, rounded
+COMPARED = 200  # time codes at which two animations are compared, at most
 ONE_MOTION = 1e-3  # [m], and of rotation matrices: how far joints of two Skeletons may part while they are animated
 SAME_PLACE = 1e-3  # of the size of the skeleton, within which joints stand where those of another do
 
@@ -79,13 +81,13 @@ def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> Non
         return
     theirs = animation_source(character.prim).prim
     sources = [source for source in (animation, theirs) if source]
-    if animation == theirs:
+    if animation == theirs or not value(animation, "joints"):  # without joints it weighs blendshapes alone
         return
     times = change_times(source.GetAttribute(name) for source in sources for name in NEEDED)
     match = np.array(match_joints(own.joints, skeleton.joint_names))
     mine = [joint for joint, name in enumerate(own.joints) if name in used and match[joint] >= 0]
     first: Floats | None = None
-    for code in map(Usd.TimeCode, times):
+    for code in map(Usd.TimeCode, spread(np.array(times), COMPARED).tolist()):
         placed = _shown(character, theirs is not None, code)[character.character_joints][match[mine]]
         apart = np.linalg.inv(placed) @ _shown(own, True, code)[mine]
         first = apart if first is None else first

@@ -146,9 +146,8 @@ def read_influences(
 def _need_still(attribute: Usd.Attribute, where: str) -> None:
     """Raise `SsilkError` where a value that skinning begins with changes; one time sample is as good as a default."""
     times = change_times([attribute]) if attribute else []
-    first = np.array(attribute.Get(EARLIEST)) if times else None
     for time in times[1:]:
-        later = np.array(attribute.Get(time))
+        first, later = (np.array(attribute.Get(each)) for each in (times[0], time))
         if later.shape != first.shape or not np.allclose(later, first, rtol=0, atol=STILL):
             fail(
                 where,
