@@ -12,9 +12,11 @@ import numpy as np
 
 from ..errors import SetupError
 from ..scene.meshes import world_points
-from ..scene.modifiers import HARMLESS, REFINING, is_refined
+from ..scene.modifiers import HARMLESS, REFINING, is_refined, moves_by_itself, simulates_in_order
 from ..scene.objects import found_again, scene_units
 from .sampling import SLICE
+
+STILL = 1e-6  # how far a vertex moves that does not [m]
 
 
 def simulating(garment: bpy.types.Object) -> list[bpy.types.Modifier]:
@@ -31,7 +33,9 @@ def need_simulated(garment: bpy.types.Object) -> None:
     """
     moving = simulating(garment)
     if not moving:
-        raise SetupError(f"No modifier simulates '{garment.name}'; give it a Cloth modifier, and bake that.")
+        raise SetupError(
+            f"No modifier simulates '{garment.name}'; add a simulation or a cache below its Armature modifier."
+        )
     for modifier in moving:
         cache = getattr(modifier, "point_cache", None)
         if cache is not None and not cache.is_baked:
@@ -49,29 +53,103 @@ def switch_off(garment: bpy.types.Object) -> list[str]:
 def sample_vertices(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> Iterator[float]:
     """Append the vertices of each frame in the world [m], y up, (V, 3), yielding the part that is done.
 
-    The scene's frame is put back after each slice of time.
+    The scene's frame is put back after each slice of time. Where nodes simulate, all frames are played in order and
+    it is put back at the end: a later frame that is shown in between would spoil those that follow.
 
     Raises:
-        SetupError: the garment was deleted meanwhile, or modifiers change the number of its vertices.
+        SetupError: the garment was deleted meanwhile, modifiers change the number of its vertices, or the frame was
+            changed while nodes simulated.
     """
-    uid, name = garment.session_uid, garment.name
-    while len(points) < len(frames):
-        _sample_slice(found_again(uid, name), frames, points)
+    ordered = any(map(simulates_in_order, simulating(garment)))
+    for _ in (_in_order if ordered else _apart)(garment, frames, points):
         yield len(points) / len(frames)
 
 
-def _sample_slice(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> None:
-    scene, until = bpy.context.scene, time.monotonic() + SLICE
-    before = scene.frame_current, scene.frame_subframe
-    with _unrefined(garment):
+def _apart(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> Iterator[None]:
+    uid, name, waiting = garment.session_uid, garment.name, list(frames)
+    while waiting:
+        before = _frame_now()
         try:
-            while len(points) < len(frames):
-                scene.frame_set(frames[len(points)])
-                points.append(_evaluated(garment))
-                if time.monotonic() > until:
-                    break
+            _sample_slice(found_again(uid, name), waiting, frames, points)
         finally:
-            scene.frame_set(before[0], subframe=before[1])
+            _show_frame(before)
+        yield
+
+
+def _in_order(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> Iterator[None]:
+    uid, name, before = garment.session_uid, garment.name, _frame_now()
+    waiting = list(range(min(_first_simulated(), frames.start), frames.stop))
+    try:
+        while waiting:
+            _sample_slice(found_again(uid, name), waiting, frames, points)
+            left = _frame_now()
+            yield
+            if _frame_now() != left:
+                raise SetupError(
+                    f"The frame was changed while '{name}' was simulated; leave the timeline and repeat."
+                )
+    finally:
+        _show_frame(before)
+
+
+def need_moved(garment: bpy.types.Object, frames: range, points: list[np.ndarray]) -> None:
+    """Check that each simulation moved something; Blender passes over a cache that is gone or of another mesh.
+
+    Args:
+        points: vertices of each frame, as `sample_vertices` gives them.
+
+    Raises:
+        SetupError: without it the garment is the same in the first frame, in the middle and in the last one.
+    """
+    before, chosen = _frame_now(), sorted({0, len(frames) // 2, len(frames) - 1})
+    for modifier in filter(moves_by_itself, simulating(garment)):
+        modifier.show_viewport = False
+        try:
+            with _unrefined(garment):
+                still = all(
+                    np.allclose(_evaluated_at(garment, frames[index]), points[index], rtol=0, atol=STILL)
+                    for index in chosen
+                )
+        finally:
+            modifier.show_viewport = True
+            _show_frame(before)
+        if still:
+            raise SetupError(
+                f"The modifier '{modifier.name}' moves no vertex of '{garment.name}' in the frames "
+                f"{', '.join(str(frames[index]) for index in chosen)}; see that its cache is there, of this mesh."
+            )
+
+
+def _frame_now() -> tuple[int, float]:
+    scene = bpy.context.scene
+    return scene.frame_current, scene.frame_subframe
+
+
+def _show_frame(frame: tuple[int, float]) -> None:
+    bpy.context.scene.frame_set(frame[0], subframe=frame[1])
+
+
+def _first_simulated() -> int:
+    """Return the frame in which nodes of the scene begin to simulate."""
+    scene = bpy.context.scene
+    return scene.simulation_frame_start if scene.use_custom_simulation_range else scene.frame_start
+
+
+def _sample_slice(garment: bpy.types.Object, waiting: list[int], frames: range, points: list[np.ndarray]) -> None:
+    """Play the first of the frames that wait, for a moment, and append the vertices of those that are asked for."""
+    until = time.monotonic() + SLICE
+    with _unrefined(garment):
+        while waiting:
+            bpy.context.scene.frame_set(frame := waiting.pop(0))
+            if frame in frames:
+                points.append(_evaluated(garment))
+            if time.monotonic() > until:
+                break
+
+
+def _evaluated_at(garment: bpy.types.Object, frame: int) -> np.ndarray:
+    bpy.context.scene.frame_set(frame)
+    return _evaluated(garment)
 
 
 def _evaluated(garment: bpy.types.Object) -> np.ndarray:

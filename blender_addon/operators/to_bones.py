@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import SetupError
 from ..motions.keys import need_tracks
 from ..motions.sampling import need_company, prepare_takes, sample
-from ..motions.simulated import need_simulated, sample_vertices, switch_off
+from ..motions.simulated import need_moved, need_simulated, sample_vertices, switch_off
 from ..motions.sources import TIMELINE, Source
 from ..outside.work import Work
 from ..playback.bake import animated, need_bakeable, need_movable
@@ -29,7 +29,7 @@ CACHE = "cache.usdc"
 
 
 class SimulationToBones(TimelineOperator, bpy.types.Operator):
-    """Turn the garment's baked Cloth modifier into keys of its proxies and shape keys, and switch it off"""
+    """Turn the garment's simulation or cache into keys of its proxies and shape keys, and switch it off"""
 
     bl_idname = "ssilk.to_bones"
     bl_label = "To Bones"
@@ -72,6 +72,7 @@ class SimulationToBones(TimelineOperator, bpy.types.Operator):
             yield part / 2
         for part in sample_vertices(garment, self.take.frames, self.points):
             yield 0.5 + part / 2
+        need_moved(self.pair.objects()[0], self.take.frames, self.points)
         yield from loading_usd()
         from ssilk_usd.writing.files import write_cache, write_motion
 

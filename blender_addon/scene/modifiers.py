@@ -30,7 +30,7 @@ REFINING = {
 COMPLETING = {
     "ARRAY", "BOOLEAN", "BUILD", "MESH_TO_VOLUME", "MIRROR", "PARTICLE_INSTANCE", "SCREW", "SKIN", "VOLUME_TO_MESH",
 }  # fmt: skip
-# They move points by themselves, whatever bones do.
+# They move points by themselves, whatever bones do; so do nodes that simulate.
 MOVING = {"CLOTH", "EXPLODE", "FLUID", "MESH_CACHE", "MESH_SEQUENCE_CACHE", "OCEAN", "SOFT_BODY"}
 
 BELOW = "move it below the Armature modifier"
@@ -55,25 +55,35 @@ def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Ob
     deforms = [modifier.type == "ARMATURE" and modifier.object is not None for modifier in used]
     bones = deforms.index(True) if any(deforms) else -1
     judged = (
-        (modifier, 0 <= bones < place, _objection(modifier, after=0 <= bones < place, bound=bones >= 0))
+        (modifier, _objection(modifier, after=0 <= bones < place, bound=bones >= 0, simulated=simulated))
         for place, modifier in enumerate(used)
         if place != bones
     )
-    return [
-        Objection(modifier.name, *said)
-        for modifier, after, said in judged
-        if said and not (simulated and after and modifier.show_viewport and modifier.type in MOVING)
-    ]
+    return [Objection(modifier.name, *said) for modifier, said in judged if said]
 
 
-def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool) -> tuple[str, str] | None:
+def moves_by_itself(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier moves points whatever bones do: a simulation, or a cache of one."""
+    return modifier.type in MOVING or simulates_in_order(modifier)
+
+
+def simulates_in_order(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier's nodes simulate, so that each frame begins where the one before it was left."""
+    return modifier.type == "NODES" and any(
+        bake.node and bake.node.bl_idname == "GeometryNodeSimulationOutput" for bake in modifier.bakes
+    )
+
+
+def _objection(modifier: bpy.types.Modifier, *, after: bool, bound: bool, simulated: bool) -> tuple[str, str] | None:
     """Return what a modifier does wrong and what to do, where it stands after bones or before; None if nothing."""
     kind = modifier.type
     if kind in HARMLESS:
         return None
     if kind == "ARMATURE":
         return ("moves it a second time", "remove one of both") if modifier.object else None
-    if kind in MOVING:
+    if moves_by_itself(modifier):
+        if simulated and bound and modifier.show_viewport:
+            return None if after else ("moves it before bones do", BELOW)
         return "moves it in place of what is trained", "remove it, or switch it off"
     if kind in COMPLETING:
         return "gives it parts that its mesh does not have", "apply it"

@@ -374,8 +374,8 @@ WORDS = {
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"
     ),
     "To Bones": "In Knochen",
-    "Turn the garment's baked Cloth modifier into keys of its proxies and shape keys, and switch it off": (
-        "Den gebackenen Stoff-Modifikator des Kleidungsstücks in Schlüsselbilder seiner Stellvertreter und "
+    "Turn the garment's simulation or cache into keys of its proxies and shape keys, and switch it off": (
+        "Simulation oder Cache des Kleidungsstücks in Schlüsselbilder seiner Stellvertreter und "
         "Formschlüssel umwandeln und abschalten"
     ),
     "Remove Bake": "Gebackenes entfernen",

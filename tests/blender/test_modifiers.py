@@ -76,6 +76,21 @@ def test_what_is_off_or_deforms_nothing_is_passed_over(bpy, skirt):
     assert told(skirt) == "remove one of both"
 
 
+def test_nodes_that_simulate_move_a_garment_by_themselves(bpy, skirt):
+    from blender_addon.scene.modifiers import need_plain_modifiers
+
+    skirt.modifiers.new("Armature", "ARMATURE").object = bpy.data.objects["Rig"]
+    inner, outer = (bpy.data.node_groups.new(name, "GeometryNodeTree") for name in ("Inner", "Outer"))
+    outer.nodes.new("GeometryNodeGroup").node_tree = inner
+    modifier = skirt.modifiers.new("Dynamics", "NODES")
+    modifier.node_group = outer
+    assert told(skirt) == FINE
+    start, end = (inner.nodes.new(f"GeometryNodeSimulation{side}") for side in ("Input", "Output"))
+    assert start.pair_with_output(end)
+    assert told(skirt) == REMOVE
+    need_plain_modifiers(skirt, simulated=True)
+
+
 def test_training_baking_and_playing_say_the_same(bpy, skirt):
     from blender_addon.errors import SetupError
     from blender_addon.playback.bake import need_bakeable
@@ -110,7 +125,7 @@ def test_what_bones_may_be_made_of_is_seen_to_move_what_bones_moved(bpy, skirt):
         need_plain_modifiers(skirt, simulated=True)
     cloth.show_viewport = True
     skirt.modifiers.move(1, 0)
-    with pytest.raises(SetupError, match=REMOVE):
+    with pytest.raises(SetupError, match=BELOW):
         need_plain_modifiers(skirt, simulated=True)
 
 

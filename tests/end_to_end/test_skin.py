@@ -151,6 +151,7 @@ def test_a_cut_is_held_where_the_cache_has_another_rate(rate):
     [
         ("two.usda:/sim --stage rigged.usda --motion brief.usda -o x.usda", "2 meshes of 312 points in '/sim'"),
         ("cache.abc --stage rigged.usda --motion brief.usda -o x.usda", "an Alembic cache"),
+        ("cache.mdd --stage rigged.usda --motion brief.usda -o x.usda", "an MDD cache, which tells no unit, axis"),
         ("two.usda --stage rigged.usda --motion brief.usda -o x.usda", "2 meshes of 312 points"),
         ("cache.usda:/sim/Shirt --stage rigged.usda --motion brief.usda -o x.usda", "no visible mesh '/sim/Shirt'"),
         ("less.usda:/sim/Cloth --stage rigged.usda --motion brief.usda -o x.usda", "311 points; the garment has 312"),
@@ -163,6 +164,7 @@ def test_a_cut_is_held_where_the_cache_has_another_rate(rate):
 )
 def test_what_does_not_fit_is_refused(world, copy, words, complaint, capsys):
     (copy / "cache.abc").write_bytes(b"Ogawa")
+    (copy / "cache.mdd").write_bytes(bytes(8))
     points, faces = np.load("points.npy"), np.load("faces.npy")
     write_cache("two.usda", points[:1], faces, names=("Left", "Right"))
     write_cache("less.usda", points[:1, :-1], faces[(faces < points.shape[1] - 1).all(axis=1)])

@@ -138,7 +138,7 @@ def seen(stage: Usd.Stage, path: str, code=0) -> np.ndarray:
     """World positions of a mesh as UsdSkel alone computes them."""
     prim = stage.GetPrimAtPath(path)
     cache = UsdSkel.Cache()
-    cache.Populate(UsdSkel.Root.Find(prim), Usd.PrimDefaultPredicate)
+    cache.Populate(UsdSkel.Root.Find(prim), Usd.TraverseInstanceProxies())
     bound = UsdSkel.BindingAPI(prim).GetInheritedSkeleton()
     points = UsdGeom.Mesh(prim).GetPointsAttr().Get()
     transforms = cache.GetSkelQuery(bound).ComputeSkinningTransforms(code)
@@ -227,6 +227,74 @@ def test_a_garment_in_its_own_file_goes_from_its_bind_pose_to_the_characters(tmp
     stage.Save()
     garment = read_scene(hero, garment=f"{own}:/Cape/Cape")[1]
     np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+
+
+@pytest.mark.parametrize(("other", "is_off"), [([5, 10, 0], False), ([5, 10, 3], True)])
+def test_an_animation_of_its_own_moves_a_garment_as_the_characters_or_is_refused(tmp_path, other, is_off):
+    path = outfit(tmp_path, "another pose, animated")
+    stage = Usd.Stage.Open(str(path))
+    animate(stage, "/Hero/Own", BIND, [10, 20, -30], UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Outfit/Rig")))
+    for walk, turn in (("/Hero/Walk", [5, 10, 0]), ("/Hero/Own", other)):
+        animation = UsdSkel.Animation(stage.GetPrimAtPath(walk))
+        turned = Rotation.from_euler("x", np.array(turn)[:, None], degrees=True).as_matrix()
+        quats = Rotation.from_matrix(kinematics.local_transforms(BIND, PARENTS)[:, :3, :3] @ turned).as_quat()
+        animation.GetRotationsAttr().Set([Gf.Quatf(float(w), *map(float, v)) for *v, w in quats], 12)
+    stage.Save()
+    if is_off:
+        with pytest.raises(SsilkError, match=r"/Hero/Own moves Hips/Leg otherwise than .* at time code 12"):
+            read_scene(path, garment="Cape")
+        return
+    garment = read_scene(path, garment="Cape")[1]
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_one_of_two_instances_of_a_character_is_read_and_rigged_where_it_is(tmp_path, name):
+    hero, path, out = (tmp_path / f"{each}.usda" for each in ("hero", "two", "rigged"))
+    stage = Usd.Stage.CreateNew(str(hero))
+    rig = character(stage)
+    mesh(stage, "/Hero/Cape", CLOTH, FACES, OF_JOINTS, "/Hero/Rig")
+    animate(stage, "/Hero/Walk", BIND, [10, 20, -30], rig)
+    stage.Save()
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    for instance, place in (("A", xform()), ("B", xform((0, 70, 0), at=(3, 0, 1)))):
+        prim = stage.DefinePrim(f"/{instance}", "SkelRoot")
+        UsdGeom.Xformable(prim).AddTransformOp().Set(gf(place))
+        prim.GetReferences().AddReference("hero.usda")
+        prim.SetInstanceable(True)
+    stage.Save()
+    found, garment, _ = read_scene(path, root=f"/{name}", garment=f"/{name}/Cape")
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+    none = ProxyRig(garment.mesh.path, (), np.zeros(0, int), np.zeros((0, 4, 4)), garment.skin)
+    write_rigged_stage(path, Scene(found, Garment(garment.mesh, garment.skin, np.full(len(CLOTH), 1)), none), out)
+    after = Usd.Stage.Open(str(out))
+    for each in ("A", "B"):
+        np.testing.assert_allclose(seen(after, f"/{each}/Cape"), seen(stage, f"/{each}/Cape"), atol=3e-6)
+
+
+SKIN = ("points", "primvars:skel:jointIndices", "primvars:skel:jointWeights", "primvars:skel:geomBindTransform")
+
+
+@pytest.mark.parametrize("name", SKIN)
+@pytest.mark.parametrize("of", ["/Hero/Body", "/Hero/Outfit/Cape"])
+def test_what_skinning_begins_with_may_be_a_time_sample_and_may_not_change(tmp_path, of, name):
+    path = outfit(tmp_path, "geomBindTransform")
+    stage = Usd.Stage.Open(str(path))
+    attribute = stage.GetPrimAtPath(of).GetAttribute(name)
+    value = attribute.Get()
+    attribute.Clear()
+    attribute.Set(value, 3)
+    attribute.Set(value, 9)
+    stage.Save()
+    garment = read_scene(path, garment="Cape")[1]
+    np.testing.assert_allclose(garment.mesh.points, CLOTH, atol=2e-6)
+    found = np.array(value)
+    attribute.Set(type(value)((found[::-1] if name.endswith("Indices") else found * 1.1).tolist()), 9)
+    stage.Save()
+    with pytest.raises(SsilkError, match=f"its {name} changes at time code 9"):
+        read_scene(path, garment="Cape")
 
 
 def test_other_axes_of_the_same_joints_move_no_garment_in_its_own_file(tmp_path):

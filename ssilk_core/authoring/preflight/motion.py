@@ -28,6 +28,7 @@ CHECKED_RATE, MOST_CHECKED = 5.0, 500  # poses a second, and in all, in which li
 MANY_BURIED = 0.02  # share of the frames
 NAMED_LIMBS = 3
 LYING, MOSTLY = 0.5, 0.9  # cosine between the hub's up axis and that at rest, and share of the frames
+STRAIGHTER = 0.15  # by how much this cosine's mean is larger by the other axis, where that one is the right one
 MAX_SAMPLE_GAP = 0.5  # [s] gap that is reported if it is also ten times the usual sampling interval
 
 
@@ -77,22 +78,32 @@ def root_jumps(motion: Motion, skeleton: Skeleton) -> Findings:
 
 
 def lying(motion: Motion, skeleton: Skeleton) -> Findings:
-    """Yield a warning if the character lies, or stands on its head, in nearly all frames of a motion."""
+    """Yield a warning if the character lies, or stands on its head, or stands straighter by the other up axis."""
     hub = motion_transforms(motion, skeleton.parents)[:, skeleton.hub, :3, :3]
     rest = world_transforms(skeleton.rest_transforms, skeleton.parents)[skeleton.hub, :3, :3]
-    down = np.flatnonzero((hub @ rest.T)[:, 1, 1] < LYING)
+    up = (hub @ rest.T)[:, :, 1]
+    down, (_, own, other) = np.flatnonzero(up[:, 1] < LYING), up.mean(axis=0)
     if len(down) > MOSTLY * motion.frame_count:
-        yield Finding(
-            severity="warning",
-            code="lying",
-            prim=motion.path,
-            count=len(down),
-            found=f"the character lies or stands on its head in {len(down)} of {motion.frame_count} frames",
-            why="gravity pulls the cloth along the world's y axis, not towards the character's feet",
-            fix="if it should stand, correct upAxis of the motion's file, or export it together with its character",
-            elements="frames",
-            indices=index_tuple(down),
+        found = f"the character lies or stands on its head in {len(down)} of {motion.frame_count} frames"
+    elif abs(other) > own + STRAIGHTER:  # between Y up and Z up is a quarter turn about x
+        leans, would = np.degrees(np.arccos(np.clip([own, abs(other)], -1, 1)))
+        found = (
+            f"the character leans by {leans:.0f} degrees on average, and by {would:.0f} if the up axis of its file "
+            "were the other one"
         )
+    else:
+        return
+    yield Finding(
+        severity="warning",
+        code="lying",
+        prim=motion.path,
+        count=len(down),
+        found=found,
+        why="gravity pulls the cloth along the world's y axis, not towards the character's feet",
+        fix="if it should stand, correct upAxis of the motion's file, or export it together with its character",
+        elements="frames",
+        indices=index_tuple(down),
+    )
 
 
 def joint_jumps(motion: Motion, skeleton: Skeleton) -> Findings:

@@ -139,12 +139,12 @@ class TwoFrames:
         np.multiply(given, self.scale, given)
         np.add(given, self.identity, given)
         length = np.sqrt(np.add.reduce(long * long, 0))
-        np.maximum(length, self.shortest, length)
+        np.maximum(length, self.shortest, out=length)
         np.divide(length, self.unit, length)
         np.divide(long, length, self.limited)
         np.subtract(second, np.add.reduce(x * second, 0) * x, second)
         length = np.sqrt(np.add.reduce(second * second, 0))
-        np.divide(second, np.maximum(length, SHORTEST, length), self.y)
+        np.divide(second, np.maximum(length, SHORTEST, out=length), self.y)
         self.again[:] = self.axes
         ahead, behind = self.turned
         np.subtract(np.multiply(*ahead), np.multiply(*behind), self.z)

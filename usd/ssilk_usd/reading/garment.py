@@ -31,7 +31,7 @@ from .bindings import need_skinned
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
-from .rebinding import blended_moves, character_source, common_move, joint_moves, used_moves
+from .rebinding import blended_moves, character_source, common_move, joint_moves, need_one_motion, used_moves
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton, skeletons
 from .skin import match_joints, read_influences, read_skin
@@ -173,7 +173,9 @@ def garment_place(prim: Usd.Prim, skel: SkelSource | None, skeleton: Skeleton | 
 def _rebound(prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton) -> GarmentPlace:
     """Return where a skinned garment is, which may be bound to a Skeleton of its own."""
     to_core, moves = geom_to_core(prim, skel), joint_moves(skel, skeleton)
-    influences = None if moves is None else read_influences(prim, skel.joints)
+    influences = read_influences(prim, skel.joints)
+    if influences is not None:
+        need_one_motion(skel, skeleton, influences.used_joints())
     if moves is None or influences is None:
         return GarmentPlace(to_core)
     ordered, used = used_moves(moves, influences, skel.joints)

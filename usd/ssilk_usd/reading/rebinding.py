@@ -11,17 +11,22 @@ from __future__ import annotations
 import numpy as np
 from pxr import Usd, UsdSkel
 
+from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Skeleton
 from ssilk_core.scene.kinematics import world_transforms
 
-from ..opening.stage import EARLIEST, PRIMS, column_matrix, location
+from ..opening.stage import EARLIEST, PRIMS, column_matrix, location, value
+from ..opening.times import change_times
 from ..units import scaling
-from .animation import animation_source
+from .animation import NEEDED, animation_source
+from .clips import spread
 from .skeleton import skeleton_at, skeletons
 from .skin import AuthoredInfluences, match_joints
 from .spaces import SkelSource
 
 SAME = 1e-5  # [m], and of rotation matrices: two bind poses that differ by less are one, rounded
+COMPARED = 200  # time codes at which two animations are compared, at most
+ONE_MOTION = 1e-3  # [m], and of rotation matrices: how far joints of two Skeletons may part while they are animated
 SAME_PLACE = 1e-3  # of the size of the skeleton, within which joints stand where those of another do
 
 
@@ -62,6 +67,41 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
     return to_character if np.abs(to_character - np.eye(4)).max() > SAME else None
 
 
+def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> None:
+    """Check that an animation of a garment's own Skeleton moves it as the character's does.
+
+    Args:
+        used: joints of `own` that carry the garment.
+
+    Raises:
+        SsilkError: a joint moves away from where the character has it.
+    """
+    character, animation = character_source(own.stage, skeleton), animation_source(own.prim).prim
+    if character is None or animation is None or location(own.prim) == skeleton.path:
+        return
+    theirs = animation_source(character.prim).prim
+    sources = [source for source in (animation, theirs) if source]
+    if animation == theirs or not value(animation, "joints"):  # without joints it weighs blendshapes alone
+        return
+    times = change_times(source.GetAttribute(name) for source in sources for name in NEEDED)
+    match = np.array(match_joints(own.joints, skeleton.joint_names))
+    mine = [joint for joint, name in enumerate(own.joints) if name in used and match[joint] >= 0]
+    first: Floats | None = None
+    for code in map(Usd.TimeCode, spread(np.array(times), COMPARED).tolist()):
+        placed = _shown(character, theirs is not None, code)[character.character_joints][match[mine]]
+        apart = np.linalg.inv(placed) @ _shown(own, True, code)[mine]
+        first = apart if first is None else first
+        off = np.abs(apart - first).max(axis=(1, 2))
+        if off.size and off.max() > ONE_MOTION:
+            fail(
+                location(own.prim),
+                f"its animation {animation.GetPath()} moves {own.joints[mine[int(off.argmax())]]} otherwise than the "
+                f"character's Skeleton at time code {code.GetValue():g}",
+                "a garment moves with the joints of its character",
+                f"bind it to the animation of {skeleton.path}, or the garment to that Skeleton",
+            )
+
+
 def common_move(moves: Floats) -> Floats | None:
     """Return the one transform that all of some are (4, 4), up to rounding; None where they differ."""
     return moves[0] if np.abs(moves - moves[0]).max() <= SAME else None
@@ -82,12 +122,12 @@ def used_moves(moves: Floats, influences: AuthoredInfluences, joints: tuple[str,
     return ordered, ordered[np.unique(influences.indices[influences.weights != 0])]
 
 
-def _shown(source: SkelSource, animated: bool) -> Floats:
-    """Return joint to core world [m] as USD shows a skeleton at its earliest time, rigid, shape (N, 4, 4)."""
+def _shown(source: SkelSource, animated: bool, time: Usd.TimeCode = EARLIEST) -> Floats:
+    """Return joint to core world [m] as USD shows a skeleton, placed as at first, rigid, shape (N, 4, 4)."""
     posed = world_transforms(source.rest, source.parents)
     if animated:
         cache = UsdSkel.Cache()
         cache.Populate(UsdSkel.Root(source.root), PRIMS)
-        found = cache.GetSkelQuery(UsdSkel.Skeleton(source.prim)).ComputeJointSkelTransforms(EARLIEST)
+        found = cache.GetSkelQuery(UsdSkel.Skeleton(source.prim)).ComputeJointSkelTransforms(time)
         posed = column_matrix(found) if found else posed
     return source.units.matrix @ source.placement @ posed @ scaling(1 / source.joint_scale)

@@ -13,9 +13,11 @@ from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.scene.assets import Floats, Ints, SkinWeights
 
-from ..names import JOINTS, SKEL
+from ..names import GEOM_BIND, JOINTS, SKEL
 from ..opening.stage import EARLIEST, inherited, location
+from ..opening.times import change_times
 
+STILL = 1e-5  # in units of the stage, and of weights: rounding
 WHOLE = 0.01  # how far weights of a vertex may sum from one: half floats and rounding tools stay within
 
 
@@ -122,7 +124,10 @@ def read_influences(
             "both are needed",
             "bind the mesh again",
         )
-    count = len(UsdGeom.Mesh(prim).GetPointsAttr().Get(EARLIEST) or [])
+    points = UsdGeom.Mesh(prim).GetPointsAttr()
+    for attribute in (points, indices, weights, prim.GetAttribute(GEOM_BIND)):
+        _need_still(attribute, where)
+    count = len(points.Get(EARLIEST) or [])
     rows_of_indices = _rows(indices, count, where).astype(np.int64)
     rows_of_weights = _rows(weights, count, where).astype(np.float64)
     if rows_of_indices.shape != rows_of_weights.shape:
@@ -136,6 +141,20 @@ def read_influences(
     names = joints if own is None else tuple(own.Get(EARLIEST) or ())
     need_unique(names, where)
     return AuthoredInfluences(where, names, _checked(rows_of_indices, rows_of_weights, names, where), rows_of_weights)
+
+
+def _need_still(attribute: Usd.Attribute, where: str) -> None:
+    """Raise `SsilkError` where a value that skinning begins with changes; one time sample is as good as a default."""
+    times = change_times([attribute]) if attribute else []
+    for time in times[1:]:
+        first, later = (np.array(attribute.Get(each)) for each in (times[0], time))
+        if later.shape != first.shape or not np.allclose(later, first, rtol=0, atol=STILL):
+            fail(
+                where,
+                f"it is skinned, and its {attribute.GetName()} changes at time code {time:g}",
+                "a skinned mesh has one value at all times, and joints and blendshapes move it",
+                "author the value at rest alone, or make the mesh a point cache without influences",
+            )
 
 
 def _rows(attribute: Usd.Attribute, point_count: int, where: str) -> Floats:

@@ -17,6 +17,11 @@ from ssilk_core.scene.assets import Floats, Ints
 from ..opening.stage import USD_SUFFIXES
 from .play import Shot
 
+OTHER_CACHES = {
+    ".abc": "an Alembic cache, which this build of USD has no plug-in for",
+    ".mdd": "an MDD cache, which tells no unit, axis or mesh",
+    ".pc2": "a PC2 cache, which tells no unit, axis or mesh",
+}
 MOST_OTHER_EDGES = 0.5  # share of the edges: with all quads divided along their other diagonals a third is others
 
 
@@ -99,14 +104,16 @@ def _other_edges(faces: Ints, own: Ints) -> float:
 
 
 def _need_readable(file: str) -> None:
-    """Raise `SsilkError` for a file of Alembic that this build of USD cannot read."""
-    suffix = Path(file).suffix.removeprefix(".")
-    if suffix == "abc" and Path(file).is_file() and Sdf.FileFormat.FindByExtension(suffix) is None:
+    """Raise `SsilkError` for a file of points that is not USD, where it is known what it is."""
+    suffix = Path(file).suffix
+    if suffix not in OTHER_CACHES or not Path(file).is_file():
+        return
+    if Sdf.FileFormat.FindByExtension(suffix.removeprefix(".")) is None:
         fail(
             file,
-            "an Alembic cache, which this build of USD has no plug-in for",
+            OTHER_CACHES[suffix],
             f"a cache is one of {', '.join(USD_SUFFIXES)}",
-            "export the points as USD",
+            "export the points as USD, or put the file on the garment in Blender and press To Bones",
         )
 
 
