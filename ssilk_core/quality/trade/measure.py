@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import torch
 
 from ...network.checkpoint import ModelFile, network
 from ...network.rollout import decode, garment_poses
@@ -29,7 +28,6 @@ from ..cost import (
     stored_time,
 )
 from ..evaluation.methods import EvaluationScene, Method, TakeSet
-from ..evaluation.metrics import derivative, mean_square
 from ..evaluation.record import recorded
 from ..evaluation.tally import Tally
 from ..reduction import ModelSize, Reducer
@@ -72,7 +70,6 @@ class VariantMeter:
     ) -> None:
         self.name, self.reducer, self.dressed, self.take_set, self.weigh = name, reducer, dressed, take_set, weigh
         self.whole = ShotMethod(name, reducer.player, dressed, take_set, fps=dressed.fps)
-        self.reference: ShotMethod | None = None
         self.base = self._tally(self.whole).totals().mean()
         self._cut = lru_cache(1)(lambda size: reducer.reduce(size).file)
         self._torch = lru_cache(1)(self._torch_time)
@@ -98,9 +95,6 @@ class VariantMeter:
             simulated=variant.simulated,
             advanced=advanced,
         )
-        if variant.simulated:
-            self.reference = method
-        apart = self._apart(method)
         tally = self._tally(method, self.whole)
         total = float(tally.totals().mean())
         return TradePoint(
@@ -123,35 +117,12 @@ class VariantMeter:
             intersections=tally.intersections(self.dressed.intersections),
             position=tally.root("position error"),
             velocity=tally.root("velocity error"),
-            apart=apart and apart[0],
-            apart_velocity=apart and apart[1],
         )
-
-    def simulate(self, advanced: Callable[[], object] = lambda: None) -> None:
-        """Let the simulator compute what later points are compared with; `advanced` is called after each frame."""
-        self.reference = ShotMethod(
-            "simulator", self.reducer.player, self.dressed, self.take_set, fps=self.dressed.fps, simulated=True,
-            advanced=advanced,
-        )  # fmt: skip
-        for take, own in enumerate(self.take_set.takes):
-            self.reference.vertices(take, range(own.frame_count))
 
     @property
     def motion(self) -> Motion:
         """The motion for time measurements."""
         return self.take_set.takes[0].motion
-
-    def _apart(self, method: Method) -> tuple[float, float] | None:
-        """Return RMS distances of positions [m] and velocities [m/s] from the simulator's; None without one."""
-        if self.reference is None:
-            return None
-        away, mass = [], self.dressed.energy.mass
-        for take, own in enumerate(self.take_set.takes):
-            frames = range(own.frame_count)
-            away.append(method.vertices(take, frames) - self.reference.vertices(take, frames))
-        places = torch.cat([mean_square(x, mass) for x in away])
-        speeds = torch.cat([mean_square(derivative(x, 1, self.dressed.fps), mass) for x in away])
-        return float(places.mean()) ** 0.5, float(speeds.mean()) ** 0.5
 
     def _tally(self, method: Method, truth: Method | None = None) -> Tally:
         takes = range(len(self.take_set.takes))

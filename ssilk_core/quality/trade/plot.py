@@ -18,13 +18,12 @@ COSTS = {
 }
 # Label, factor to its unit, and the value below which the axis is linear, so that it can show zero.
 ERRORS = {
-    "from_simulator": ("RMS distance from the simulator [mm]", 1e3, 1.0),
     "position": ("RMS distance from the whole model [mm]", 1e3, 0.1),
     "total": ("energy above the lowest [J]", 1.0, 1e-3),
     "mean_shown_skin": ("covered skin that shows [%]", 1e2, 1e-2),
     "mean_intersections": ("triangles that intersect others [%]", 1e2, 1e-2),
 }
-# Errors that compare networks: distances are from one's own whole model, and from the simulator with its start.
+# Errors that compare networks; a distance is from one's own whole model.
 ACROSS_MODELS = ("total", "mean_shown_skin", "mean_intersections")
 NAMED = (WHOLE, "level", "refinement", "latents", SIMULATOR)  # sweeps whose points are all labelled
 

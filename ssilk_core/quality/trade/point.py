@@ -36,8 +36,6 @@ class TradePoint:
         shown_skin: share of the covered skin that shows; None where the garment covers nothing.
         intersections: share of the triangles that intersect others of the garment.
         position, velocity: RMS errors against the full model [m], [m/s].
-        apart, apart_velocity: RMS distance of positions and velocities from the simulator's, which goes on from the
-            model's first two states [m], [m/s]; None where it was not asked.
     """
 
     garment: str
@@ -62,8 +60,6 @@ class TradePoint:
     collisions: float
     position: float
     velocity: float
-    apart: float | None
-    apart_velocity: float | None
     shown_skin: ShownSkin | None
     intersections: SelfIntersections
     solving: float | None
@@ -81,11 +77,6 @@ class TradePoint:
     def making(self) -> float:
         """Time to make a frame [ms]: that of playing it, and of the solver on the device."""
         return self.milliseconds + (self.solving or 0.0)
-
-    @property
-    def from_simulator(self) -> float:
-        """RMS distance from the simulator [m]; NaN where there is none."""
-        return nan if self.apart is None else self.apart
 
     @property
     def mean_intersections(self) -> float:

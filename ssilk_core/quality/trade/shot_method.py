@@ -72,8 +72,7 @@ class ShotMethod:
             self.refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
         self.solving: list[float] = []
         self.shots: dict[int, Decomposition] = {}
-        # All that the simulator computed is kept: other variants are compared with it.
-        self._points = lru_cache(len(take_set.takes) if simulated else 1)(self._take)
+        self._points = lru_cache(1)(self._take)
 
     def vertices(self, take: int, frames: range) -> Tensor:
         """Return positions in consecutive frames of a take, relative to its first root position [m], (V, 3, N)."""

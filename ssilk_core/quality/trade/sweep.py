@@ -83,22 +83,17 @@ class Results:
 def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, report: Reporter = silent) -> int:
     """Measure the variants of a model that `results` lacks, and add each after its measurement.
 
-    The simulator comes first, since all others are compared with it. Then those without a solver are counted. Each
-    solver tells its progress in frames.
+    Those without a solver come first, and are counted. Each of the others tells its progress in frames.
 
     Return how many failed; each is warned of, and the others go on.
     """
-    tried, failed = sorted(variants, key=lambda variant: (not variant.simulated, variant.solved)), 0
+    tried, failed = sorted(variants, key=lambda variant: variant.solved), 0
     missing = [variant for variant in tried if not results.found(meter.name, variant)]
     quick, left = (sum(not variant.solved for variant in each) for each in (tried, missing))
-    if (
-        missing and tried[0].simulated and not missing[0].simulated
-    ):  # an earlier run measured it, and kept no vertices
-        meter.simulate(_told(meter, tried[0], report))
     told = Countdown(quick, report, done=quick - left)
     for variant in missing:
         try:
-            point = meter.point(variant, *([_told(meter, variant, report)] if variant.solved else []))
+            point = _solved(meter, variant, report) if variant.solved else meter.point(variant)
         except SsilkError as error:
             failed += 1
             report(Message(f"{meter.name}, {variant.name}: not measured, {error}", "warning"))
@@ -109,8 +104,8 @@ def sweep(meter: VariantMeter, variants: Iterable[Variant], results: Results, re
     return failed
 
 
-def _told(meter: VariantMeter, variant: Variant, report: Reporter) -> Countdown:
-    """Say how many frames a solver computes, and return what counts them."""
+def _solved(meter: VariantMeter, variant: Variant, report: Reporter) -> TradePoint:
+    """Measure a variant of which the solver computes the frames, and report each."""
     given = GIVEN * len(meter.take_set.takes) if variant.simulated else 0
     report(Message(f"{meter.name}, {variant.name}: the solver computes {meter.frames - given} frames"))
-    return Countdown(meter.frames - given, report)
+    return meter.point(variant, Countdown(meter.frames - given, report))

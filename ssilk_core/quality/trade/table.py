@@ -11,7 +11,7 @@ from .point import SECONDS, TradePoint, front
 
 HEADER = ("garment", "model", "swept", "variant", "size", "ms a frame", "95 %", "PyTorch", "solver", "memory [MB]",
           "model [MB]", f"{SECONDS} s shot [MB]", "total [J]", "excess [J]", "inside", "skin shows", "worst", "bare",
-          "intersect", "most", "RMS [mm]", "velocity [mm/s]", "off simulator [mm]", "[m/s]", "best at")  # fmt: skip
+          "intersect", "most", "RMS [mm]", "velocity [mm/s]", "best at")  # fmt: skip
 MARKS = {"making": "time", "shot_bytes": "shot", "model_bytes": "model"}
 
 
@@ -68,7 +68,5 @@ def _cells(p: TradePoint, best: list[str]) -> list[str]:
         f"{p.intersections.worst:.2%}",
         f"{1000 * p.position:.3g}",
         f"{1000 * p.velocity:.3g}",
-        "" if p.apart is None else f"{1000 * p.apart:.3g}",
-        "" if p.apart_velocity is None else f"{p.apart_velocity:.3g}",
         ", ".join(best),
     ]

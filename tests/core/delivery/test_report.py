@@ -200,7 +200,7 @@ POINT = {
     "influences": 4, "precision": "float32", "fps": 30.0, "refine": 0, "milliseconds": 0.5, "high": 0.6,
     "torch": None, "operations": 10, "memory": 10, "model_bytes": 1000, "shot_bytes": 1000.0,
     "total": 1.5, "excess": 0.0, "collisions": 0.0, "position": 0.002, "velocity": 0.0,
-    "apart": None, "apart_velocity": None, "shown_skin": None, "solving": None,
+    "shown_skin": None, "solving": None,
     "intersections": {"frames": 1, "triangles": 9, "mean": 0.1, "worst": 0.2, "clip": "a", "frame": 1.0,
                       "regions": {}},
 }  # fmt: skip

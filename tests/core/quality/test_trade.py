@@ -358,43 +358,25 @@ def test_a_variant_that_fails_is_told_and_the_others_are_measured(meter, points,
     assert warning.level == "warning" and "int16: not measured, frame 3" in warning.text
 
 
-def test_the_simulator_comes_first_and_each_solver_tells_its_frames(meter, points, monkeypatch):
+def test_each_solver_tells_its_frames_after_the_quick_variants(meter, points, monkeypatch):
     tried, said = [chosen(meter, name) for name in ("as trained", "simulator", "hero", "int16")], []
 
     def told(variant, advanced=None):
         for _ in range((66 if variant.simulated else 70) if advanced else 0):
             advanced()
-        return replace(points["int16"], swept=variant.swept, variant=variant.name, refine=variant.refine)
+        return replace(points["int16"], swept=variant.swept, variant=variant.name)
 
     monkeypatch.setattr(meter, "point", told)
     results = Results(None, {})
     assert sweep(meter, tried, results, said.append) == 0
-    assert [point.variant for point in results.points] == ["simulator", "as trained", "int16", "hero"]
+    assert [point.variant for point in results.points] == ["as trained", "int16", "simulator", "hero"]
     ends = [(event.done, event.total) for event in said if isinstance(event, Progress) and event.done == event.total]
-    assert ends == [(66, 66), (2, 2), (70, 70)]
+    assert ends == [(2, 2), (66, 66), (70, 70)]
     messages = [event.text for event in said if isinstance(event, Message)]
     assert messages == [
         "toy, simulator: the solver computes 66 frames",
         "toy, hero: the solver computes 70 frames",
     ]
-
-    again: list[str] = []  # a file keeps figures and no vertices: what is still missing is compared with new ones
-    monkeypatch.setattr(meter, "simulate", lambda advanced: again.append("simulated"))
-    assert sweep(meter, tried, results) == 0 and not again
-    results.points.pop()
-    assert sweep(meter, tried, results) == 0 and again == ["simulated"] and len(results.points) == 4
-
-
-def test_what_is_measured_is_compared_with_the_simulator(meter, bench, points, monkeypatch):
-    """With another network in the place of the simulator, which takes a second for each frame."""
-    reducer, dressed, take_set = bench
-    assert all(point.apart is None and point.apart_velocity is None for point in points.values())
-    other = Player(reducer.reduce(chosen(meter, "0 proxies").size).file)
-    monkeypatch.setattr(meter, "reference", ShotMethod("other", other, dressed, take_set, fps=FPS))
-    found = meter.point(chosen(meter, "as trained"))
-    assert (found.apart, found.apart_velocity) == pytest.approx(
-        (points["0 proxies"].position, points["0 proxies"].velocity), rel=1e-3
-    )
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"asked": 1}', '{"asked": {}, "points": [{"model": "m"}]}'])
