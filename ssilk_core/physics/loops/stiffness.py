@@ -61,7 +61,7 @@ def stiffness_loop(
     moduli = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
     elements = (tables.faces, tables.face_slots, tables.face_numbers, tables.hinges, tables.order,
                 tables.hinge_slots, tables.roots, tables.sample_slots, tables.sample_weights)  # fmt: skip
-    numbers = array(x), *elements, *map(float, moduli), woven, array(weight[:, 0]), array(given), array(exact)
+    numbers = array(x), *elements, *map(float, moduli), woven, array(weight.expand(-1, frames)), array(given), array(exact)
     run_parts(_stiffness, frames, *numbers, blocks.numpy())
     return blocks
 
@@ -73,7 +73,7 @@ def _stiffness(x, faces, face_slots, face_numbers, hinges, order, hinge_slots, r
     for n in range(start, stop):
         total[:] = 0
         for v in range(len(weight)):
-            total[v, 0] = total[v, 4] = total[v, 8] = weight[v]
+            total[v, 0] = total[v, 4] = total[v, 8] = weight[v, n]
         _add_faces(x, faces, face_slots, face_numbers, first, second, woven, exact[n], n, total)
         _add_hinges(x, hinges, order, hinge_slots, roots, n, total)
         for sample in range(len(contact)):

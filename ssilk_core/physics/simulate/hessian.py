@@ -125,7 +125,7 @@ class Hessian:
         """Return the Hessian at x.
 
         Args:
-            weight: isotropic stiffness of each free vertex [N/m], shape (U, 1).
+            weight: isotropic stiffness of each free vertex [N/m], shape (U, 1), or of each in each frame, (U, N).
             contact: block of each sample, shape (S, 3, 3, N), or None.
             fixed: free vertices that are stiffened so that a solution hardly moves them, shape (U, N), or None.
             exact_hessian: see `Membrane.stiffness`.
