@@ -297,6 +297,27 @@ def test_what_skinning_begins_with_may_be_a_time_sample_and_may_not_change(tmp_p
         read_scene(path, garment="Cape")
 
 
+def test_rounding_of_a_large_value_is_no_change(tmp_path):
+    """In centimetres a step of single precision is more than 1e-5."""
+    path = outfit(tmp_path, "geomBindTransform")
+    stage = Usd.Stage.Open(str(path))
+    attribute = stage.GetPrimAtPath("/Hero/Outfit/Cape").GetAttribute("points")
+    values = np.array(attribute.Get(), np.float32) + np.float32(170)
+    for time, each in ((3, values), (9, np.nextafter(values, np.float32(200)))):
+        attribute.Set(Vt.Vec3fArray.FromNumpy(each), time)
+    stage.Save()
+    read_scene(path, garment="Cape")
+
+
+def test_a_garments_animation_is_not_compared_with_a_character_that_stands_still(tmp_path):
+    """Its motion comes from another file; a clip that an export left on the garment's Skeleton is not played."""
+    path = outfit(tmp_path, "another pose")
+    stage = Usd.Stage.Open(str(path))
+    animate(stage, "/Hero/Own", BIND, [10, 20, -30], UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Outfit/Rig")))
+    stage.Save()
+    read_scene(path, garment="Cape")
+
+
 def test_other_axes_of_the_same_joints_move_no_garment_in_its_own_file(tmp_path):
     """Programs turn the axes of joints as they like; where the joints stand is the pose."""
     hero, own = tmp_path / "hero.usda", tmp_path / "cape.usda"

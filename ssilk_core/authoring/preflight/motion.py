@@ -86,6 +86,7 @@ def lying(motion: Motion, skeleton: Skeleton) -> Findings:
     if len(down) > MOSTLY * motion.frame_count:
         found = f"the character lies or stands on its head in {len(down)} of {motion.frame_count} frames"
     elif abs(other) > own + STRAIGHTER:  # between Y up and Z up is a quarter turn about x
+        down = np.arange(motion.frame_count)
         leans, would = np.degrees(np.arccos(np.clip([own, abs(other)], -1, 1)))
         found = (
             f"the character leans by {leans:.0f} degrees on average, and by {would:.0f} if the up axis of its file "

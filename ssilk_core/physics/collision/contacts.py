@@ -22,6 +22,7 @@ from ...scene.assets import PINNED, TIGHT, Ints, Scene
 from ...scene.mesh import topology
 from ...scene.mesh.blocks import compact_blocks
 from .. import kernels
+from .closest_point import closest_on_faces
 from .distance import MAX_DEPTH, Patches, PosedBody, nearest_planes, signed_distance_to_planes, smoothed_planes
 from .limb_axes import loose_faces
 from .nearest_vertex import GARMENT_BLOCK
@@ -121,6 +122,22 @@ class Contacts:
         if self._piercing and body.limbs:
             self._piercing.replace_planes(x, body.limbs, found.normal, found.offset, found.curvature)
         return found
+
+    def touched(self, x: Tensor, search_radius: Tensor, body: PosedBody) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return the nearest body points of samples x (S, 3, N) as `closest_on_faces` does, on what each can touch.
+
+        Args:
+            search_radius: upper bound of each distance [m], shape (S, N); negative values skip a sample.
+        """
+        assert body.faces is not None
+        parts = []
+        for group in self._groups:
+            candidates = group.patches.faces if group.patches else None
+            given = x.index_select(0, group.rows), search_radius.index_select(0, group.rows)
+            row, *found = closest_on_faces(*given, body.points, body.faces, candidates)
+            parts.append((group.rows[row], *found))
+        row, frame, corners, weights = (torch.cat(part, dim=-1) for part in zip(*parts))
+        return row, frame, corners, weights
 
     def smoothed_nearby(
         self, x: Tensor, body: PosedBody, known: SmoothedDistance, at: Tensor, within: float

@@ -30,8 +30,8 @@ def points_loop(
     contact (V, 3, N) and that of contact at samples (S, 3, N) [N].
 
     Args:
-        x: positions (V, 3, N); mass: (V, 1); gravity: (3, N).
-        anchors: stiffness (V, 1) and target (V, 3, N) of each spring to a point.
+        x: positions (V, 3, N); mass: (V, 1); gravity: (3, N) or (3, 1).
+        anchors: stiffness (V, 1) and target (V, 3, N), or one for all frames (V, 3, 1), of each spring to a point.
         samples: positions (S, 3, N); area: of each, (S, 1).
         planes: normals (S, 3, N) and offsets (S, N) of the distance to the body, or None without contact.
         law: stiffness, start and ramp of `energy.collision.ContactLaw`.
@@ -40,10 +40,10 @@ def points_loop(
     normal, offset = (x[:0], x[:0, 0]) if planes is None else planes
     touching = len(normal)
     weights = torch.cat([weight for weight, _ in anchors], dim=1) if anchors else x.new_zeros(vertices, 0)
-    targets = torch.stack([target for _, target in anchors]) if anchors else x.new_zeros(0, vertices, 3, frames)
+    targets = torch.stack([target.expand_as(x) for _, target in anchors]) if anchors else x.new_zeros(0, *x.shape)
     energy = x.new_empty(frames)
     slopes = x.new_empty(vertices if wanted else 0, 3, frames), x.new_empty(touching if wanted else 0, 3, frames)
-    given = array(x), array(mass[:, 0]), array(gravity), array(weights), array(targets)
+    given = array(x), array(mass[:, 0]), array(gravity.expand(3, frames)), array(weights), array(targets)
     contact = array(samples), array(normal), array(offset), array(area[:, 0]), *law
     run_parts(_points, frames, *given, *contact, energy.numpy(), *(slope.numpy() for slope in slopes))
     return energy, *slopes

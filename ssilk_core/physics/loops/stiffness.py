@@ -61,8 +61,8 @@ def stiffness_loop(
     moduli = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
     elements = (tables.faces, tables.face_slots, tables.face_numbers, tables.hinges, tables.order,
                 tables.hinge_slots, tables.roots, tables.sample_slots, tables.sample_weights)  # fmt: skip
-    numbers = array(x), *elements, *map(float, moduli), woven, array(weight.expand(-1, frames)), array(given), array(exact)
-    run_parts(_stiffness, frames, *numbers, blocks.numpy())
+    numbers = array(x), *elements, *map(float, moduli), woven, array(weight.expand(-1, frames))
+    run_parts(_stiffness, frames, *numbers, array(given), array(exact), blocks.numpy())
     return blocks
 
 

@@ -25,7 +25,6 @@ from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
-from ..collision.closest_point import closest_on_faces
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
@@ -193,11 +192,11 @@ class IncrementalPotential:
         if not mu:
             return None
         samples, found = self.cloth.positions(x), self.body_distance(x, StepInputs(body, x.new_zeros(3, x.shape[-1])))
-        assert found is not None and body.faces is not None
+        assert found is not None
         distance = found.distance(samples)
         force = self.cloth.area * self.law.pressure(distance)
         reach = torch.where(force > 0, 2 * distance.abs() + self.law.start, -1.0).float()
-        row, frame, corners, weights = closest_on_faces(samples.float(), reach, body.points, body.faces)
+        row, frame, corners, weights = self.contacts.touched(samples.float(), reach, body)
         vertices = torch.as_tensor(self.cloth.samples.corners, device=x.device)[row].T
         coefficients = torch.as_tensor(self.cloth.samples.weights, dtype=x.dtype, device=x.device)[row].T
         normal = torch.nn.functional.normalize(found.normal[row, :, frame].T, dim=0)

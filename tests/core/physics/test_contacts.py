@@ -145,6 +145,21 @@ def test_tight_cloth_far_from_its_patch_touches_nothing(scene, options):
         assert not smoothed.curvature[heights < -(distance.TIGHT_REACH + slack)].any()
 
 
+def test_tight_cloth_touches_its_own_side_and_loose_cloth_what_is_nearest(scene):
+    """Friction holds to the part of the body that pushes, also where another part is nearer."""
+    side = np.array([[RADIUS + 0.002, 0, 0]])
+    for kind, own in ((TIGHT, True), (LOOSE, False)):
+        dressed, body = on_limb(scene, side, kind)
+        contacts = Contacts(dressed, vertex_samples(len(dressed.classes)), device=CPU)
+        posed = still(body, exact=True)
+        x = torch.tensor([-RADIUS - 0.002, 0.0, 0.0]).expand(len(dressed.classes), 3)[..., None]
+        reach = torch.full((len(x), 1), 3 * RADIUS)
+        row, frame, corners, weights = contacts.touched(x, reach, posed)
+        assert row.tolist() == list(range(len(x))) and not frame.any()
+        found = (weights[:, :, None] * posed.points[corners, :, 0]).sum(0)
+        assert bool((found[:, 0] > -0.5 * RADIUS).all()) is own
+
+
 def test_pinned_cloth_meets_nothing_unless_it_is_measured(scene):
     dressed, body = on_limb(scene, np.array([0.0, 0, 0]), PINNED)
     x = torch.tensor(dressed.garment.mesh.points, dtype=torch.float32)[..., None]

@@ -80,19 +80,19 @@ def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> Non
     if character is None or animation is None or location(own.prim) == skeleton.path:
         return
     theirs = animation_source(character.prim).prim
-    sources = [source for source in (animation, theirs) if source]
-    if animation == theirs or not value(animation, "joints"):  # without joints it weighs blendshapes alone
+    # Without joints it weighs blendshapes alone. A character that stands still here is moved from elsewhere.
+    if theirs is None or animation == theirs or not value(animation, "joints"):
         return
-    times = change_times(source.GetAttribute(name) for source in sources for name in NEEDED)
+    times = change_times(source.GetAttribute(name) for source in (animation, theirs) for name in NEEDED)
     match = np.array(match_joints(own.joints, skeleton.joint_names))
     mine = [joint for joint, name in enumerate(own.joints) if name in used and match[joint] >= 0]
     first: Floats | None = None
     for code in map(Usd.TimeCode, spread(np.array(times), COMPARED).tolist()):
-        placed = _shown(character, theirs is not None, code)[character.character_joints][match[mine]]
-        apart = np.linalg.inv(placed) @ _shown(own, True, code)[mine]
-        first = apart if first is None else first
-        off = np.abs(apart - first).max(axis=(1, 2))
-        if off.size and off.max() > ONE_MOTION:
+        placed = _shown(character, True, code)[character.character_joints][match[mine]]
+        shown = _shown(own, True, code)[mine]
+        first = np.linalg.pinv(placed) @ shown if first is None else first  # a joint may be scaled to nothing
+        off = np.abs(placed @ first - shown).max(axis=(1, 2))
+        if off.size and not off.max() <= ONE_MOTION:  # what is not a number is off, too
             fail(
                 location(own.prim),
                 f"its animation {animation.GetPath()} moves {own.joints[mine[int(off.argmax())]]} otherwise than the "

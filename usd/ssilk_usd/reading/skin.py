@@ -17,7 +17,7 @@ from ..names import GEOM_BIND, JOINTS, SKEL
 from ..opening.stage import EARLIEST, inherited, location
 from ..opening.times import change_times
 
-STILL = 1e-5  # in units of the stage, and of weights: rounding
+STILL = 1e-5  # of the largest value: rounding
 WHOLE = 0.01  # how far weights of a vertex may sum from one: half floats and rounding tools stay within
 
 
@@ -148,7 +148,8 @@ def _need_still(attribute: Usd.Attribute, where: str) -> None:
     times = change_times([attribute]) if attribute else []
     for time in times[1:]:
         first, later = (np.array(attribute.Get(each)) for each in (times[0], time))
-        if later.shape != first.shape or not np.allclose(later, first, rtol=0, atol=STILL):
+        bound = STILL * max(1.0, float(np.abs(first).max(initial=0)))
+        if later.shape != first.shape or not np.allclose(later, first, rtol=0, atol=bound):
             fail(
                 where,
                 f"it is skinned, and its {attribute.GetName()} changes at time code {time:g}",
