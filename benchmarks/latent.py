@@ -5,10 +5,10 @@
     python benchmarks/latent.py --device cuda --motion walk --elements chosen --shots 1 16 64 256
 
 All shots of a motion are solved at once, each a frame later in the motion than the one before; those that would not
-end within the motion begin again at the first one. Times are those of a
-frame of one shot, in processor time on a processor: medians over frames, without the first two. What it takes to
-choose elements for a motion comes before the first frame ("begins"). Energies are means over frames and shots, of the
-best start, and as solved, on the elements that the solver has; each row has its own past, so rows differ in these.
+end within the motion begin again at the first one. Times are those of a frame of one shot, in processor time on a
+processor: medians over frames, without the first two. What it takes to choose elements for a motion comes before the
+first frame ("begins"). Energies are means over frames and shots, of the best start, and as solved, on the elements
+that the solver has; each row has its own past, so rows differ in these.
 "Whole" is the first shot's on all elements, of the same states. "Left" is the share of the gain that the solver's own
 prediction has still left. The first row of a motion is the network; "all" rows solve for the whole garment. With
 --simulate the simulator goes through the first shot, and RMS distances from it, after five frames and at the end, are

@@ -60,18 +60,18 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     kept = _kept(options)
     known = (outcome for outcome in kept.known(report) if outcome.verdict != "breaks")  # that is tried again
-    found = {(outcome.group, outcome.name): outcome for outcome in known}
-    missing = [case for case in cases if (case.group, case.name) not in found]
+    found = {outcome.label: outcome for outcome in known}
+    missing = [case for case in cases if case.label not in found]
     report(Started("stress", len(missing)))
     told = Countdown(len(missing), report)
 
     def write(*, finished: bool) -> None:
-        rows = [asdict(found[case.group, case.name]) for case in CASES if (case.group, case.name) in found]
+        rows = [asdict(found[case.label]) for case in CASES if case.label in found]
         kept.write({"model": options.model.name}, rows, finished=finished)
 
     try:
         for case in missing:
-            outcome = found[case.group, case.name] = case.run(subject)
+            outcome = found[case.label] = case.run(subject)
             if outcome.verdict not in case.allowed:
                 report(Message(f"{case.label} {outcome.verdict}: {outcome.said}", "warning"))
             write(finished=False)
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         kept.tell_kept(len(found), report)
         raise
     write(finished=True)
-    outcomes = [found[case.group, case.name] for case in cases]
+    outcomes = [found[case.label] for case in cases]
     faults = [case.label for case, outcome in zip(cases, outcomes) if outcome.verdict not in case.allowed]
     report(Message(markdown(outcomes)))
     report(Result("stress", {"cases": len(outcomes), "faults": ", ".join(faults) or "none"}))

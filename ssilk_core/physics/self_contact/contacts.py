@@ -22,6 +22,13 @@ UNSLOWED = 0.99  # the share above which a vertex counts as not slowed: 0.8 + 0.
 TINY = 1e-12  # [m]
 
 
+def at_vertices(parts: Tensor, vertices: Tensor, frame: Tensor, x: Tensor) -> Tensor:
+    """Return the sums of parts (4, 3, P), of the vertices (4, P) in frames (P,), in the shape (V, 3, N) of x."""
+    found = x.new_zeros(len(x), x.shape[-1], 3)
+    at = vertices, frame.expand_as(vertices)
+    return found.index_put_(at, parts.movedim(1, -1), accumulate=True).movedim(-1, 1).contiguous()
+
+
 @dataclass(frozen=True, eq=False)
 class Slopes:
     """Rows whose squares add up to a Hessian: the sum over R rows of each row with itself.
@@ -87,9 +94,7 @@ class ClothContacts:
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
         force = (-self.pressure(x) * self.coefficients)[:, None] * self.direction
-        found = x.new_zeros(len(x), x.shape[-1], 3)
-        at = self.vertices, self.frame.expand_as(self.vertices)
-        return found.index_put_(at, force.movedim(1, -1), accumulate=True).movedim(-1, 1).contiguous()
+        return at_vertices(force, self.vertices, self.frame, x)
 
     def stiffness(self, x: Tensor) -> Tensor:
         """Return the second derivative of each contact's energy by its gap [N/m], shape (P,)."""

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ..self_contact import ClothContacts
-from ..self_contact.contacts import Slopes
+from ..self_contact.contacts import Slopes, at_vertices
 from ..self_contact.neighbours import places_among
 
 CREEP = 2e-3  # [m/s]
@@ -88,10 +88,7 @@ class Friction:
         """Return its gradient [N], shape (V, 3, N)."""
         slip = self._slip(x)
         force = self._along(slip.norm(dim=0)) * slip
-        found = x.new_zeros(len(x), x.shape[-1], 3)
-        at = self.vertices, self.frame.expand_as(self.vertices)
-        found.index_put_(at, (self.coefficients[:, None] * force).movedim(1, -1), accumulate=True)
-        return found.movedim(-1, 1).contiguous()
+        return at_vertices(self.coefficients[:, None] * force, self.vertices, self.frame, x)
 
     def slopes(self, x: Tensor) -> Slopes:
         """Return what its Hessian at x is made of: along the slip, and across it."""

@@ -51,6 +51,11 @@ class CaseOutcome:
     measured: CaseMeasurement
     seconds: float
 
+    @property
+    def label(self) -> str:
+        """As `cases.Case.label`."""
+        return f"{self.group}: {self.name}"
+
     def row(self) -> list[str]:
         """Return the cells of the row."""
         found, error = self.measured.extent, self.measured.error
@@ -62,7 +67,7 @@ class CaseOutcome:
             ]  # fmt: skip
         off = "" if error is None else f"{error:.2g} {self.measured.unit}".strip()
         words = f"{self.verdict}: {self.said}" if self.said else self.verdict
-        return [f"{self.group}: {self.name}", words, *figures, off, f"{self.seconds:.0f}"]
+        return [self.label, words, *figures, off, f"{self.seconds:.0f}"]
 
 
 def markdown(outcomes: Sequence[CaseOutcome]) -> str:

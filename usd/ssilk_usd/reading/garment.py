@@ -173,6 +173,8 @@ def garment_place(prim: Usd.Prim, skel: SkelSource | None, skeleton: Skeleton | 
 def _rebound(prim: Usd.Prim, skel: SkelSource, skeleton: Skeleton) -> GarmentPlace:
     """Return where a skinned garment is, which may be bound to a Skeleton of its own."""
     to_core, moves = geom_to_core(prim, skel), joint_moves(skel, skeleton)
+    if location(skel.prim) == skeleton.path:
+        return GarmentPlace(to_core)
     influences = read_influences(prim, skel.joints)
     if influences is not None:
         need_one_motion(skel, skeleton, influences.used_joints())

@@ -58,9 +58,9 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
         to_character = binds[match] @ np.linalg.inv(theirs)
     else:
         animated = all(animation_source(source.prim).prim for source in (own, character))
-        kept = character.character_joints
-        shown = _shown(character, animated)[kept] @ np.linalg.inv(binds)
-        to_character = np.linalg.inv(shown)[match] @ _shown(own, animated) @ np.linalg.inv(theirs)
+        queries = (_query(character), _query(own)) if animated else (None, None)
+        shown = _shown(character, queries[0])[character.character_joints] @ np.linalg.inv(binds)
+        to_character = np.linalg.inv(shown)[match] @ _shown(own, queries[1]) @ np.linalg.inv(theirs)
     for joint in np.flatnonzero(match < 0):
         above = own.parents[joint]
         to_character[joint] = to_character[above] if above >= 0 else np.eye(4)
@@ -68,7 +68,7 @@ def joint_moves(own: SkelSource, skeleton: Skeleton) -> Floats | None:
 
 
 def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> None:
-    """Check that an animation of a garment's own Skeleton moves it as the character's does.
+    """Check that an animation of a garment's own Skeleton, not the character's, moves it as the character's does.
 
     Args:
         used: joints of `own` that carry the garment.
@@ -77,7 +77,7 @@ def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> Non
         SsilkError: a joint moves away from where the character has it.
     """
     character, animation = character_source(own.stage, skeleton), animation_source(own.prim).prim
-    if character is None or animation is None or location(own.prim) == skeleton.path:
+    if character is None or animation is None:
         return
     theirs = animation_source(character.prim).prim
     # Without joints it weighs blendshapes alone. A character that stands still here is moved from elsewhere.
@@ -86,10 +86,10 @@ def need_one_motion(own: SkelSource, skeleton: Skeleton, used: list[str]) -> Non
     times = change_times(source.GetAttribute(name) for source in (animation, theirs) for name in NEEDED)
     match = np.array(match_joints(own.joints, skeleton.joint_names))
     mine = [joint for joint, name in enumerate(own.joints) if name in used and match[joint] >= 0]
-    first: Floats | None = None
+    queries, first = (_query(character), _query(own)), None
     for code in map(Usd.TimeCode, spread(np.array(times), COMPARED).tolist()):
-        placed = _shown(character, True, code)[character.character_joints][match[mine]]
-        shown = _shown(own, True, code)[mine]
+        placed = _shown(character, queries[0], code)[character.character_joints][match[mine]]
+        shown = _shown(own, queries[1], code)[mine]
         first = np.linalg.pinv(placed) @ shown if first is None else first  # a joint may be scaled to nothing
         off = np.abs(placed @ first - shown).max(axis=(1, 2))
         if off.size and not off.max() <= ONE_MOTION:  # what is not a number is off, too
@@ -122,12 +122,20 @@ def used_moves(moves: Floats, influences: AuthoredInfluences, joints: tuple[str,
     return ordered, ordered[np.unique(influences.indices[influences.weights != 0])]
 
 
-def _shown(source: SkelSource, animated: bool, time: Usd.TimeCode = EARLIEST) -> Floats:
-    """Return joint to core world [m] as USD shows a skeleton, placed as at first, rigid, shape (N, 4, 4)."""
+def _query(source: SkelSource) -> UsdSkel.SkeletonQuery:
+    """Return what animates a skeleton as USD shows it."""
+    cache = UsdSkel.Cache()
+    cache.Populate(UsdSkel.Root(source.root), PRIMS)
+    return cache.GetSkelQuery(UsdSkel.Skeleton(source.prim))
+
+
+def _shown(source: SkelSource, query: UsdSkel.SkeletonQuery | None, time: Usd.TimeCode = EARLIEST) -> Floats:
+    """Return joint to core world [m] as USD shows a skeleton, placed as at first, rigid, shape (N, 4, 4).
+
+    Without a query it is at rest.
+    """
     posed = world_transforms(source.rest, source.parents)
-    if animated:
-        cache = UsdSkel.Cache()
-        cache.Populate(UsdSkel.Root(source.root), PRIMS)
-        found = cache.GetSkelQuery(UsdSkel.Skeleton(source.prim)).ComputeJointSkelTransforms(time)
+    if query:
+        found = query.ComputeJointSkelTransforms(time)
         posed = column_matrix(found) if found else posed
     return source.units.matrix @ source.placement @ posed @ scaling(1 / source.joint_scale)

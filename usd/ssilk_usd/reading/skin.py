@@ -146,9 +146,12 @@ def read_influences(
 def _need_still(attribute: Usd.Attribute, where: str) -> None:
     """Raise `SsilkError` where a value that skinning begins with changes; one time sample is as good as a default."""
     times = change_times([attribute]) if attribute else []
+    if len(times) < 2:
+        return
+    first = np.array(attribute.Get(times[0]))
+    bound = STILL * max(1.0, float(np.abs(first).max(initial=0)))
     for time in times[1:]:
-        first, later = (np.array(attribute.Get(each)) for each in (times[0], time))
-        bound = STILL * max(1.0, float(np.abs(first).max(initial=0)))
+        later = np.array(attribute.Get(time))
         if later.shape != first.shape or not np.allclose(later, first, rtol=0, atol=bound):
             fail(
                 where,
