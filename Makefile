@@ -23,13 +23,11 @@ demo: $(STAMP)
 test: $(STAMP)
 	$(MAKE) -j 2 lint pytest
 
-# One process for each core; each of them computes with one thread. Files begin in the order of tests/conftest.py.
-# Those that come first compile nearly all loops, which two processes that begin together would each compile.
-FIRST := tests/core/network/test_latent_solver.py $(addprefix tests/core/physics/,test_loops.py test_simulate_solver.py)
-pytest: export OMP_NUM_THREADS := 1
+# One process more than there are cores, since many tests wait for processes of their own; each of them computes with
+# one thread. Files begin in the order of tests/conftest.py.
+WORKERS = $(shell $(PYTHON) -c "import os; print(os.cpu_count() + 1)")
 pytest: $(STAMP)
-	$(BIN)/python -m pytest $(FIRST)
-	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder $(addprefix --ignore=,$(FIRST))
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
