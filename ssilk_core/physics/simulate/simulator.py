@@ -9,7 +9,7 @@ where single precision is finest; between steps positions are kept in world spac
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -31,8 +31,8 @@ from .newton import Solution, SolverOptions, minimise_from
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
-POSES = 16  # between the bind pose and the first one
-ON_THE_WAY = 10  # iterations for each of these
+POSES = 8  # from the bind pose to one in which cloth comes to rest
+ON_THE_WAY = 5  # iterations for each of these but the last
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +182,7 @@ class Simulator:
             running = [span for span in spans if span.motion.frame_count > step]
             poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            past, solution = self._after(past, poses) if past else self._first(poses, running)
+            past, solution = self._after(past, poses) if past else self._first(running)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, past.last, solution)
 
@@ -208,36 +208,45 @@ class Simulator:
         world = solution.x.double() + poses.root
         return StepHistory(world, before, poses.root, poses.lbs, solution.neighbours, friction)
 
-    def _first(self, poses: PosedCharacters, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
+    def _first(self, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
-        solver = self.options.quasi_static_solver
-        self.report(Message(f"cloth comes to rest in the first pose, in {solver.iterations} iterations at most"))
-        told = Countdown(solver.iterations, self.report)
-        inputs, start = self.inputs(poses, None), poses.lbs
-        if self.options.self_contact:
-            start, known = self._from_bind_pose(poses, spans)
-            inputs = replace(inputs, neighbours=known)
-        solution = minimise_from(self.potential, start, inputs, solver, advanced=told)
+        most = self.options.quasi_static_solver.iterations + (POSES - 1) * ON_THE_WAY
+        self.report(Message(f"cloth comes to rest in the first pose, in {most} iterations at most"))
+        rotations, translations = (
+            np.stack([getattr(span.motion, name)[0] for span in spans]) for name in ("rotations", "translations")
+        )
+        poses, solution = self.at_rest(rotations, translations, Countdown(most, self.report))
         return self._history(solution, poses, None), solution
 
-    def _from_bind_pose(
-        self, poses: PosedCharacters, spans: Sequence[MotionSpan]
-    ) -> tuple[Tensor, ClothNeighbours | None]:
-        """Return the garment (V, 3, N), carried from the bind pose to the first poses past itself, and its sides."""
-        first = [
-            np.stack([getattr(span.motion, name)[0] for span in spans]) for name in ("rotations", "translations")
-        ]
+    def at_rest(
+        self, rotations: Floats, translations: Floats, advanced: Callable[[], object] = lambda: None
+    ) -> tuple[PosedCharacters, Solution]:
+        """Return poses with their quasi-static states, to which the garment is carried from the bind pose.
+
+        Linear blend skinning alone puts cloth through raised arms and through itself, and no minimisation leads out.
+
+        Args:
+            rotations, translations: of the joints, local, shapes (N, J, 4) and (N, J, 3).
+            advanced: called after each iteration.
+        """
         turned, placed = bind_pose(self.poser.skeleton)
-        start = self.poser.pose(np.broadcast_to(turned, first[0].shape), np.broadcast_to(placed, first[1].shape))
-        x, lbs, known = start.lbs, start.lbs, None
-        solver = replace(self.options.quasi_static_solver, iterations=ON_THE_WAY)
+        poses = self.poser.pose(np.broadcast_to(turned, rotations.shape), np.broadcast_to(placed, translations.shape))
+        x, last = poses.lbs, self.options.quasi_static_solver
+        known: ClothNeighbours | None = None
         for share in np.arange(1, POSES + 1) / POSES:
-            between = self.poser.pose(slerp(turned, first[0], share), (1 - share) * placed + share * first[1])
-            inputs = self.inputs(between, None)
-            x, inputs = self.potential.approach(x, x + between.lbs - lbs, inputs, known)
-            found = minimise_from(self.potential, self.apply_pins(x, between), inputs, solver)
-            x, lbs, known = found.x, between.lbs, found.neighbours
-        return self.apply_pins(x, poses), known
+            lbs = poses.lbs
+            poses = self.poser.pose(slerp(turned, rotations, share), (1 - share) * placed + share * translations)
+            x, inputs = self._carried(x, x + poses.lbs - lbs, self.inputs(poses, None), known)
+            solver = last if share == 1 else replace(last, iterations=min(ON_THE_WAY, last.iterations))
+            solution = minimise_from(self.potential, self.apply_pins(x, poses), inputs, solver, advanced)
+            x, known = solution.x, solution.neighbours
+        return poses, solution
+
+    def _carried(
+        self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
+    ) -> tuple[Tensor, StepInputs]:
+        """Return a target (V, 3, N), or how far the garment comes towards it past itself, and the inputs there."""
+        return self.potential.approach(x, target, inputs, known) if self.options.self_contact else (target, inputs)
 
     def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
@@ -258,10 +267,8 @@ class Simulator:
         """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
         start = self.best_start(self.starts(poses, past, inputs), inputs)
-        if self.options.self_contact:
-            x, inputs = self.potential.approach(past.local, start, inputs, past.neighbours)
-            start = self.apply_pins(x, poses)
-        return self.solve(start, inputs)
+        x, inputs = self._carried(past.local, start, inputs, past.neighbours)
+        return self.solve(self.apply_pins(x, poses), inputs)
 
     def starts(self, poses: PosedCharacters, past: StepHistory, inputs: StepInputs) -> list[Tensor]:
         """Return states (V, 3, N) that a step after `past` may start from: predicted, still, and with the body."""
@@ -339,6 +346,5 @@ def quasi_static_states(
 ) -> Floats:
     """Return the quasi-static garment of each pose of a motion, in world space [m], shape (F, V, 3)."""
     simulator = Simulator(scene, fabric, options, device=device)
-    poses = simulator.poser.pose(motion.rotations, motion.translations)
-    solution = simulator.quasi_static(poses, poses.lbs)
+    poses, solution = simulator.at_rest(motion.rotations, motion.translations)
     return (solution.x.double() + poses.root).permute(2, 0, 1).cpu().numpy()
