@@ -1,0 +1,371 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dial between fast and near to the simulator: errors of each place on it beside its time, of one garment.
+
+    python benchmarks/dial.py errors --garment cape --stage character.usdc --motions FOLDER --device cuda
+    python benchmarks/dial.py times --garment cape --stage character.usdc --motions FOLDER --device cuda
+    OMP_NUM_THREADS=1 python benchmarks/dial.py times --garment cape ... --device cpu --threads 1
+    python benchmarks/dial.py picture
+
+Places are the network, as trained and reduced to quality levels, the solver in latents on few elements and on all,
+refinement, *Hero* and the simulator (`helpers/dial_places.py`). Windows are spread over each clip of the splits. All
+places play the frames of a window and --lead frames before it, from rest. The simulator goes on from the place's own
+first two states in the window, so that nobody is blamed for a state that it did not choose. Its own row goes on from
+the network's, and is right by definition. What it is worth is told by "1 mm off": the loose cloth of these two states
+is moved sideways by a millimetre, and that simulation is compared with the first.
+
+All figures are of a window's frames after its first two: RMS distances over mass after some frames [m], RMS errors of
+velocity over mass and frames [m/s], total energies [J] (gravity relative to skinning), shares of the covered skin
+that show, and shares of triangles that intersect others in the frames whose distances are told.
+
+Times are those of a frame of one shot, on one processor core of a shot alone, and on a GPU of --shots at once, but of
+refinement and *Hero*, which take one shot at a time. Both write the garment's file, which grows row by row; the same
+command goes on where it was cut off. `picture` draws what the files of the garments that ship hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from documents.dial import draw
+from helpers.dial_places import NETWORK, PLACES, SIMULATOR, Dial, Place
+from helpers.own_windows import STATES, spread_windows
+from helpers.reports import RESULTS, provenance, rounded
+from helpers.subjects import Subject, clip_of, open_subject
+from ssilk_usd.stages import demo_body_path
+from torch import Tensor
+
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.devices import device_name
+from ssilk_core.errors import SsilkError, fail
+from ssilk_core.events import Countdown, Message, Reporter, TextReporter
+from ssilk_core.files import sha256
+from ssilk_core.physics.energy import TERMS
+from ssilk_core.quality.evaluation.methods import TakeSet, build_take_set
+from ssilk_core.quality.evaluation.metrics import mean_square
+from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
+from ssilk_core.quality.evaluation.record import frame_energies
+from ssilk_core.quality.evaluation.splits import read_index, splits_of
+from ssilk_core.quality.evaluation.takes import Take, takes_of
+from ssilk_core.quality.kept_rows import UNFINISHED, KeptRows
+from ssilk_core.scene.assets import Motion
+
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
+OFF, OFF_BY = "simulator, 1 mm off", 1e-3  # [m]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DialErrors:
+    """What a place on the dial does in the windows of a split; a value for each window in which it is finite.
+
+    Attributes:
+        lost: windows in which it is not.
+        distance: RMS distance from the simulator that goes on from the place's own two states, after frames [m].
+        velocity: RMS error of velocity [m/s].
+        total: mean energy [J].
+        shown, intersecting: mean shares of the covered skin that shows, and of triangles that intersect others.
+    """
+
+    split: str
+    place: str
+    lost: int
+    distance: dict[str, tuple[float, ...]]
+    velocity: tuple[float, ...]
+    total: tuple[float, ...]
+    shown: tuple[float, ...]
+    intersecting: tuple[float, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DialTime:
+    """What a frame of one shot takes at a place [ms], where so many shots are played at once."""
+
+    place: str
+    device: str
+    hardware: str
+    shots: int
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Takes, of which each is a window with its lead, and the windows of each split."""
+
+    takes: list[Take]
+    windows: dict[str, list[Window]]
+
+
+class Bench:
+    """One garment on its character, with its windows and its file of figures."""
+
+    def __init__(self, options: argparse.Namespace, report: Reporter) -> None:
+        self.options, self.report = options, report
+        self.path = options.model or shipped_path(options.garment)
+        self.subject: Subject = open_subject(self.path, options.stage, options.device)
+        index = splits_of(read_index(options.index or options.motions / "index.json"), options.clips)
+        self.splits = {name: clips for name, clips in index.items() if name in options.splits}
+        if not self.splits:
+            fail("clips", f"none of the splits {', '.join(options.splits)} is chosen", "one at least is needed")
+        names = [clip for clips in self.splits.values() for clip in clips]
+        self.clips = {name: clip_of(options, name, self.subject) for name in names}
+        self.kept = KeptRows(
+            path=options.output or RESULTS / f"dial_{self.path.stem}.json",
+            verb="dial",
+            kind=DialErrors,
+            names=("split", "place"),
+            inputs=self._inputs(),
+            beside={"times": DialTime},
+        )
+        self.rows = self.kept.known(report)
+        self.document = self.kept.told() if self.rows else {}
+
+    def _inputs(self) -> dict[str, Any]:
+        motions = self.options.motions
+        return {
+            "model": sha256(self.path),
+            "stage": sha256(self.options.stage),
+            "motions": {name: sha256(motions / f"{name}.usdc") for name in self.clips},
+            "windows": self.options.windows,
+            "lead": self.options.lead,
+            "after": self.options.after,
+        }
+
+    @cached_property
+    def windows(self) -> Windows:
+        """The windows of all splits, each a take of its own with its lead."""
+        skeleton, fps = self.subject.scene.character.skeleton, self.subject.file.config.fps
+        takes: list[Take] = []
+        windows: dict[str, list[Window]] = {}
+        for split, clips in self.splits.items():
+            windows[split] = []
+            for clip in clips:
+                own = takes_of(clip, self.clips[clip], skeleton, fps)
+                spread = spread_windows(dict(enumerate(own)), self.options.windows, [max(self.options.after)])
+                for number, frames in spread:
+                    take, first = own[number], max(0, frames.start - self.options.lead)
+                    windows[split].append((len(takes), range(frames.start - first, frames.stop - first)))
+                    cut = take.motion.clip(first, frames.stop)
+                    takes.append(replace(take, first=take.first + first, motion=cut))
+            if not windows[split]:
+                fail(split, "its clips are too short", f"{STATES + max(self.options.after)} frames are needed")
+        return Windows(takes, windows)
+
+    @cached_property
+    def take_set(self) -> TakeSet:
+        model = self.subject.model
+        return build_take_set(self.windows.takes, self.subject.dressed, model.joints, model.config.descriptors)
+
+    @cached_property
+    def dial(self) -> Dial:
+        return Dial(self.subject, list(self.clips.values()))
+
+    @property
+    def names(self) -> list[tuple[str, str]]:
+        """The rows that a whole file has, by split and place."""
+        places = [*(place.name for place in PLACES), SIMULATOR, OFF]
+        return [(split, place) for split in self.splits for place in places]
+
+    def write(self, **told: Any) -> None:
+        """Write the file; it is finished once it has all rows of errors."""
+        measured = {(row.split, row.place) for row in self.rows}
+        self.document = {"units": "SI, times in ms", **self.document, **told}
+        inputs = (self.kept.inputs_at, self.kept.rows_at, UNFINISHED)
+        plain = {name: value for name, value in self.document.items() if name not in inputs}
+        rows = sorted((asdict(row) for row in self.rows), key=lambda row: self.names.index((row["split"], row["place"])))
+        self.kept.write(plain, rounded(rows), finished=measured >= set(self.names))
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A place in the windows of a split.
+
+    Attributes:
+        windows: those in which it is finite.
+        own: the same, with what it does there.
+    """
+
+    split: str
+    place: str
+    windows: list[Window]
+    own: list[MethodWindow]
+    lost: int
+
+
+def errors(options: argparse.Namespace, report: Reporter) -> None:
+    """Measure the places that the garment's file lacks; the simulator goes on from several at once."""
+    bench = Bench(options, report)
+    known = {row.place for row in bench.rows}
+    missing = [place for place in PLACES if place.name not in known]
+    if {SIMULATOR, OFF} - known:
+        missing = [NETWORK, *(place for place in missing if place != NETWORK)]
+    count = sum(map(len, bench.windows.windows.values()))
+    frames = max(take.frame_count for take in bench.windows.takes)
+    report(Message(f"{bench.subject.name}: {count} windows, of takes of {frames} frames at most"))
+    group: list[Played] = []
+    room = BATCH
+    for number, place in enumerate(missing, start=1):
+        told = Countdown(frames * (count if place.refine else 1), report)
+        report(Message(f"{bench.subject.name}: {place.name}"))
+        group += played(bench, place, told)
+        room -= count * (2 if place == NETWORK else 1)
+        if room < count or number == len(missing):
+            simulated(bench, group)
+            group, room = [], BATCH
+
+
+def played(bench: Bench, place: Place, told: Countdown) -> list[Played]:
+    """Play a place in all takes, and return its windows; the network's, moved by a millimetre, beside it."""
+    dressed, take_set = bench.subject.dressed, bench.take_set
+    method = bench.dial.method(place, take_set, told)
+    found = []
+    for split, windows in bench.windows.windows.items():
+        own = [(window, MethodWindow(dressed, take_set, method, window)) for window in windows]
+        finite = [(window, one) for window, one in own if one.is_finite]
+        lost = len(own) - len(finite)
+        found.append(Played(split, place.name, [at for at, _ in finite], [one for _, one in finite], lost))
+        if place == NETWORK:
+            offset = torch.zeros_like(found[-1].own[0].x[0])
+            offset[dressed.simulator.potential.free, 0] = OFF_BY
+            found.append(replace(found[-1], place=OFF, own=[one.moved(offset) for one in found[-1].own]))
+    return found
+
+
+def simulated(bench: Bench, group: Sequence[Played]) -> None:
+    """Let the simulator go on from all windows of a group at once, and write what that tells of each."""
+    every = [window for one in group for window in one.own]
+    report = bench.report
+    report(Message(f"{bench.subject.name}: the simulator goes on from {len(every)} windows"))
+    told = Countdown(sum(len(window.x) - STATES for window in every), report)
+    ends = iter(continuations(bench.subject.dressed.simulator, every, told))
+    reached = {(one.split, one.place): [next(ends) for _ in one.own] for one in group}
+    for one in group:
+        own, reference = [window.x for window in one.own], reached[one.split, one.place]
+        if one.place == OFF:  # the simulation from the network's own states is what it is compared with
+            own, reference = reference, reached[one.split, NETWORK.name]
+        bench.rows.append(figures(bench, one, own, reference))
+        if one.place == NETWORK.name:
+            simulator = replace(one, place=SIMULATOR)
+            bench.rows.append(figures(bench, simulator, reference, reference))
+        bench.write(**provenance(bench.options))
+
+
+def figures(bench: Bench, one: Played, own: Sequence[Tensor], reference: Sequence[Tensor]) -> DialErrors:
+    """Return what positions (L, V, 3) in windows tell, beside those of the simulator."""
+    dressed, mass = bench.subject.dressed, bench.subject.energy.mass.double()
+    after: dict[str, list[float]] = {str(count): [] for count in bench.options.after}
+    values: dict[str, list[float]] = {"velocity": [], "total": [], "shown": [], "intersecting": []}
+    for (take, frames), x, y in zip(one.windows, own, reference):
+        away = (x - y).permute(1, 2, 0)
+        square = mean_square(away, mass)
+        for count, found in after.items():
+            found.append(float(square[int(count) + STATES - 1].sqrt()))
+        moved = mean_square(away.diff(dim=-1)[..., STATES - 1 :], mass).mean().sqrt()
+        values["velocity"].append(float(moved) * dressed.fps)
+        local = bench.take_set.local(take, x.cpu().numpy())
+        for name, value in appearance(bench, take, frames, local, x).items():
+            values[name].append(value)
+    distance = {count: tuple(found) for count, found in after.items()}
+    told = {name: tuple(found) for name, found in values.items()}
+    return DialErrors(split=one.split, place=one.place, lost=one.lost, distance=distance, **told)
+
+
+@torch.no_grad()
+def appearance(bench: Bench, take: int, frames: range, local: Tensor, x: Tensor) -> dict[str, float]:
+    """Return mean energy [J], shown skin and what intersects, of a window's frames after its first two.
+
+    Args:
+        local: positions about the take's first root [m], shape (V, 3, L).
+        x: the same in the world, shape (L, V, 3).
+    """
+    dressed, later = bench.subject.dressed, frames[STATES:]
+    terms = frame_energies(dressed, bench.take_set, take, later, local)
+    states = dressed.covered.states(local[..., STATES:], bench.take_set.character(take, later))
+    chosen = x[[count + STATES - 1 for count in bench.options.after]].cpu().numpy()
+    crossed = [dressed.intersections.triangles(points).mean() for points in chosen]
+    return {
+        "total": float(sum(terms[name].double().mean() for name in TERMS)),
+        "shown": float(states.shows.double().mean()),
+        "intersecting": float(np.mean(crossed)),
+    }
+
+
+def times(options: argparse.Namespace, report: Reporter) -> None:
+    """Time the places that the garment's file lacks on this device."""
+    bench = Bench(options, report)
+    device = bench.subject.device
+    known = bench.document.get("times", [])
+    shots = timed_shots(bench, options.shots)
+    for place in (*PLACES, None):
+        name = place.name if place else SIMULATOR
+        if any((time["place"], time["device"]) == (name, device.type) for time in known):
+            continue
+        count, milliseconds = bench.dial.milliseconds(place, shots)
+        report(Message(f"{bench.subject.name}, {name}: {milliseconds:.3g} ms a frame and shot, {count} at once"))
+        own = DialTime(place=name, device=device.type, hardware=device_name(device), shots=count,
+                       milliseconds=milliseconds)  # fmt: skip
+        known = [*known, rounded(asdict(own))]
+        bench.write(times=known)
+
+
+def timed_shots(bench: Bench, count: int) -> list[Motion]:
+    """Return shots from the windows' starts on, of each split in turn; they begin a frame later in each round."""
+    order = [at for each in zip(*bench.windows.windows.values()) for at in each]
+    found = []
+    for number in range(count):
+        take, frames = order[number % len(order)]
+        motion = bench.windows.takes[take].motion
+        start = frames.start + number // len(order) % (len(frames) - bench.options.frames + 1)
+        found.append(motion.clip(start, start + bench.options.frames))
+    return found
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("what", choices=("errors", "times", "picture"), help="to measure, or to draw")
+    found.add_argument("--garment", default="cape", help="garment that ships (default cape)")
+    found.add_argument("--model", type=Path, metavar="FILE", help="another model, written by 'ssilk train'")
+    found.add_argument("--stage", type=Path, default=demo_body_path(),
+                       help="USD file with the character (default: the demo's body)")  # fmt: skip
+    found.add_argument("--motions", type=Path, metavar="FOLDER", help="folder of motion files")
+    found.add_argument("--index", type=Path, metavar="JSON",
+                       help="list of clips with their splits (default: index.json of that folder)")  # fmt: skip
+    found.add_argument("--splits", nargs="+", default=["test", "flips"], help="(default test flips)")
+    found.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips of the splits")
+    found.add_argument("--windows", type=int, default=1, help="of each clip (default 1)")
+    found.add_argument("--lead", type=int, default=30, help="frames played before a window (default 30)")
+    found.add_argument("--after", type=int, nargs="+", default=[10, 30],
+                       help="frames to tell distances after; the last ends a window (default 10 30)")  # fmt: skip
+    found.add_argument("--shots", type=int, default=64, help="that a GPU is timed on at once (default 64)")
+    found.add_argument("--frames", type=int, default=10, help="of shots that are timed (default 10)")
+    found.add_argument("--output", type=Path, metavar="FILE",
+                       help="figures, or picture (default: in results/, and docs/images/dial.png)")  # fmt: skip
+    found.add_argument("--device", default="cpu", help="where everything runs (default cpu)")
+    found.add_argument("--threads", type=int, default=2, help="processor threads (default 2)")
+    return found
+
+
+def main() -> None:
+    options = parser().parse_args()
+    torch.set_num_threads(options.threads)
+    try:
+        if options.what == "picture":
+            draw(options.output or PICTURE)
+            return
+        if options.motions is None:
+            fail("--motions", "no folder", "figures are measured on motions")
+        if options.windows < 1 or min(options.after) < 1:
+            fail("windows", f"{options.windows} windows, after {options.after} frames", "at least 1 is needed of each")
+        (errors if options.what == "errors" else times)(options, TextReporter())
+    except SsilkError as error:
+        raise SystemExit(f"error: {error}") from error
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The places on the dial between fast and near to the simulator: how a garment is played at each, and how fast.
+
+Networks play as trained, or reduced as quality levels have them. The solver in latents, refinement and *Hero* take
+more time for less error. The simulator ends the dial.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from helpers.clock import now
+from helpers.subjects import Subject
+from ssilk_core.network.checkpoint import ModelFile, network
+from ssilk_core.network.latent_solver import LatentOptions
+from ssilk_core.network.latent_solver.shots import LatentShots
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.runtime import Player
+from ssilk_core.physics.refine import RefineOptions, Refiner
+from ssilk_core.quality.cost import play_time
+from ssilk_core.quality.evaluation.methods import Method, Network, SolvedNetwork, TakeSet, build_take_set
+from ssilk_core.quality.evaluation.own_starts import MethodWindow, history, poses_of
+from ssilk_core.quality.evaluation.takes import Take
+from ssilk_core.quality.levels import QUALITIES
+from ssilk_core.quality.reduction import Reducer
+from ssilk_core.quality.trade.shot_method import ShotMethod
+from ssilk_core.quality.trade.variants import Variant
+from ssilk_core.scene.assets import Motion
+
+SIMULATOR, ALONE = "simulator", 2  # shots that are timed one after the other, where they are not solved at once
+
+
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """A place on the dial: a network, as it is or reduced to a quality level, or a solver that it starts.
+
+    Attributes:
+        level: the quality level that reduces the network; None for none.
+        latents: how states are solved for in latents; None where they are not.
+        refine: how vertices are refined; None where they are not.
+    """
+
+    name: str
+    level: str | None = None
+    latents: LatentOptions | None = None
+    refine: RefineOptions | None = None
+
+
+FEW = [Place(name=f"{n} in latents", latents=LatentOptions(iterations=n, sampled=True)) for n in (1, 2, 4)]
+ALL = LatentOptions(iterations=QUALITIES["latent"].latent_iterations)
+HELD, CARRIED = RefineOptions(iterations=4), RefineOptions(iterations=QUALITIES["hero"].refine, feedback=True)
+NETWORK = Place(name="network")
+PLACES = (
+    Place(name="crowd", level="crowd"),
+    Place(name="game", level="game"),
+    NETWORK,
+    *FEW,
+    Place(name="latent", latents=ALL),
+    Place(name="refine 4", refine=HELD),
+    Place(name="hero", refine=CARRIED),
+)
+
+
+class Refined:
+    """A `Method`: a network's takes, refined one after the other, before they are stored as joints and blendshapes."""
+
+    def __init__(
+        self, subject: Subject, take_set: TakeSet, options: RefineOptions, advanced: Callable[[], object]
+    ) -> None:
+        dressed, played = subject.dressed, Network(subject.model, take_set)
+        refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
+        self.take_set, self.points = take_set, []
+        for number, (take, origin) in enumerate(zip(take_set.takes, take_set.origins)):
+            x = played.vertices(number, range(take.frame_count)).double().permute(2, 0, 1).cpu().numpy() + origin
+            frames = []
+            for frame in refiner.frames(take.motion, x):
+                frames.append(frame.points)
+                advanced()
+            self.points.append(np.stack(frames))
+
+    def vertices(self, take: int, frames: range) -> Tensor:
+        return self.take_set.local(take, self.points[take][frames.start : frames.stop])
+
+    def still(self, take: int, frames: range) -> None:
+        return None
+
+
+class Dial:
+    """Plays one garment at each place.
+
+    Args:
+        motions: that the network is reduced for.
+    """
+
+    def __init__(self, subject: Subject, motions: Sequence[Motion]) -> None:
+        self.subject, self.motions = subject, motions
+
+    @cached_property
+    def reducer(self) -> Reducer:
+        return Reducer(self.subject.file, self.motions)
+
+    def file(self, place: Place) -> ModelFile:
+        """Return the model of a place, as 'ssilk reduce' writes it where it is reduced."""
+        if place.level is None:
+            return self.subject.file
+        level, fps = QUALITIES[place.level], self.subject.file.config.fps
+        size = level.size.within(self.reducer.whole)
+        packed = Variant(swept="level", name=place.name, size=size, precision="int16", fps=fps)
+        return packed.in_precision(self.reducer.reduce(size).file)
+
+    def method(self, place: Place, take_set: TakeSet, advanced: Callable[[], object] = lambda: None) -> Method:
+        """Return a place over takes; `advanced` is called after each frame that a solver finds."""
+        subject = self.subject
+        if place.latents:
+            return SolvedNetwork(subject.model, subject.file.fabric, place.latents, take_set, advanced)
+        if place.refine:
+            return Refined(subject, take_set, place.refine, advanced)
+        if place.level is None:
+            return Network(subject.model, take_set)
+        fps = QUALITIES[place.level].rate(subject.dressed.fps)
+        return ShotMethod(place.name, Player(self.file(place)), subject.dressed, take_set, fps=fps)
+
+    def milliseconds(self, place: Place | None, shots: Sequence[Motion]) -> tuple[int, float]:
+        """Time a place, or the simulator where it is None, on shots of one length.
+
+        On a processor shots are played one after the other, by one core where one thread is allowed, and times are
+        processor times. On a GPU all are played at once, but for those of refinement, which takes shots one by one.
+
+        Returns:
+            How many shots are played at once, and the mean time of a frame of one shot [ms]; without the first frame,
+            in which solvers begin at rest, and without a first pass, which loads.
+        """
+        on_gpu = self.subject.device.type == "cuda"
+        if place and not (place.latents or place.refine):
+            return (len(shots), self._networks(place, shots)) if on_gpu else (1, self._players(place, shots[:ALONE]))
+        apart = not on_gpu or (place is not None and place.refine is not None)
+        batches = [[shot] for shot in shots[:ALONE]] if apart else [list(shots)]
+        self._timed(place, batches[0])
+        return len(batches[0]), float(np.mean([self._timed(place, batch) for batch in batches]))
+
+    def _players(self, place: Place, shots: Iterable[Motion]) -> float:
+        """Return the time of a frame in the numpy runtime [ms]."""
+        player = Player(self.file(place))
+        return float(np.mean([play_time(player, shot).median for shot in shots]))
+
+    @torch.no_grad()
+    def _networks(self, place: Place, shots: Sequence[Motion]) -> float:
+        """Return the time of a frame and shot of a network in PyTorch [ms], from poses to vertices."""
+        subject, times = self.subject, []
+        model = subject.model if place.level is None else self._network(self.file(place))
+        for _ in range(3):
+            begun = now(subject.device)
+            takes = self._take_set(shots)
+            states = torch.cat(Network(model, takes).states)
+            model.vertices(states, takes.bank.character(torch.arange(len(states), device=subject.device)))
+            times.append(1000 * (now(subject.device) - begun) / len(states))
+        return min(times)
+
+    def _network(self, file: ModelFile) -> GarmentModel:
+        return network(file, self.subject.scene).to(self.subject.device)
+
+    def _take_set(self, shots: Iterable[Motion]) -> TakeSet:
+        model = self.subject.model
+        takes = [Take(shot.path, 0, shot) for shot in shots]
+        return build_take_set(takes, self.subject.dressed, model.joints, model.config.descriptors)
+
+    def _timed(self, place: Place | None, batch: Sequence[Motion]) -> float:
+        """Return the mean time of a frame and shot of a solver over shots at once [ms], without the first yielded."""
+        on_gpu, device = self.subject.device.type == "cuda", self.subject.device
+        ends: list[float] = []
+        for _ in self._frames(place, batch):
+            ends.append(now(device) if on_gpu else time.process_time())
+        return 1000 * (ends[-1] - ends[0]) / (len(ends) - 1) / len(batch)
+
+    def _frames(self, place: Place | None, batch: Sequence[Motion]) -> Iterator[object]:
+        """Yield the frames of shots; the simulator's from the second on, as it is given two states."""
+        subject, take_set = self.subject, self._take_set(batch)
+        if place and place.latents:
+            yield from LatentShots(subject.model, subject.file.fabric, place.latents).frames(batch)
+            return
+        played = Network(subject.model, take_set)
+        if place and place.refine:
+            dressed, (origin,), (shot,) = subject.dressed, take_set.origins, batch
+            refiner = Refiner(dressed.scene, dressed.fabric, place.refine, fps=dressed.fps, device=dressed.device)
+            x = played.vertices(0, range(shot.frame_count)).double().permute(2, 0, 1).cpu().numpy() + origin
+            yield from refiner.frames(shot, x)
+            return
+        simulator, count = subject.dressed.simulator, batch[0].frame_count
+        own = [MethodWindow(subject.dressed, take_set, played, (at, range(count))) for at in range(len(batch))]
+        yield None
+        past = history(simulator, [(window, 2) for window in own])
+        yield from simulator.carry_on(
+            past, (poses_of(simulator, [(window, at) for window in own]) for at in range(2, count))
+        )
