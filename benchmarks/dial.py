@@ -17,8 +17,8 @@ All figures are of a window's frames after its first two: RMS distances over mas
 velocity over mass and frames [m/s], total energies [J] (gravity relative to skinning), shares of the covered skin
 that show, and shares of triangles that intersect others in the frames whose distances are told.
 
-Times are those of a frame of one shot, on one processor core of a shot alone, and on a GPU of --shots at once, but of
-refinement and *Hero*, which take one shot at a time. Both write the garment's file, which grows row by row; the same
+Times are those of a frame of one shot: on one processor core of a shot alone, on a GPU of --shots at once, but of
+refinement, whose frames are solved at once instead. Both write the garment's file, which grows row by row; the same
 command goes on where it was cut off. `picture` draws what the files of the garments that ship hold.
 """
 
@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 import torch
 from documents.dial import draw
-from helpers.dial_places import NETWORK, PLACES, SIMULATOR, Dial, Place
+from helpers.dial_places import ALONE, HELD, NETWORK, PLACES, SIMULATOR, Dial, Place
 from helpers.own_windows import STATES, spread_windows
 from helpers.reports import RESULTS, provenance, rounded
 from helpers.subjects import Subject, clip_of, open_subject
@@ -58,6 +58,10 @@ from ssilk_core.scene.assets import Motion
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
 OFF, OFF_BY = "simulator, 1 mm off", 1e-3  # [m]
+
+
+ON_GPU = 64  # shots that are timed at once
+SHOT = 1 + HELD.batch  # frames of shots that are timed; the first stands alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -210,7 +214,8 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
     group: list[Played] = []
     room = BATCH
     for number, place in enumerate(missing, start=1):
-        told = Countdown(frames * (count if place.refine else 1), report)
+        one_by_one = place.refine is not None and not place.refine.feedback
+        told = Countdown(sum(take.frame_count for take in bench.windows.takes) if one_by_one else frames, report)
         report(Message(f"{bench.subject.name}: {place.name}"))
         group += played(bench, place, told)
         room -= count * (2 if place == NETWORK else 1)
@@ -300,12 +305,13 @@ def times(options: argparse.Namespace, report: Reporter) -> None:
     bench = Bench(options, report)
     device = bench.subject.device
     known = bench.document.get("times", [])
-    shots = timed_shots(bench, options.shots)
+    at_once = options.shots or (ON_GPU if device.type == "cuda" else 1)
+    shots = timed_shots(bench, max(at_once, ALONE))
     for place in (*PLACES, None):
         name = place.name if place else SIMULATOR
         if any((time["place"], time["device"]) == (name, device.type) for time in known):
             continue
-        count, milliseconds = bench.dial.milliseconds(place, shots)
+        count, milliseconds = bench.dial.milliseconds(place, shots, at_once=at_once > 1)
         report(Message(f"{bench.subject.name}, {name}: {milliseconds:.3g} ms a frame and shot, {count} at once"))
         own = DialTime(place=name, device=device.type, hardware=device_name(device), shots=count,
                        milliseconds=milliseconds)  # fmt: skip
@@ -320,8 +326,8 @@ def timed_shots(bench: Bench, count: int) -> list[Motion]:
     for number in range(count):
         take, frames = order[number % len(order)]
         motion = bench.windows.takes[take].motion
-        start = frames.start + number // len(order) % (len(frames) - bench.options.frames + 1)
-        found.append(motion.clip(start, start + bench.options.frames))
+        start = frames.start + number // len(order) % max(1, len(frames) - SHOT + 1)
+        found.append(motion.clip(start, start + SHOT))
     return found
 
 
@@ -342,8 +348,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--lead", type=int, default=30, help="frames played before a window (default 30)")
     found.add_argument("--after", type=int, nargs="+", default=[10, 30],
                        help="frames to tell distances after; the last ends a window (default 10 30)")  # fmt: skip
-    found.add_argument("--shots", type=int, default=64, help="that a GPU is timed on at once (default 64)")
-    found.add_argument("--frames", type=int, default=10, help="of shots that are timed (default 10)")
+    found.add_argument("--shots", type=int, help="that are timed at once (default: 64 on a GPU, 1 on a processor)")
     found.add_argument("--output", type=Path, metavar="FILE",
                        help="figures, or picture (default: in results/, and docs/images/dial.png)")  # fmt: skip
     found.add_argument("--device", default="cpu", help="where everything runs (default cpu)")

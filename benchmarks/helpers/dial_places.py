@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,9 +32,11 @@ from ssilk_core.quality.levels import QUALITIES
 from ssilk_core.quality.reduction import Reducer
 from ssilk_core.quality.trade.shot_method import ShotMethod
 from ssilk_core.quality.trade.variants import Variant
-from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.assets import Floats, Motion
 
-SIMULATOR, ALONE = "simulator", 2  # shots that are timed one after the other, where they are not solved at once
+SIMULATOR = "simulator"
+ALONE = 2  # shots that are timed one after the other, where they are not played at once
+TIMED = 10  # frames that are timed of a shot whose frames are solved one after the other
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,22 +70,42 @@ PLACES = (
 )
 
 
+def refined(
+    subject: Subject, take_set: TakeSet, order: Sequence[int], options: RefineOptions
+) -> Iterator[dict[int, Floats]]:
+    """Yield refined vertices (V, 3) in the world [m], by take: with feedback of all takes at once, else one by one.
+
+    Args:
+        order: the takes, longest first.
+    """
+    dressed, played = subject.dressed, Network(subject.model, take_set)
+    refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
+    motions, networks = [take_set.takes[take].motion for take in order], []
+    for take, motion in zip(order, motions):
+        x = played.vertices(take, range(motion.frame_count)).double().permute(2, 0, 1).cpu().numpy()
+        networks.append(x + take_set.origins[take])
+    if options.feedback:
+        for frames in refiner.shots_at_once(motions, networks):
+            yield {take: frame.points for take, frame in zip(order, frames)}
+    else:
+        for take, motion, network in zip(order, motions, networks):
+            for frame in refiner.frames(motion, network):
+                yield {take: frame.points}
+
+
 class Refined:
-    """A `Method`: a network's takes, refined one after the other, before they are stored as joints and blendshapes."""
+    """A `Method`: takes of a network, refined, before they are stored as joints and blendshapes."""
 
     def __init__(
         self, subject: Subject, take_set: TakeSet, options: RefineOptions, advanced: Callable[[], object]
     ) -> None:
-        dressed, played = subject.dressed, Network(subject.model, take_set)
-        refiner = Refiner(dressed.scene, dressed.fabric, options, fps=dressed.fps, device=dressed.device)
-        self.take_set, self.points = take_set, []
-        for number, (take, origin) in enumerate(zip(take_set.takes, take_set.origins)):
-            x = played.vertices(number, range(take.frame_count)).double().permute(2, 0, 1).cpu().numpy() + origin
-            frames = []
-            for frame in refiner.frames(take.motion, x):
-                frames.append(frame.points)
-                advanced()
-            self.points.append(np.stack(frames))
+        order = sorted(range(len(take_set.takes)), key=lambda take: -take_set.takes[take].frame_count)
+        frames: list[list[Floats]] = [[] for _ in order]
+        for found in refined(subject, take_set, order, options):
+            for take, points in found.items():
+                frames[take].append(points)
+            advanced()
+        self.take_set, self.points = take_set, [np.stack(own) for own in frames]
 
     def vertices(self, take: int, frames: range) -> Tensor:
         return self.take_set.local(take, self.points[take][frames.start : frames.stop])
@@ -127,31 +149,35 @@ class Dial:
         fps = QUALITIES[place.level].rate(subject.dressed.fps)
         return ShotMethod(place.name, Player(self.file(place)), subject.dressed, take_set, fps=fps)
 
-    def milliseconds(self, place: Place | None, shots: Sequence[Motion]) -> tuple[int, float]:
+    def milliseconds(self, place: Place | None, shots: Sequence[Motion], *, at_once: bool) -> tuple[int, float]:
         """Time a place, or the simulator where it is None, on shots of one length.
 
-        On a processor shots are played one after the other, by one core where one thread is allowed, and times are
-        processor times. On a GPU all are played at once, but for those of refinement, which takes shots one by one.
+        Shots that are not played at once are played by the numpy runtime, or solved, one after the other. Refinement
+        without feedback takes them one by one in any case: it refines a shot's frames at once. The times of solvers
+        on a processor are processor times.
 
         Returns:
             How many shots are played at once, and the mean time of a frame of one shot [ms]; without the first frame,
             in which solvers begin at rest, and without a first pass, which loads.
         """
-        on_gpu = self.subject.device.type == "cuda"
         if place and not (place.latents or place.refine):
-            return (len(shots), self._networks(place, shots)) if on_gpu else (1, self._players(place, shots[:ALONE]))
-        apart = not on_gpu or (place is not None and place.refine is not None)
-        batches = [[shot] for shot in shots[:ALONE]] if apart else [list(shots)]
+            if at_once:
+                return len(shots), self._network_time(place, shots)
+            return 1, self._player_time(place, shots)
+        held = bool(place and place.refine and not place.refine.feedback)
+        batches = [list(shots)] if at_once and not held else [[shot] for shot in shots[:ALONE]]
+        if not held:
+            batches = [[shot.clip(0, TIMED) for shot in batch] for batch in batches]
         self._timed(place, batches[0])
         return len(batches[0]), float(np.mean([self._timed(place, batch) for batch in batches]))
 
-    def _players(self, place: Place, shots: Iterable[Motion]) -> float:
+    def _player_time(self, place: Place, shots: Iterable[Motion]) -> float:
         """Return the time of a frame in the numpy runtime [ms]."""
         player = Player(self.file(place))
         return float(np.mean([play_time(player, shot).median for shot in shots]))
 
     @torch.no_grad()
-    def _networks(self, place: Place, shots: Sequence[Motion]) -> float:
+    def _network_time(self, place: Place, shots: Sequence[Motion]) -> float:
         """Return the time of a frame and shot of a network in PyTorch [ms], from poses to vertices."""
         subject, times = self.subject, []
         model = subject.model if place.level is None else self._network(self.file(place))
@@ -164,7 +190,8 @@ class Dial:
         return min(times)
 
     def _network(self, file: ModelFile) -> GarmentModel:
-        return network(file, self.subject.scene).to(self.subject.device)
+        """Return a reduced model, whose rig is its own, on the whole character."""
+        return network(file, replace(file.scene, character=self.subject.scene.character)).to(self.subject.device)
 
     def _take_set(self, shots: Iterable[Motion]) -> TakeSet:
         model = self.subject.model
@@ -185,13 +212,10 @@ class Dial:
         if place and place.latents:
             yield from LatentShots(subject.model, subject.file.fabric, place.latents).frames(batch)
             return
-        played = Network(subject.model, take_set)
         if place and place.refine:
-            dressed, (origin,), (shot,) = subject.dressed, take_set.origins, batch
-            refiner = Refiner(dressed.scene, dressed.fabric, place.refine, fps=dressed.fps, device=dressed.device)
-            x = played.vertices(0, range(shot.frame_count)).double().permute(2, 0, 1).cpu().numpy() + origin
-            yield from refiner.frames(shot, x)
+            yield from refined(subject, take_set, range(len(batch)), place.refine)
             return
+        played = Network(subject.model, take_set)
         simulator, count = subject.dressed.simulator, batch[0].frame_count
         own = [MethodWindow(subject.dressed, take_set, played, (at, range(count))) for at in range(len(batch))]
         yield None
