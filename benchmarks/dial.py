@@ -47,6 +47,7 @@ from ssilk_core.errors import SsilkError, fail
 from ssilk_core.events import Countdown, Message, Reporter, TextReporter
 from ssilk_core.files import sha256
 from ssilk_core.physics.energy import TERMS
+from ssilk_core.physics.intersections.pairs import need_predicates
 from ssilk_core.quality.evaluation.methods import TakeSet, build_take_set
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
@@ -181,8 +182,9 @@ class Bench:
         self.document = {"units": "SI, times in ms", **self.document, **told}
         inputs = (self.kept.inputs_at, self.kept.rows_at, UNFINISHED)
         plain = {name: value for name, value in self.document.items() if name not in inputs}
-        rows = sorted((asdict(row) for row in self.rows), key=lambda row: self.names.index((row["split"], row["place"])))
-        self.kept.write(plain, rounded(rows), finished=measured >= set(self.names))
+        rows = sorted(self.rows, key=lambda row: self.names.index((row.split, row.place)))
+        figures = rounded([asdict(row) for row in rows])
+        self.kept.write(plain, figures, finished=measured >= set(self.names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +205,7 @@ class Played:
 
 def errors(options: argparse.Namespace, report: Reporter) -> None:
     """Measure the places that the garment's file lacks; the simulator goes on from several at once."""
+    need_predicates()
     bench = Bench(options, report)
     known = {row.place for row in bench.rows}
     missing = [place for place in PLACES if place.name not in known]
@@ -366,7 +369,8 @@ def main() -> None:
         if options.motions is None:
             fail("--motions", "no folder", "figures are measured on motions")
         if options.windows < 1 or min(options.after) < 1:
-            fail("windows", f"{options.windows} windows, after {options.after} frames", "at least 1 is needed of each")
+            found = f"{options.windows} windows, after {options.after} frames"
+            fail("windows", found, "at least 1 is needed of each")
         (errors if options.what == "errors" else times)(options, TextReporter())
     except SsilkError as error:
         raise SystemExit(f"error: {error}") from error

@@ -125,7 +125,9 @@ class _Tail:
 
     def first(self, count: int) -> _Tail:
         """Return those of the first shots."""
-        return _Tail(*(values if values is None else values[..., :count] for values in vars(self).values()))
+        before = None if self.before is None else self.before[..., :count]
+        last, root, lbs = (values[..., :count] for values in (self.last, self.root, self.lbs))
+        return _Tail(last, before, root, lbs, self.correction[..., :count])
 
 
 class Refiner:
