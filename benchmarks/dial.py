@@ -128,7 +128,8 @@ class Bench:
             beside={"times": DialTime},
         )
         self.rows = self.kept.known(report)
-        self.document = self.kept.told() if self.rows else {}
+        told = self.kept.told()
+        self.document = told if told.get(self.kept.inputs_at) == self.kept.inputs else {}
 
     def _inputs(self) -> dict[str, Any]:
         motions = self.options.motions
