@@ -15,7 +15,8 @@ is moved sideways by a millimetre, and that simulation is compared with the firs
 
 All figures are of a window's frames after its first two: RMS distances over mass after some frames [m], RMS errors of
 velocity over mass and frames [m/s], total energies [J] (gravity relative to skinning), shares of the covered skin
-that show, and shares of triangles that intersect others in the frames whose distances are told.
+that show, of frames in which a limb is through the cloth, and of triangles that intersect others in the frames whose
+distances are told, and RMS third differences of positions [m].
 
 Times are those of a frame of one shot: on one processor core of a shot alone, on a GPU of --shots at once, but of
 refinement, whose frames are solved at once instead. Both write the garment's file, which grows row by row; the same
@@ -48,6 +49,7 @@ from ssilk_core.events import Countdown, Message, Reporter, TextReporter
 from ssilk_core.files import sha256
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.physics.intersections.pairs import need_predicates
+from ssilk_core.physics.skin.covered_skin import ShownCounts
 from ssilk_core.quality.evaluation.methods import TakeSet, build_take_set
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
@@ -58,6 +60,7 @@ from ssilk_core.quality.kept_rows import UNFINISHED, KeptRows
 from ssilk_core.scene.assets import Motion
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
+LOOKS = ("total", "shown", "limbs", "intersecting", "jitter")
 OFF, OFF_BY = "simulator, 1 mm off", 1e-3  # [m]
 
 
@@ -74,7 +77,9 @@ class DialErrors:
         distance: RMS distance from the simulator that goes on from the place's own two states, after frames [m].
         velocity: RMS error of velocity [m/s].
         total: mean energy [J].
-        shown, intersecting: mean shares of the covered skin that shows, and of triangles that intersect others.
+        shown, limbs, intersecting: mean shares of the covered skin that shows, of frames in which a limb is through
+            the cloth, and of triangles that intersect others.
+        jitter: RMS of the third difference of positions [m].
     """
 
     split: str
@@ -84,7 +89,9 @@ class DialErrors:
     velocity: tuple[float, ...]
     total: tuple[float, ...]
     shown: tuple[float, ...]
+    limbs: tuple[float, ...]
     intersecting: tuple[float, ...]
+    jitter: tuple[float, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -268,7 +275,7 @@ def figures(bench: Bench, one: Played, own: Sequence[Tensor], reference: Sequenc
     """Return what positions (L, V, 3) in windows tell, beside those of the simulator."""
     dressed, mass = bench.subject.dressed, bench.subject.energy.mass.double()
     after: dict[str, list[float]] = {str(count): [] for count in bench.options.after}
-    values: dict[str, list[float]] = {"velocity": [], "total": [], "shown": [], "intersecting": []}
+    values: dict[str, list[float]] = {"velocity": [], **{name: [] for name in LOOKS}}
     for (take, frames), x, y in zip(one.windows, own, reference):
         away = (x - y).permute(1, 2, 0)
         square = mean_square(away, mass)
@@ -286,7 +293,7 @@ def figures(bench: Bench, one: Played, own: Sequence[Tensor], reference: Sequenc
 
 @torch.no_grad()
 def appearance(bench: Bench, take: int, frames: range, local: Tensor, x: Tensor) -> dict[str, float]:
-    """Return mean energy [J], shown skin and what intersects, of a window's frames after its first two.
+    """Return `LOOKS` of a window's frames after its first two, as `DialErrors` has them.
 
     Args:
         local: positions about the take's first root [m], shape (V, 3, L).
@@ -295,12 +302,15 @@ def appearance(bench: Bench, take: int, frames: range, local: Tensor, x: Tensor)
     dressed, later = bench.subject.dressed, frames[STATES:]
     terms = frame_energies(dressed, bench.take_set, take, later, local)
     states = dressed.covered.states(local[..., STATES:], bench.take_set.character(take, later))
+    counts = ShownCounts.of(states)
     chosen = x[[count + STATES - 1 for count in bench.options.after]].cpu().numpy()
     crossed = [dressed.intersections.triangles(points).mean() for points in chosen]
     return {
         "total": float(sum(terms[name].double().mean() for name in TERMS)),
-        "shown": float(states.shows.double().mean()),
+        "shown": float(counts.shares.mean()),
+        "limbs": np.nan if counts.pierced_share is None else counts.pierced_share,
         "intersecting": float(np.mean(crossed)),
+        "jitter": float(mean_square(local.diff(n=3), bench.subject.energy.mass).mean().sqrt()),
     }
 
 
