@@ -28,171 +28,34 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from documents.dial import draw
-from helpers.dial_places import ALONE, HELD, NETWORK, PLACES, SIMULATOR, Dial, Place
-from helpers.own_windows import STATES, spread_windows
-from helpers.reports import RESULTS, provenance, rounded
-from helpers.subjects import Subject, clip_of, open_subject
+from helpers.dial_bench import OFF, DialBench, DialErrors, DialTime
+from helpers.dial_places import ALONE, HELD, NETWORK, PLACES, SIMULATOR, DialPlace
+from helpers.own_windows import STATES
+from helpers.reports import provenance, rounded
 from ssilk_usd.stages import demo_body_path
 from torch import Tensor
 
-from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.devices import device_name
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.events import Countdown, Message, Reporter, TextReporter
-from ssilk_core.files import sha256
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.physics.intersections.pairs import need_predicates
 from ssilk_core.physics.skin.covered_skin import ShownCounts
-from ssilk_core.quality.evaluation.methods import TakeSet, build_take_set
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
 from ssilk_core.quality.evaluation.record import frame_energies
-from ssilk_core.quality.evaluation.splits import read_index, splits_of
-from ssilk_core.quality.evaluation.takes import Take, takes_of
-from ssilk_core.quality.kept_rows import UNFINISHED, KeptRows
 from ssilk_core.scene.assets import Motion
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
 LOOKS = ("total", "shown", "limbs", "intersecting", "jitter")
-OFF, OFF_BY = "simulator, 1 mm off", 1e-3  # [m]
-
-
+OFF_BY = 1e-3  # [m]
 ON_GPU = 64  # shots that are timed at once
 SHOT = 1 + HELD.batch  # frames of shots that are timed; the first stands alone
-
-
-@dataclass(frozen=True, kw_only=True)
-class DialErrors:
-    """What a place on the dial does in the windows of a split; a value for each window in which it is finite.
-
-    Attributes:
-        lost: windows in which it is not.
-        distance: RMS distance from the simulator that goes on from the place's own two states, after frames [m].
-        velocity: RMS error of velocity [m/s].
-        total: mean energy [J].
-        shown, limbs, intersecting: mean shares of the covered skin that shows, of frames in which a limb is through
-            the cloth, and of triangles that intersect others.
-        jitter: RMS of the third difference of positions [m].
-    """
-
-    split: str
-    place: str
-    lost: int
-    distance: dict[str, tuple[float, ...]]
-    velocity: tuple[float, ...]
-    total: tuple[float, ...]
-    shown: tuple[float, ...]
-    limbs: tuple[float, ...]
-    intersecting: tuple[float, ...]
-    jitter: tuple[float, ...]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DialTime:
-    """What a frame of one shot takes at a place [ms], where so many shots are played at once."""
-
-    place: str
-    device: str
-    hardware: str
-    shots: int
-    milliseconds: float
-
-
-@dataclass(frozen=True, eq=False)
-class Windows:
-    """Takes, of which each is a window with its lead, and the windows of each split."""
-
-    takes: list[Take]
-    windows: dict[str, list[Window]]
-
-
-class Bench:
-    """One garment on its character, with its windows and its file of figures."""
-
-    def __init__(self, options: argparse.Namespace, report: Reporter) -> None:
-        self.options, self.report = options, report
-        self.path = options.model or shipped_path(options.garment)
-        self.subject: Subject = open_subject(self.path, options.stage, options.device)
-        index = splits_of(read_index(options.index or options.motions / "index.json"), options.clips)
-        self.splits = {name: clips for name, clips in index.items() if name in options.splits}
-        if not self.splits:
-            fail("clips", f"none of the splits {', '.join(options.splits)} is chosen", "one at least is needed")
-        names = [clip for clips in self.splits.values() for clip in clips]
-        self.clips = {name: clip_of(options, name, self.subject) for name in names}
-        self.kept = KeptRows(
-            path=options.output or RESULTS / f"dial_{self.path.stem}.json",
-            verb="dial",
-            kind=DialErrors,
-            names=("split", "place"),
-            inputs=self._inputs(),
-            beside={"times": DialTime},
-        )
-        self.rows = self.kept.known(report)
-        told = self.kept.told()
-        self.document = told if told.get(self.kept.inputs_at) == self.kept.inputs else {}
-
-    def _inputs(self) -> dict[str, Any]:
-        motions = self.options.motions
-        return {
-            "model": sha256(self.path),
-            "stage": sha256(self.options.stage),
-            "motions": {name: sha256(motions / f"{name}.usdc") for name in self.clips},
-            "windows": self.options.windows,
-            "lead": self.options.lead,
-            "after": self.options.after,
-        }
-
-    @cached_property
-    def windows(self) -> Windows:
-        """The windows of all splits, each a take of its own with its lead."""
-        skeleton, fps = self.subject.scene.character.skeleton, self.subject.file.config.fps
-        takes: list[Take] = []
-        windows: dict[str, list[Window]] = {}
-        for split, clips in self.splits.items():
-            windows[split] = []
-            for clip in clips:
-                own = takes_of(clip, self.clips[clip], skeleton, fps)
-                spread = spread_windows(dict(enumerate(own)), self.options.windows, [max(self.options.after)])
-                for number, frames in spread:
-                    take, first = own[number], max(0, frames.start - self.options.lead)
-                    windows[split].append((len(takes), range(frames.start - first, frames.stop - first)))
-                    cut = take.motion.clip(first, frames.stop)
-                    takes.append(replace(take, first=take.first + first, motion=cut))
-            if not windows[split]:
-                fail(split, "its clips are too short", f"{STATES + max(self.options.after)} frames are needed")
-        return Windows(takes, windows)
-
-    @cached_property
-    def take_set(self) -> TakeSet:
-        model = self.subject.model
-        return build_take_set(self.windows.takes, self.subject.dressed, model.joints, model.config.descriptors)
-
-    @cached_property
-    def dial(self) -> Dial:
-        return Dial(self.subject, list(self.clips.values()))
-
-    @property
-    def names(self) -> list[tuple[str, str]]:
-        """The rows that a whole file has, by split and place."""
-        places = [*(place.name for place in PLACES), SIMULATOR, OFF]
-        return [(split, place) for split in self.splits for place in places]
-
-    def write(self, **told: Any) -> None:
-        """Write the file; it is finished once it has all rows of errors."""
-        measured = {(row.split, row.place) for row in self.rows}
-        self.document = {"units": "SI, times in ms", **self.document, **told}
-        inputs = (self.kept.inputs_at, self.kept.rows_at, UNFINISHED)
-        plain = {name: value for name, value in self.document.items() if name not in inputs}
-        rows = sorted(self.rows, key=lambda row: self.names.index((row.split, row.place)))
-        figures = rounded([asdict(row) for row in rows])
-        self.kept.write(plain, figures, finished=measured >= set(self.names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +77,7 @@ class Played:
 def errors(options: argparse.Namespace, report: Reporter) -> None:
     """Measure the places that the garment's file lacks; the simulator goes on from several at once."""
     need_predicates()
-    bench = Bench(options, report)
+    bench = DialBench(options, report)
     known = {row.place for row in bench.rows}
     missing = [place for place in PLACES if place.name not in known]
     if {SIMULATOR, OFF} - known:
@@ -235,7 +98,7 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
             group, room = [], BATCH
 
 
-def played(bench: Bench, place: Place, told: Countdown) -> list[Played]:
+def played(bench: DialBench, place: DialPlace, told: Countdown) -> list[Played]:
     """Play a place in all takes, and return its windows; the network's, moved by a millimetre, beside it."""
     dressed, take_set = bench.subject.dressed, bench.take_set
     method = bench.dial.method(place, take_set, told)
@@ -252,7 +115,7 @@ def played(bench: Bench, place: Place, told: Countdown) -> list[Played]:
     return found
 
 
-def simulated(bench: Bench, group: Sequence[Played]) -> None:
+def simulated(bench: DialBench, group: Sequence[Played]) -> None:
     """Let the simulator go on from all windows of a group at once, and write what that tells of each."""
     every = [window for one in group for window in one.own]
     report = bench.report
@@ -271,7 +134,7 @@ def simulated(bench: Bench, group: Sequence[Played]) -> None:
         bench.write(**provenance(bench.options))
 
 
-def figures(bench: Bench, one: Played, own: Sequence[Tensor], reference: Sequence[Tensor]) -> DialErrors:
+def figures(bench: DialBench, one: Played, own: Sequence[Tensor], reference: Sequence[Tensor]) -> DialErrors:
     """Return what positions (L, V, 3) in windows tell, beside those of the simulator."""
     dressed, mass = bench.subject.dressed, bench.subject.energy.mass.double()
     after: dict[str, list[float]] = {str(count): [] for count in bench.options.after}
@@ -292,7 +155,7 @@ def figures(bench: Bench, one: Played, own: Sequence[Tensor], reference: Sequenc
 
 
 @torch.no_grad()
-def appearance(bench: Bench, take: int, frames: range, local: Tensor, x: Tensor) -> dict[str, float]:
+def appearance(bench: DialBench, take: int, frames: range, local: Tensor, x: Tensor) -> dict[str, float]:
     """Return `LOOKS` of a window's frames after its first two, as `DialErrors` has them.
 
     Args:
@@ -316,7 +179,7 @@ def appearance(bench: Bench, take: int, frames: range, local: Tensor, x: Tensor)
 
 def times(options: argparse.Namespace, report: Reporter) -> None:
     """Time the places that the garment's file lacks on this device."""
-    bench = Bench(options, report)
+    bench = DialBench(options, report)
     device = bench.subject.device
     known = bench.document.get("times", [])
     at_once = options.shots or (ON_GPU if device.type == "cuda" else 1)
@@ -333,7 +196,7 @@ def times(options: argparse.Namespace, report: Reporter) -> None:
         bench.write(times=known)
 
 
-def timed_shots(bench: Bench, count: int) -> list[Motion]:
+def timed_shots(bench: DialBench, count: int) -> list[Motion]:
     """Return shots from the windows' starts on, of each split in turn; they begin a frame later in each round."""
     order = [at for each in zip(*bench.windows.windows.values()) for at in each]
     found = []

@@ -41,7 +41,7 @@ WARM_UP = 4  # frames of a first pass; a take has no fewer
 
 
 @dataclass(frozen=True, kw_only=True)
-class Place:
+class DialPlace:
     """A place on the dial: a network, as it is or reduced to a quality level, or a solver that it starts.
 
     Attributes:
@@ -56,18 +56,18 @@ class Place:
     refine: RefineOptions | None = None
 
 
-FEW = [Place(name=f"{n} in latents", latents=LatentOptions(iterations=n, sampled=True)) for n in (1, 2, 4)]
+FEW = [DialPlace(name=f"{n} in latents", latents=LatentOptions(iterations=n, sampled=True)) for n in (1, 2, 4)]
 ALL = LatentOptions(iterations=QUALITIES["latent"].latent_iterations)
 HELD, CARRIED = RefineOptions(iterations=4), RefineOptions(iterations=QUALITIES["hero"].refine, feedback=True)
-NETWORK = Place(name="network")
+NETWORK = DialPlace(name="network")
 PLACES = (
-    Place(name="crowd", level="crowd"),
-    Place(name="game", level="game"),
+    DialPlace(name="crowd", level="crowd"),
+    DialPlace(name="game", level="game"),
     NETWORK,
     *FEW,
-    Place(name="latent", latents=ALL),
-    Place(name="refine 4", refine=HELD),
-    Place(name="hero", refine=CARRIED),
+    DialPlace(name="latent", latents=ALL),
+    DialPlace(name="refine 4", refine=HELD),
+    DialPlace(name="hero", refine=CARRIED),
 )
 
 
@@ -129,7 +129,7 @@ class Dial:
     def reducer(self) -> Reducer:
         return Reducer(self.subject.file, self.motions)
 
-    def file(self, place: Place) -> ModelFile:
+    def file(self, place: DialPlace) -> ModelFile:
         """Return the model of a place, as 'ssilk reduce' writes it where it is reduced."""
         if place.level is None:
             return self.subject.file
@@ -138,7 +138,7 @@ class Dial:
         packed = Variant(swept="level", name=place.name, size=size, precision="int16", fps=fps)
         return packed.in_precision(self.reducer.reduce(size).file)
 
-    def method(self, place: Place, take_set: TakeSet, advanced: Callable[[], object] = lambda: None) -> Method:
+    def method(self, place: DialPlace, take_set: TakeSet, advanced: Callable[[], object] = lambda: None) -> Method:
         """Return a place over takes; `advanced` is called after each frame that a solver finds."""
         subject = self.subject
         if place.latents:
@@ -150,7 +150,7 @@ class Dial:
         fps = QUALITIES[place.level].rate(subject.dressed.fps)
         return ShotMethod(place.name, Player(self.file(place)), subject.dressed, take_set, fps=fps)
 
-    def milliseconds(self, place: Place | None, shots: Sequence[Motion], *, at_once: bool) -> tuple[int, float]:
+    def milliseconds(self, place: DialPlace | None, shots: Sequence[Motion], *, at_once: bool) -> tuple[int, float]:
         """Time a place, or the simulator where it is None, on shots of one length.
 
         Shots that are not played at once are played by the numpy runtime, or solved, one after the other. Refinement
@@ -172,13 +172,13 @@ class Dial:
         self._timed(place, batches[0] if held else [shot.clip(0, WARM_UP) for shot in batches[0]])
         return len(batches[0]), float(np.mean([self._timed(place, batch) for batch in batches]))
 
-    def _player_time(self, place: Place, shots: Iterable[Motion]) -> float:
+    def _player_time(self, place: DialPlace, shots: Iterable[Motion]) -> float:
         """Return the time of a frame in the numpy runtime [ms]."""
         player = Player(self.file(place))
         return float(np.mean([play_time(player, shot).median for shot in shots]))
 
     @torch.no_grad()
-    def _network_time(self, place: Place, shots: Sequence[Motion]) -> float:
+    def _network_time(self, place: DialPlace, shots: Sequence[Motion]) -> float:
         """Return the time of a frame and shot of a network in PyTorch [ms], from poses to vertices."""
         subject, times = self.subject, []
         model = subject.model if place.level is None else self._network(self.file(place))
@@ -199,7 +199,7 @@ class Dial:
         takes = [Take(shot.path, 0, shot) for shot in shots]
         return build_take_set(takes, self.subject.dressed, model.joints, model.config.descriptors)
 
-    def _timed(self, place: Place | None, batch: Sequence[Motion]) -> float:
+    def _timed(self, place: DialPlace | None, batch: Sequence[Motion]) -> float:
         """Return the mean time of a frame and shot of a solver over shots at once [ms], without the first yielded."""
         on_gpu, device = self.subject.device.type == "cuda", self.subject.device
         ends: list[float] = []
@@ -207,7 +207,7 @@ class Dial:
             ends.append(now(device) if on_gpu else time.process_time())
         return 1000 * (ends[-1] - ends[0]) / (len(ends) - 1) / len(batch)
 
-    def _frames(self, place: Place | None, batch: Sequence[Motion]) -> Iterator[object]:
+    def _frames(self, place: DialPlace | None, batch: Sequence[Motion]) -> Iterator[object]:
         """Yield the frames of shots; the simulator's from the second on, as it is given two states."""
         subject, take_set = self.subject, self._take_set(batch)
         if place and place.latents:
