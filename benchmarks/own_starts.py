@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import torch
 from helpers.methods import SKINNING, methods_of
+from helpers.own_windows import STATES, spread_windows
 from helpers.reports import provenance, table, write_document
 from helpers.subjects import Subject, clip_of, open_subjects
 from ssilk_usd.stages import demo_body_path
@@ -46,7 +47,6 @@ from ssilk_core.quality.evaluation.splits import read_index, splits_of
 from ssilk_core.quality.evaluation.takes import Take, takes_of, within
 
 NO_MODEL = "none"
-STATES = 2  # that a simulation starts from
 Figures = dict[str, list[float]]
 """Values of windows by name; NaN where a window is too short for one."""
 
@@ -57,22 +57,6 @@ class Playlist:
 
     takes: list[Take]
     windows: dict[str, list[Window]]
-
-
-def spread_windows(takes: Mapping[int, Take], count: int, after: Sequence[int]) -> list[Window]:
-    """Return windows of one clip's takes, by number, in the middles of `count` equal parts of where they may start.
-
-    A take that is too short for the last of the frames `after` is one window, unless it is too short for the first.
-    """
-    length = STATES + max(after)
-    places = [
-        (number, range(start, min(start + length, take.frame_count)))
-        for number, take in takes.items()
-        if take.frame_count >= STATES + min(after)
-        for start in range(max(1, take.frame_count - length + 1))
-    ]
-    chosen = dict.fromkeys(((np.arange(count) + 0.5) / count * len(places)).astype(int).tolist() if places else ())
-    return [places[place] for place in chosen]
 
 
 def playlist(options: argparse.Namespace, subject: Subject) -> Playlist:

@@ -71,7 +71,7 @@ def test_methods_are_measured_from_their_own_starts(script, world, capsys):
 
 
 def test_windows_are_spread_and_short_takes_are_one(script):
-    from own_starts import spread_windows
+    from helpers.own_windows import spread_windows
 
     from ssilk_core.quality.evaluation.takes import Take
 

@@ -10,9 +10,9 @@ below the network's. Inertia m/(2 dt^2) |x - target|^2 holds each frame x
   x. Frames do not depend on earlier refinements: many are refined at once, any part of a shot can be refined by
   itself, and errors do not accumulate.
 - with feedback, to the course 2 x' - x'' of the two previous refined frames as they were before they were lifted, one
-  frame after the other. Each starts from the network's state, from that plus the last correction, or as a step of the
-  simulator does, whichever has least energy: the network's course may differ from that of the refined cloth. With
-  enough iterations this is the simulator.
+  frame after the other; several shots can advance at once. Each starts from the network's state, from that plus the
+  last correction, or as a step of the simulator does, whichever has least energy: the network's course may differ
+  from that of the refined cloth. With enough iterations this is the simulator.
 
 The first frame of a shot, and after a cut, is quasi-static with feedback, and solved as the simulator does: the shot
 goes on from it.
@@ -20,7 +20,7 @@ goes on from it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -108,18 +108,26 @@ class RefinedFrame:
 
 @dataclass(frozen=True, eq=False)
 class _Tail:
-    """Previous states for the next frames.
+    """Previous states of N shots for the next frames.
 
     Attributes:
-        world: positions of one or two frames in world space, shape (V, 3, 1 or 2).
-        root, lbs: root and garment under linear blend skinning in the last frame.
-        correction: displacement of the last frame by refinement, shape (V, 3, 1).
+        last: positions in the last frame in world space, shape (V, 3, N).
+        before: the same one frame earlier, with feedback; None where there is none.
+        root, lbs: root and garment under linear blend skinning in the last frame, shapes (3, N) and (V, 3, N).
+        correction: displacement of the last frame by refinement, shape (V, 3, N).
     """
 
-    world: Tensor
+    last: Tensor
+    before: Tensor | None
     root: Tensor
     lbs: Tensor
     correction: Tensor
+
+    def first(self, count: int) -> _Tail:
+        """Return those of the first shots."""
+        before = None if self.before is None else self.before[..., :count]
+        last, root, lbs = (values[..., :count] for values in (self.last, self.root, self.lbs))
+        return _Tail(last, before, root, lbs, self.correction[..., :count])
 
 
 class Refiner:
@@ -174,19 +182,51 @@ class Refiner:
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._next_frames(network, stop - start)
             poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
-            past = self._history(tail, world, poses)
-            inputs = self.simulator.inputs(poses, past)
-            if not self.options.feedback:
-                inputs = replace(inputs, predicted=(world - poses.root).to(self.potential.dtype))
-            before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
-            if refined_points is None:
-                solved = self._refine(before, tail, past, world, poses, inputs)
-                refined = self.clearing.lift(solved, inputs, before.energy).double() + poses.root
-                seen = solved.double() + poses.root  # what is lifted has no speed
-            else:
-                seen = refined = self._next_frames(refined_points, stop - start)
-            yield from self._describe(before, inputs, refined, poses.root)
-            tail = self._tail(tail, world, seen, poses)
+            given = None if refined_points is None else self._next_frames(refined_points, stop - start)
+            frames, tail = self._refined(tail, world, poses, given)
+            yield from frames
+
+    @torch.no_grad()
+    def shots_at_once(
+        self, motions: Sequence[Motion], networks: Sequence[Iterable[Floats]]
+    ) -> Iterator[list[RefinedFrame]]:
+        """Yield each frame of several shots with feedback: of the first of them, those that have not ended.
+
+        Args:
+            motions: at the rate of the refinement, without cuts, by decreasing length.
+            networks: garment vertices of each frame of each shot in world space [m], shape (V, 3).
+        """
+        tail, points = None, [iter(network) for network in networks]
+        for number in range(motions[0].frame_count):
+            running = [motion for motion in motions if motion.frame_count > number]
+            world = torch.cat([self._next_frames(each, 1) for each in points[: len(running)]], dim=-1)
+            poses = self.simulator.poser.pose(*(
+                np.stack([getattr(motion, name)[number] for motion in running])
+                for name in ("rotations", "translations")
+            ))  # fmt: skip
+            frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None)
+            yield list(frames)
+
+    def _refined(
+        self, tail: _Tail | None, world: Tensor, poses: PosedCharacters, given: Tensor | None
+    ) -> tuple[Iterator[RefinedFrame], _Tail]:
+        """Refine frames of a shot, or with feedback one of each of several; return them and what the next ones need.
+
+        Args:
+            world: the network's positions (V, 3, N); given: those after refinement, where they are known.
+        """
+        past = self._history(tail, world, poses)
+        inputs = self.simulator.inputs(poses, past)
+        if not self.options.feedback:
+            inputs = replace(inputs, predicted=(world - poses.root).to(self.potential.dtype))
+        before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
+        if given is None:
+            solved = self._refine(before, tail, past, world, poses, inputs)
+            refined = self.clearing.lift(solved, inputs, before.energy).double() + poses.root
+            seen = solved.double() + poses.root  # what is lifted has no speed
+        else:
+            seen = refined = given
+        return self._describe(before, inputs, refined, poses.root), self._tail(tail, world, seen, poses)
 
     def _next_frames(self, vertices: Iterator[Floats], count: int) -> Tensor:
         """Return the next frames' positions (V, 3, N)."""
@@ -215,16 +255,18 @@ class Refiner:
         """Return the previous states of consecutive frames."""
         if tail is None:
             return None if self.options.feedback else StepHistory(world, None, poses.root, poses.lbs)
-        seen, count = torch.cat([tail.world, world[..., :-1]], dim=-1), world.shape[-1]
-        before = seen[..., -count - 1 : -1] if self.options.feedback and seen.shape[-1] > count else None
-        root = torch.cat([tail.root, poses.root[:, :-1]], dim=1)
-        return StepHistory(seen[..., -count:], before, root, torch.cat([tail.lbs, poses.lbs[..., :-1]], dim=-1))
+        if self.options.feedback:
+            return StepHistory(tail.last, tail.before, tail.root, tail.lbs)
+        earlier = ((tail.last, world), (tail.root, poses.root), (tail.lbs, poses.lbs))
+        last, root, lbs = (torch.cat([first, rest[..., :-1]], dim=-1) for first, rest in earlier)
+        return StepHistory(last, None, root, lbs)
 
     def _tail(self, tail: _Tail | None, world: Tensor, refined: Tensor, poses: PosedCharacters) -> _Tail:
         """Return the previous states for the frames after these."""
-        kept = refined if self.options.feedback else world
-        kept = kept if tail is None else torch.cat([tail.world, kept], dim=-1)
-        return _Tail(kept[..., -2:], poses.root[:, -1:], poses.lbs[..., -1:], (refined - world)[..., -1:])
+        correction = refined - world
+        if self.options.feedback:
+            return _Tail(refined, tail.last if tail else None, poses.root, poses.lbs, correction)
+        return _Tail(world[..., -1:], None, poses.root[:, -1:], poses.lbs[..., -1:], correction[..., -1:])
 
     def _describe(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:
         """Yield frames with their changes."""

@@ -7,7 +7,8 @@ states tells what it does wrong from there on. Any method of `methods` can be me
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import copy
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,6 +43,12 @@ class MethodWindow:
         self.motion = motion.clip(frames.start, frames.stop)
         origin = torch.as_tensor(first_place(motion, dressed.scene.character.skeleton), device=dressed.device)
         self.x = method.vertices(take, frames).double().permute(2, 0, 1) + origin
+
+    def moved(self, offset: Tensor) -> MethodWindow:
+        """Return the window with its vertices moved in all frames by (V, 3) [m]."""
+        found = copy.copy(self)
+        found.x = self.x + offset
+        return found
 
     @property
     def is_finite(self) -> bool:
@@ -102,19 +109,47 @@ def _departures(
     frames: int,
 ) -> Tensor:
     """Return the figures of `Departures` of one batch, shape (3, frames, N)."""
-    past = history(simulator, [(window, 2) for window in windows])
     found = torch.full((3, frames, len(windows)), torch.nan, dtype=torch.float64)
-    steps = [[(window, at) for window in windows if len(window.x) > at] for at in range(2, len(windows[0].x))]
-    states = simulator.carry_on(past, (poses_of(simulator, places) for places in steps))
-    for step, (places, state) in enumerate(zip(steps, states)):
-        past = past.first(len(places))
+    for step, (places, past, state) in enumerate(_steps(simulator, windows)):
         away, moved = stacked(places, 0) - state.last, state.last - past.last
         lbs = state.lbs + state.root - past.lbs - past.root
         missed = [away, stacked(places, 0) - stacked(places, 1) - moved, lbs - moved]
         found[:, step, : len(places)] = torch.stack([mean_square(each, mass) for each in missed]).cpu()
-        past = state
         advanced(len(places))
     return found
+
+
+def _steps(
+    simulator: Simulator, windows: Sequence[MethodWindow]
+) -> Iterator[tuple[list[Place], StepHistory, StepHistory]]:
+    """Yield the places that are stepped to, and the simulator's states before and after each step."""
+    past = history(simulator, [(window, 2) for window in windows])
+    steps = [[(window, at) for window in windows if len(window.x) > at] for at in range(2, len(windows[0].x))]
+    states = simulator.carry_on(past, (poses_of(simulator, places) for places in steps))
+    for places, state in zip(steps, states):
+        yield places, past.first(len(places)), state
+        past = state
+
+
+@torch.no_grad()
+def continuations(
+    simulator: Simulator, windows: Sequence[MethodWindow], advanced: Callable[[int], object]
+) -> list[Tensor]:
+    """Return the simulator's positions in windows, from the first two states of each on.
+
+    Args:
+        windows, advanced: as for `departures`.
+
+    Returns:
+        Of each window, positions in the world [m], float64, shape (L, V, 3); the first two are the window's own.
+    """
+    found = [[*window.x[:2]] for window in windows]
+    for start in range(0, len(windows), BATCH):
+        for places, _, state in _steps(simulator, windows[start : start + BATCH]):
+            for own, x in zip(found[start:], state.last.unbind(-1)):
+                own.append(x)
+            advanced(len(places))
+    return [torch.stack(own) for own in found]
 
 
 def poses_of(simulator: Simulator, places: Sequence[Place]) -> PosedCharacters:

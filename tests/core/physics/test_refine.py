@@ -128,6 +128,19 @@ def test_with_feedback_a_shot_begins_at_rest(scene, rollout) -> None:
     assert alone[0].residual > changes[0].residual
 
 
+def test_shots_at_once_are_what_each_is_by_itself(scene, rollout) -> None:
+    motion, points = rollout
+    shots = [(motion, points), (motion.clip(3, FRAMES), points[3:])]
+    refiner = Refiner(scene, CLOTH, RefineOptions(iterations=3, feedback=True), fps=motion.fps)
+    frames = list(refiner.shots_at_once(*zip(*shots)))
+    assert [len(frame) for frame in frames] == [2] * (FRAMES - 3) + [1] * 3
+    for number, shot in enumerate(shots):
+        found = np.stack([frame[number].points for frame in frames if len(frame) > number])
+        alone, changes = refined(scene, *shot, iterations=3, feedback=True)
+        assert np.abs(found - alone).max() < 1e-5
+        assert frames[2][number].change.after == pytest.approx(changes[2].after, rel=1e-4)
+
+
 def test_a_cut_is_not_looked_back_over(scene, rollout) -> None:
     motion, points = rollout
     moved = motion.translations.copy()

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The dial between fast and near to the simulator, as a table and as a picture, of the garments that ship."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import mean, median
+from typing import Any
+
+from ssilk_core.errors import fail
+from ssilk_core.quality.charts import ChartPanel, write_chart
+
+from .forms import GARMENTS, digits, document, fixed, percent, table
+
+SPLITS = {"test": "`test`", "flips": "flips"}
+SIMULATOR, OFF = "simulator", "simulator, 1 mm off"
+DEVICES = {"cpu": "one core", "cuda": "GPU"}
+SHOWN = {"refine 4": "`--refine 4`", **{level: f"`{level}`" for level in ("crowd", "game", "latent", "hero")}}
+SIZED = {"network": "as trained"}  # what `ssilk trade` calls it
+DRAWN_AFTER = "10"  # frames
+PANEL = (3.5, 2.7)  # [inches]
+NAMED = {"2 in latents": "2", "4 in latents": "4"}  # in the picture, behind "1 in latents"
+
+Row = dict[str, Any]
+
+
+def times(garment: str) -> dict[tuple[str, str], float]:
+    """Return the time of a frame and shot by place and device [ms]."""
+    found = document(f"dial_{garment}").get("times", [])
+    return {(each["place"], each["device"]): each["milliseconds"] for each in found}
+
+
+def places(garment: str) -> dict[str, dict[str, Row]]:
+    """Return the rows of a garment by place and split."""
+    found: dict[str, dict[str, Row]] = {}
+    for row in document(f"dial_{garment}")["figures"]:
+        found.setdefault(row["place"], {})[row["split"]] = row
+    return found
+
+
+def dial() -> str:
+    """What each place on the dial costs and misses; figures are of `test` and of flips."""
+    sizes = {(at["model"], at["variant"]): at for at in document("trade_cuda")["points"]}
+    rows = []
+    for garment, words in GARMENTS.items():
+        took = times(garment)
+        for number, (place, splits) in enumerate(places(garment).items()):
+            own = [splits[split] for split in SPLITS if split in splits]
+            spent = (took.get((place, device)) for device in DEVICES)
+            size = sizes.get((garment, SIZED.get(place, place)))
+            rows.append([
+                "" if number else words,
+                SHOWN.get(place, place),
+                *("" if ms is None else digits(ms, 2) for ms in spent),
+                *(_pair([fixed(median(row["distance"][after]), 0, 1e-3) for row in own]) for after in ("10", "30")),
+                _pair([fixed(median(row["velocity"]), 2) for row in own]),
+                _pair([digits(mean(row["total"])) for row in own]),
+                _pair([percent(mean(row["shown"]), 2) for row in own]),
+                _pair([percent(mean(row["limbs"]), 0) for row in own]),
+                _pair([percent(mean(row["intersecting"]), 1) for row in own]),
+                _pair([fixed(median(row["jitter"]), 1, 1e-3) for row in own]),
+                *(fixed(size[name], 1, 1e6) if size else "" for name in ("model_bytes", "shot_bytes")),
+            ])  # fmt: skip
+    header = ("garment", "place", "one core [ms]", "GPU [ms]", "after 10 [mm]", "30 [mm]", "velocity [m/s]",
+              "energy [J]", "shows [%]", "limbs [%]", "intersect [%]", "jitter [mm]", "model [MB]",
+              "shot [MB]")  # fmt: skip
+    return table(header, rows, 2)
+
+
+def _pair(figures: Sequence[str]) -> str:
+    return ", ".join(figures)
+
+
+def draw(path: Path) -> None:
+    """Draw distances after ten frames over times, a column for each garment and a row for each device.
+
+    Raises:
+        SsilkError: a garment was not timed on a device.
+    """
+    rows = [[panel(garment, device) for garment in GARMENTS] for device in DEVICES]
+    write_chart(path, rows, size=PANEL)
+
+
+def panel(garment: str, device: str) -> ChartPanel:
+    """Return the places of a garment on a device; lines are those of the simulator that begins 1 mm off."""
+    took, rows = times(garment), places(garment)
+    drawn = [place for place in rows if (place, device) in took]
+    if not drawn:
+        missing = f"no times of {DEVICES[device]}"
+        fail(f"dial_{garment}.json", missing, "both devices are drawn", "measure them by 'dial.py times'")
+    points = {
+        split: [
+            (took[place, device], _distance(rows[place][split]), NAMED.get(place, place) if split == "flips" else "")
+            for place in drawn
+        ]
+        for split in SPLITS
+    }  # above each other, so the names of one do for both
+    return ChartPanel(
+        title=GARMENTS[garment],
+        x=f"time of a frame, {DEVICES[device]} [ms]",
+        y=f"off after {DRAWN_AFTER} frames [mm]",
+        points=points,
+        levels=tuple(_distance(row) for row in rows.get(OFF, {}).values()),
+        log_x=True,
+    )
+
+
+def _distance(row: Row) -> float:
+    return 1000 * median(row["distance"][DRAWN_AFTER])
