@@ -79,7 +79,7 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
     need_predicates()
     bench = DialBench(options, report)
     known = {row.place for row in bench.rows}
-    missing = [place for place in PLACES if place.name not in known]
+    missing = [place for place in PLACES if place.name not in known and place.name in options.places]
     if {SIMULATOR, OFF} - known:
         missing = [NETWORK, *(place for place in missing if place != NETWORK)]
     count = sum(map(len, bench.windows.windows.values()))
@@ -221,6 +221,9 @@ def parser() -> argparse.ArgumentParser:
                        help="list of clips with their splits (default: index.json of that folder)")  # fmt: skip
     found.add_argument("--splits", nargs="+", default=["test", "flips"], help="(default test flips)")
     found.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips of the splits")
+    every = [place.name for place in PLACES]
+    found.add_argument("--places", nargs="+", default=every, choices=every, metavar="PLACE",
+                       help=f"whose errors are measured: {', '.join(every)} (default: all)")  # fmt: skip
     found.add_argument("--windows", type=int, default=1, help="of each clip (default 1)")
     found.add_argument("--lead", type=int, default=30, help="frames played before a window (default 30)")
     found.add_argument("--after", type=int, nargs="+", default=[10, 30],
