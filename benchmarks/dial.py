@@ -19,8 +19,9 @@ that show, of frames in which a limb is through the cloth, and of triangles that
 distances are told, and RMS third differences of positions [m].
 
 Times are those of a frame of one shot: on one processor core of a shot alone, on a GPU of --shots at once, but of
-refinement, whose frames are solved at once instead. Both write the garment's file, which grows row by row; the same
-command goes on where it was cut off. `picture` draws what the files of the garments that ship hold.
+refinement, whose frames are solved at once instead. Both write the garment's file, which grows by the rows of --batch
+windows; the same command goes on where it was cut off. On an H200 a step of 60 windows took 12 s beside two others.
+`picture` draws what the files of the garments that ship hold.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
     frames = max(take.frame_count for take in bench.windows.takes)
     report(Message(f"{bench.subject.name}: {count} windows, of takes of {frames} frames at most"))
     group: list[Played] = []
-    room = BATCH
+    room = bench.options.batch
     for number, place in enumerate(missing, start=1):
         one_by_one = place.refine is not None and not place.refine.feedback
         told = Countdown(sum(take.frame_count for take in bench.windows.takes) if one_by_one else frames, report)
@@ -95,7 +96,7 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
         room -= count * (2 if place == NETWORK else 1)
         if room < count or number == len(missing):
             simulated(bench, group)
-            group, room = [], BATCH
+            group, room = [], bench.options.batch
 
 
 def played(bench: DialBench, place: DialPlace, told: Countdown) -> list[Played]:
@@ -228,6 +229,9 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--lead", type=int, default=30, help="frames played before a window (default 30)")
     found.add_argument("--after", type=int, nargs="+", default=[10, 30],
                        help="frames to tell distances after; the last ends a window (default 10 30)")  # fmt: skip
+    found.add_argument("--batch", type=int, default=BATCH,
+                       help="windows, about, that the simulator goes on from at once, and that are written together "
+                       f"(default {BATCH})")  # fmt: skip
     found.add_argument("--shots", type=int, help="that are timed at once (default: 64 on a GPU, 1 on a processor)")
     found.add_argument("--output", type=Path, metavar="FILE",
                        help="figures, or picture (default: in results/, and docs/images/dial.png)")  # fmt: skip

@@ -44,7 +44,7 @@ def script(world) -> Callable[[str], None]:
 
 @pytest.fixture(scope="module")
 def measured(script, world):
-    script(f"errors {OPTIONS} --output dial.json")
+    script(f"errors {OPTIONS} --output dial.json --batch 7")  # two places at once, then the others
     return json.loads((world / "dial.json").read_text())
 
 
@@ -70,7 +70,7 @@ def test_what_was_cut_off_goes_on(measured, script, world, capsys):
         if row["place"] != "crowd"
     ]
     (world / "cut.json").write_text(json.dumps(cut))
-    script(f"errors {OPTIONS} --output cut.json")
+    script(f"errors {OPTIONS} --output cut.json --batch 1")
     found = json.loads((world / "cut.json").read_text())
     assert "unfinished" not in found and len(found["figures"]) == len(measured["figures"])
     for row, known in zip(found["figures"], measured["figures"]):
