@@ -21,13 +21,13 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "usd"), str(ROOT / "benchmarks")]
 
-from documents import farm, guides, results  # noqa: E402  # the script runs by itself
+from documents import dial, farm, guides, results  # noqa: E402  # the script runs by itself
 
 TABLES: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
         results.overview, results.other_methods, results.trainings, results.own_start, results.rest,
-        results.refinement, results.levels, results.playing, results.extremes,
+        results.playing, results.extremes, dial.dial,
         farm.cluster, farm.fuzzed, farm.disturbed, farm.disk, farm.disk_workers, farm.large_job,
         guides.targets, guides.presets,
     )

@@ -73,16 +73,15 @@ def _pair(figures: Sequence[str]) -> str:
 
 
 def draw(path: Path) -> None:
-    """Draw distances after ten frames over times, a column for each garment and a row for each device.
+    """Draw distances after ten frames over times on one core, a column for each garment.
 
     Raises:
-        SsilkError: a garment was not timed on a device.
+        SsilkError: a garment was not timed.
     """
-    rows = [[panel(garment, device) for garment in GARMENTS] for device in DEVICES]
-    write_chart(path, rows, size=PANEL)
+    write_chart(path, [[panel(garment) for garment in GARMENTS]], size=PANEL)
 
 
-def panel(garment: str, device: str) -> ChartPanel:
+def panel(garment: str, device: str = "cpu") -> ChartPanel:
     """Return the places of a garment on a device; lines are those of the simulator that begins 1 mm off."""
     took, rows = times(garment), places(garment)
     drawn = [place for place in rows if (place, device) in took]

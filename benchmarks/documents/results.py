@@ -143,46 +143,6 @@ def rest() -> str:
     return table(header, rows, 2)
 
 
-def refinement() -> str:
-    """What iterations of the solver buy in a jump."""
-    rows, crossed = [], any("intersect" in at for own in result("refine").values() for at in own.values())
-    ways = {"0": "network", "4 network": "`--refine 4`", "8 refined": "`hero`", "simulator": "simulator"}
-    for clip, found in result("refine").items():
-        for key, way in ways.items():
-            at = found[key]
-            seconds = digits(at["seconds"], 2) if at["seconds"] else ""
-            words = GARMENTS[clip.split()[0]] if key == "0" else ""
-            away = fixed(at["apart"], 0, 1e-3), fixed(at["jitter"], 1, 1e-3)
-            skin = percent(at["shows"], 2), percent(at["limbs"], 0)
-            cloth = [percent(at["intersect"], 2) if "intersect" in at else ""] if crossed else []
-            rows.append([words, way, seconds, digits(at["energy"]), *skin, *cloth, *away])
-    header = ("garment", "", "s a frame", "energy [J]", "shows, worst [%]", "limbs [%]",
-              *(["intersect [%]"] if crossed else []), "apart [mm]", "jitter [mm]")  # fmt: skip
-    return table(header, rows, 2)
-
-
-def levels() -> str:
-    """What each quality level costs and loses."""
-    on_cpu = {(at["model"], at["variant"]): at["solving"] for at in document("trade_cpu")["points"]}
-    rows, points = [], document("trade_cuda")["points"]
-    crossed = any("intersections" in at for at in points)
-    for at in points:
-        if at["variant"] in ("1 iterations", "film"):
-            continue
-        variant, skin = at["variant"], at["shown_skin"]
-        cpu = on_cpu.get((at["model"], variant))
-        solver = ("", "") if at["solving"] is None else (digits(at["solving"], 2), digits(cpu, 2) if cpu else "")
-        name = f"`{variant}`" if at["swept"] == "level" else variant
-        rows.append([GARMENTS[at["model"]] if variant == "as trained" else "", name,
-                     fixed(at["milliseconds"], 2), *solver, fixed(at["total"], 3), percent(skin["mean"], 3),
-                     *([intersecting(at.get("intersections"))] if crossed else []),
-                     digits(1000 * at["position"], 2), fixed(at["model_bytes"], 1, 1e6),
-                     fixed(at["shot_bytes"], 1, 1e6)])  # fmt: skip
-    header = ("garment", "variant", "play [ms]", "solver, GPU [ms]", "one thread [ms]", "energy [J]", "shows [%]",
-              *(["intersect [%]"] if crossed else []), "off [mm]", "model, 32 bits [MB]", "shot [MB]")  # fmt: skip
-    return table(header, rows, 2)
-
-
 def playing() -> str:
     """Times of a frame on one processor thread."""
     rows = []

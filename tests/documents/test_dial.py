@@ -60,7 +60,7 @@ def test_a_place_has_a_row_with_both_splits(folder):
     assert (lines[0][-2:], lines[3][2:4]) == (["12.4", "4.9"], ["", ""])  # sizes of the cape; what is not timed
 
 
-def test_the_picture_needs_times_of_both_devices(folder, tmp_path):
+def test_the_picture_needs_times_of_each_garment(folder, tmp_path):
     from documents.dial import draw, panel
 
     drawn = panel("cape", "cpu")
@@ -68,12 +68,12 @@ def test_the_picture_needs_times_of_both_devices(folder, tmp_path):
     assert [name for _, _, name in drawn.points["flips"]] == list(PLACES[:3])
     draw(tmp_path / "dial.png")
     width, height = Image.open(tmp_path / "dial.png").size
-    assert width > height > 400
+    assert width > height > 200
     path = folder / "dial_fringe_skirt.json"
     document = json.loads(path.read_text())
-    document["times"] = [time for time in document["times"] if time["device"] == "cpu"]
+    document["times"] = [time for time in document["times"] if time["device"] != "cpu"]
     path.write_text(json.dumps(document))
     sys.modules["documents.forms"].document.cache_clear()
-    with pytest.raises(SsilkError, match=r"dial_fringe_skirt.json: no times of GPU"):
+    with pytest.raises(SsilkError, match=r"dial_fringe_skirt.json: no times of one core"):
         draw(tmp_path / "other.png")
     assert not (tmp_path / "other.png").exists()

@@ -45,21 +45,11 @@ def with_totals(document) -> None:
     row.update({f"intersections_{name}": [value] for name, value in FOUND.items()})
 
 
-def with_point(document) -> None:
-    document["points"][0]["intersections"] = copy.copy(FOUND)
-
-
-def with_refined(document) -> None:
-    next(iter(document["measured"].values()))["simulator"]["intersect"] = FOUND["mean"]
-
-
 @pytest.mark.parametrize(
     ("table", "name", "at", "shown"),
     [
         ("overview", "shown_skin", with_shown, "3.12, 25.8"),
         ("other_methods", "table1", with_totals, "3.12, 25.8"),
-        ("levels", "trade_cuda", with_point, "3.12, 25.8"),
-        ("refinement", "refine", with_refined, "3.12"),
     ],
 )
 def test_a_measured_share_has_a_column(results, tmp_path, table, name, at, shown):
