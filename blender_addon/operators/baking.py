@@ -23,6 +23,7 @@ from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
+from ..motions.shapes import tell_changing_shapes
 from ..motions.sources import TIMELINE, Source
 from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
@@ -165,6 +166,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
+        tell_changing_shapes(self, garment)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))

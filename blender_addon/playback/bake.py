@@ -23,9 +23,10 @@ from ..motions.keys import Channel, bake_keys, continuous, mute_inherited, remov
 from ..scene.armature import bring_back, proxy_names, put_away
 from ..scene.garment import need_linear, need_linear_bodies, need_own_mesh, need_uncarried
 from ..scene.linked import give_back_mesh, give_own_mesh, has_lent_mesh
-from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
+from ..scene.meshes import need_relative, remove_shapes, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
+from ..scene.shapes import worn_points
 from ..scene.weights import put_trained_weights, restore_own_weights
 
 MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
@@ -220,7 +221,7 @@ def _need_same_points(garment: bpy.types.Object, to_trained: np.ndarray, skinned
             f"'{garment.name}' had {len(skinned.points)} vertices when it was trained and has {count} now; train it "
             "again."
         )
-    away = np.abs(rest_points(garment) @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max()
+    away = np.abs(worn_points(garment) @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max()
     if not away <= MOVED * _size(skinned):
         raise SetupError(
             f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train "
