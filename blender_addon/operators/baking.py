@@ -29,6 +29,7 @@ from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.bodies import reshaped
 from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
 from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
@@ -204,6 +205,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         from ssilk_usd.writing.files import write_motion
 
         write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
+        stage = self.model.parent / STAGE
+        self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write the inputs of the bake; return the command."""
@@ -236,7 +239,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}."
+        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}{self.reshaped}."
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):

@@ -131,3 +131,24 @@ def test_a_garment_in_another_shape_than_it_was_trained_in_is_not_baked(ready, t
     activate(ready, trained)
     ready.context.scene.frame_end = 4
     assert ready.ops.ssilk.bake(pre_roll=0.0) == {"FINISHED"}
+
+
+def test_a_body_in_another_shape_than_in_training_is_told(ready, trained, folder):
+    """The armature may stand elsewhere meanwhile, and the body with it."""
+    from blender_addon.playback.bodies import reshaped
+    from blender_addon.scene.armature import read_joints
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.handover import STAGE, hand_over
+    from blender_addon.scene.objects import Pair
+
+    rig, pillar = ready.data.objects["Rig"], ready.data.objects["Pillar"]
+    (folder / "given").mkdir()
+    hand_over(gather(trained), Pair.of(trained, rig), folder / "given")
+    for thing in (rig, pillar, trained):
+        thing.location.x += 3.0
+    ready.context.view_layer.update()
+    joints = read_joints(rig, trained).character
+    assert reshaped(trained, joints, folder / "given" / STAGE) == ""
+    fuller(pillar, 1.0)
+    found = reshaped(trained, joints, folder / "given" / STAGE)
+    assert found == " ('Pillar' is up to 30 mm off its shape in training, which the cloth met)"
