@@ -124,33 +124,47 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
 def slot_of(armature: bpy.types.Object, action: bpy.types.Action) -> Any:
     """Return the slot of an action that is an armature's own; None where actions have none, or none moves its bones.
 
-    What the armature plays says it, then what of its tracks do: names of slots stay as they were where objects are
-    renamed, appended or copied. A slot that other objects use alone is theirs.
+    What the armature plays says it, then what of its strips do, those that are muted last: names of slots stay as
+    they were where objects are renamed, appended or copied. A slot that other objects use alone is theirs.
 
     Raises:
         SetupError: several slots could be meant.
     """
-    candidates = _slots_for(armature, action)
-    if len(candidates) < 2:
-        return candidates[0] if candidates else None
-    animation = armature.animation_data
-    strips = [strip for track in animation.nla_tracks for strip in track.strips] if animation else []
-    for player in [animation, *strips] if animation else ():
-        if player.action == action and player.action_slot in candidates:
-            return player.action_slot
-    own = [slot for slot in candidates if armature in slot.users() or not slot.users()]
-    last = animation.last_slot_identifier if animation else ""
-    for wanted in (last, f"OB{armature.name}"):
-        found = [slot for slot in own if slot.identifier == wanted]
-        if found:
-            return found[0]
-    if len(own) == 1:
-        return own[0]
-    names = ", ".join(f"'{slot.name_display}'" for slot in candidates)
+    found = _own_slots(armature, action)
+    if len(found) < 2:
+        return found[0] if found else None
+    names = ", ".join(f"'{slot.name_display}'" for slot in _slots_for(armature, action))
     raise SetupError(
         f"The action '{action.name}' has the slots {names}, and none is told to be of '{armature.name}'; give "
         f"'{armature.name}' this action and its slot once, or make it a strip."
     )
+
+
+def _own_slots(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any]:
+    """Return the slot of an action that is an armature's own, or all that could be."""
+    candidates, animation = _slots_for(armature, action), armature.animation_data
+    if len(candidates) < 2:
+        return candidates
+    if animation and animation.action == action and animation.action_slot in candidates:
+        return [animation.action_slot]
+    used = _slots_of_strips(animation, action, candidates) if animation else []
+    own = used or [slot for slot in candidates if armature in slot.users() or not slot.users()]
+    last = animation.last_slot_identifier if animation else ""
+    for wanted in (last, f"OB{armature.name}"):
+        found = [slot for slot in own if slot.identifier == wanted]
+        if found:
+            return found
+    return own or candidates
+
+
+def _slots_of_strips(animation: bpy.types.AnimData, action: bpy.types.Action, candidates: list[Any]) -> list[Any]:
+    """Return those of some slots that strips play; of muted strips where no other plays any."""
+    strips = [(track.mute or strip.mute, strip) for track in animation.nla_tracks for strip in track.strips]
+    for is_muted in (False, True):
+        played = [strip.action_slot for muted, strip in strips if muted == is_muted and strip.action == action]
+        if found := [slot for slot in candidates if slot in played]:
+            return found
+    return []
 
 
 def _slots_for(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any]:
@@ -184,9 +198,10 @@ def _range(action: bpy.types.Action, slot: Any) -> tuple[float, float]:
 
 def _plays_as_it_is(armature: bpy.types.Object, strip: bpy.types.NlaStrip) -> bool:
     """Return whether a strip plays the whole of its action, once, forwards, at its own speed, and in full."""
-    slot = slot_of(armature, strip.action)
-    if slot and strip.action_slot != slot:
+    slots = _own_slots(armature, strip.action)
+    if slots and [strip.action_slot] != slots:
         return False
+    slot = slots[0] if slots else None
     whole = (strip.action_frame_start, strip.action_frame_end) == tuple(_range(strip.action, slot))
     plain = (strip.scale, strip.repeat) == (1.0, 1.0) and strip.blend_type == "REPLACE"
     changed = strip.use_reverse or strip.use_animated_influence or strip.use_animated_time or strip.modifiers

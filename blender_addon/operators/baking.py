@@ -23,11 +23,13 @@ from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
+from ..motions.shapes import tell_changing_shapes
 from ..motions.sources import TIMELINE, Source
 from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.bodies import reshaped
 from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
 from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
@@ -165,6 +167,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
+        tell_changing_shapes(self, garment)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.python = interpreter(preferences(context))
@@ -202,6 +205,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         from ssilk_usd.writing.files import write_motion
 
         write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
+        stage = self.model.parent / STAGE
+        self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write the inputs of the bake; return the command."""
@@ -234,7 +239,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}."
+        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}{self.reshaped}."
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):

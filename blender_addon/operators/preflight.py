@@ -15,6 +15,7 @@ from ssilk_core.events import format_count
 from ..arrays.findings import PUSHED, Clip, read_findings
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
+from ..motions.shapes import tell_changing_shapes
 from ..outside.wording import reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -45,6 +46,7 @@ class InspectOperator(RigOperator):
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         self.pair, self.scene = Pair.of(garment, armature_of(garment)), gather(garment)
+        tell_changing_shapes(self, garment)
         self.python = interpreter(preferences(context))
         return Work(
             f"{self.doing} '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),

@@ -16,6 +16,7 @@ from ssilk_core.scene.assets import LOOSE
 from ..arrays.joints import identifiers
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
+from ..motions.shapes import tell_changing_shapes
 from ..motions.sources import FILE, TIMELINE, Source, sources
 from ..outside import jobs
 from ..outside.wording import BONES, remember
@@ -169,6 +170,7 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         choose_preset(garment)
         self.scene = gather(garment)
+        tell_changing_shapes(self, garment)
         need_trainable(garment, armature, self.scene)
         self.chosen = ChosenMotions.of(garment, armature)
         self.pair = Pair.of(garment, armature)

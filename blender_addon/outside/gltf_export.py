@@ -9,6 +9,7 @@ Blender showed (.npy), and the folders of the modules that it has.
 import importlib
 import json
 import os
+import shutil
 import signal
 import sys
 from pathlib import Path
@@ -39,6 +40,14 @@ def heed_interrupts():
             signal.signal(getattr(signal, name), lambda *_: os._exit(130))
 
 
+def end(code):
+    """End at once: Blender 4.5 as a module may wait for ever for a thread of its own while it exits."""
+    shutil.rmtree(bpy.app.tempdir, ignore_errors=True)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 def main(blend, trust, garment, armature, path, seen, *folders):
     """Open the file, export, and compare what is in the .glb with what Blender shows, here and there."""
     heed_interrupts()
@@ -56,8 +65,9 @@ def main(blend, trust, garment, armature, path, seen, *folders):
         apart, where = gltf.apart(*things, Path(seen))
     except errors.SsilkError as error:
         say("failed", error=str(error))
-        sys.exit(2)
+        end(2)
     say("result", task="export", detail={"loss": loss, "frame": frame, "apart": apart, "where": where})
+    end(0)
 
 
 if __name__ == "__main__":

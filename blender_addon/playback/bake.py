@@ -23,9 +23,10 @@ from ..motions.keys import Channel, bake_keys, continuous, mute_inherited, remov
 from ..scene.armature import bring_back, proxy_names, put_away
 from ..scene.garment import need_linear, need_linear_bodies, need_own_mesh, need_uncarried
 from ..scene.linked import give_back_mesh, give_own_mesh, has_lent_mesh
-from ..scene.meshes import need_relative, remove_shapes, rest_points, write_shapes
+from ..scene.meshes import need_relative, remove_shapes, write_shapes
 from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
+from ..scene.shapes import earlier_shapes
 from ..scene.weights import put_trained_weights, restore_own_weights
 
 MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
@@ -213,14 +214,20 @@ def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarm
 
 
 def _need_same_points(garment: bpy.types.Object, to_trained: np.ndarray, skinned: SkinnedGarment) -> None:
-    """Check a garment's points at rest, given its own space to where it was trained [m]."""
+    """Check a garment's points at rest, given its own space to where it was trained [m].
+
+    Shape keys that were added since the training correct what was baked.
+    """
     count = len(garment.data.vertices)
     if count != len(skinned.points):
         raise SetupError(
             f"'{garment.name}' had {len(skinned.points)} vertices when it was trained and has {count} now; train it "
             "again."
         )
-    away = np.abs(rest_points(garment) @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max()
+    away = min(
+        float(np.abs(points @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max())
+        for points in earlier_shapes(garment)
+    )
     if not away <= MOVED * _size(skinned):
         raise SetupError(
             f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train "

@@ -24,6 +24,7 @@ from ..scene.armature import is_evenly_scaled
 from ..scene.garment import armature_of
 from ..scene.gather import read_mesh
 from ..scene.modifiers import objections
+from ..scene.shapes import mixed_points
 
 SCALE, MODIFIER = "unequal-scale", "shaping-modifier"
 
@@ -121,7 +122,7 @@ def _mended(item: bpy.types.PropertyGroup, garment: bpy.types.Object, left_out: 
     if item.mark == mark or item.code not in CHECKS or not mark:
         return False
     thing = bpy.data.objects[item.target]
-    mesh = read_mesh(thing, thing.data, thing.name)
+    mesh = read_mesh(thing, thing.data, thing.name, mixed_points(thing, baked=False))
     found = [each for each in CHECKS[item.code](mesh) if each.code == item.code]
     if found:
         item.take(on_polygons(replace(found[0], prim=item.target, fixable=item.fixable), mesh), mark)

@@ -22,8 +22,9 @@ from ..errors import SetupError
 from ..scene.garment import armature_of, bodies_of, rest_world
 from ..scene.linked import give_own_mesh, is_override, need_local
 from ..scene.masks import need_unmasked
-from ..scene.meshes import mixed_points, rest_points, triangles_of, world_points
+from ..scene.meshes import rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
+from ..scene.shapes import mixed_points
 from .intersections import crossing_triangles
 from .repairs import displacements
 

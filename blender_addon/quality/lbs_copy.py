@@ -14,6 +14,7 @@ from ..playback.models import TrainedGarment, model_of
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
 from ..scene.linked import local_copy, open_collection, own_copy
+from ..scene.shapes import worn_points
 from ..scene.weights import write_groups
 from .heat import ATTRIBUTE
 
@@ -65,8 +66,9 @@ def _clear_shapes(copy: bpy.types.Object) -> None:
     keys = copy.data.shape_keys
     if keys is None:
         return
-    name = keys.name
+    name, worn = keys.name, worn_points(copy)
     copy.shape_key_clear()
+    copy.data.vertices.foreach_set("co", worn.reshape(-1))
     left = bpy.data.shape_keys.get(name)  # Blender frees them since 5.2; before, they stay unused in the file
     if left:
         bpy.data.batch_remove([left])

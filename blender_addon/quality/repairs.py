@@ -15,6 +15,7 @@ from ssilk_core.scene.mesh.topology import SAME_PLACE
 from ..errors import SetupError
 from ..scene.garment import rest_world
 from ..scene.meshes import edited
+from ..scene.shapes import mixed_points
 
 DISPLACEMENT = "SSILK Displacement"  # mesh attribute: how far vertices moved, in the mesh's own space
 MERGE = 2 * SAME_PLACE  # [m]; longer than the diagonal of a cell in which ssilk takes vertices for one
@@ -71,7 +72,7 @@ def move_points(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
     """
     mesh, inverse = thing.data, np.array(rest_world(thing).inverted())
     target = points @ inverse[:3, :3].T + inverse[:3, 3]
-    old = _coordinates(mesh.vertices)
+    old = mixed_points(thing, baked=False)
     moved = np.linalg.norm((target - old) @ _metres(thing).T, axis=1, keepdims=True) > ROUNDING
     offset = np.where(moved, target - old, 0.0)
     for items in [mesh.vertices, *(block.data for block in (mesh.shape_keys.key_blocks if mesh.shape_keys else ()))]:

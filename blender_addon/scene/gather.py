@@ -21,6 +21,7 @@ from .garment import armature_of, bodies_of, carried_weights, is_carried, need_l
 from .masks import unmasked
 from .modifiers import need_plain_modifiers, reshapes
 from .objects import scene_units
+from .shapes import worn_points
 from .weights import PLAIN, own_groups, read_groups, read_kept
 
 HALF = 0.5  # weight from which on a vertex is in a group
@@ -71,7 +72,7 @@ def gather(
     things = [garment, *bodies_of(garment, armature)]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
     lbs = own_weights(armature, garment, joints)
-    mesh = read_mesh(garment, garment.data, paths[0])
+    mesh = read_mesh(garment, garment.data, paths[0], worn_points(garment))
     rig = _proxy_rig(armature, garment, joints, paths[0]) if proxies and joints.proxy_count else None
     bodies = [_read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
     return GatheredScene(
@@ -142,7 +143,7 @@ def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Join
     """
     need_linear(thing, armature)
     if not reshapes(thing):
-        return _bound(thing, thing.data, armature, joints, path)
+        return _bound(thing, thing.data, armature, joints, path, worn_points(thing))
     with _at_rest(armature) as depsgraph:
         evaluated = thing.evaluated_get(depsgraph)
         try:
@@ -152,7 +153,12 @@ def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Join
 
 
 def _bound(
-    thing: bpy.types.Object, mesh: bpy.types.Mesh, armature: bpy.types.Object, joints: Joints, path: str
+    thing: bpy.types.Object,
+    mesh: bpy.types.Mesh,
+    armature: bpy.types.Object,
+    joints: Joints,
+    path: str,
+    points: np.ndarray | None = None,
 ) -> Body:
     if is_carried(thing, (armature, leader_of(armature))):
         weights = carried_weights(thing, joints, len(mesh.vertices))
@@ -161,7 +167,7 @@ def _bound(
     bare = int(np.count_nonzero(~weights.any(axis=1)))
     if bare:
         raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
-    return Body(read_mesh(thing, mesh, path), SkinWeights.from_dense(path, weights))
+    return Body(read_mesh(thing, mesh, path, points), SkinWeights.from_dense(path, weights))
 
 
 @contextmanager
@@ -175,10 +181,15 @@ def _at_rest(armature: bpy.types.Object) -> Iterator[bpy.types.Depsgraph]:
         armature.data.pose_position = before
 
 
-def read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str) -> Mesh:
-    """Return a mesh of an object at its place at rest, as the core has it."""
+def read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str, points: np.ndarray | None = None) -> Mesh:
+    """Return a mesh of an object at its place at rest, as the core has it.
+
+    Args:
+        points: in place of the mesh's own, in the object's space, shape (V, 3).
+    """
     world = np.array(rest_world(thing))
-    points = _values(mesh.vertices, "co", 3).reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
+    own = _values(mesh.vertices, "co", 3).reshape(-1, 3) if points is None else points
+    points = own @ world[:3, :3].T + world[:3, 3]
     counts = _values(mesh.polygons, "loop_total", 1, np.int32)
     corners = np.arange(len(mesh.loops))
     mesh.calc_loop_triangles()

@@ -77,19 +77,6 @@ def rest_points(garment: bpy.types.Object) -> np.ndarray:
     return points.reshape(-1, 3)
 
 
-def mixed_points(thing: bpy.types.Object) -> np.ndarray:
-    """Return the points with all shape keys at their values, in the object's own space, shape (V, 3)."""
-    mixed = rest_points(thing)
-    keys = thing.data.shape_keys
-    for key in keys.key_blocks if keys else ():
-        if key.value and not key.mute and key != keys.reference_key:
-            ends = np.empty((2, len(mixed) * 3), dtype=np.float32)
-            for row, block in zip(ends, (key.relative_key, key)):
-                block.data.foreach_get("co", row)
-            mixed += key.value * (ends[1] - ends[0]).reshape(-1, 3)
-    return mixed
-
-
 def write_shapes(garment: bpy.types.Object, offsets: np.ndarray, names: Sequence[str]) -> list[str]:
     """Put shape keys in place of those that were baked before; return their names. In object mode.
 

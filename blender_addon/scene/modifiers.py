@@ -13,7 +13,8 @@ import bpy
 import numpy as np
 
 from ..errors import SetupError
-from .meshes import mixed_points, world_points
+from .meshes import world_points
+from .shapes import mixed_points
 from .weights import read_groups
 
 # They leave points where they are, wherever they stand.

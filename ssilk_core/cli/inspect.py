@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
     from ..authoring.preflight.inspection import PreflightInput
+    from ..authoring.preflight.motion import MotionFile
     from ..authoring.preflight.units import FileUnits
     from ..scene.assets import Motion, Skeleton
 
@@ -66,11 +67,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
-    from ssilk_usd.reading.facts import animated
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
-    from ..authoring.preflight.motion import MotionFile
 
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
@@ -80,7 +79,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
         preset=preset_named(options.preset or _default_preset()), unread=unread,
-        files=[MotionFile(motion.path, *animated(motion, character.skeleton)) for motion in motions],
+        files=[_facts(motion, character.skeleton) for motion in motions],
     )  # fmt: skip
 
 
@@ -99,6 +98,20 @@ def _readable(paths: Sequence[Path], skeleton: Skeleton) -> tuple[list[Motion], 
         except SsilkError as error:
             unread[str(source)] = str(error)
     return found, unread
+
+
+def _facts(motion: Motion, skeleton: Skeleton) -> MotionFile:
+    from ssilk_usd.reading.facts import animated
+    from ssilk_usd.reading.motion import clip_posture
+
+    from ..authoring.preflight.motion import MotionFile
+
+    joints, times = animated(motion, skeleton)
+    posture = clip_posture(motion, skeleton)
+    if posture is None:
+        return MotionFile(motion.path, joints, times)
+    upright = (posture.by_file, posture.by_character)[:: 1 if posture.is_of_file else -1]
+    return MotionFile(motion.path, joints, times, (upright[0], upright[1]), posture.is_of_file)
 
 
 def _default_preset() -> str:

@@ -72,7 +72,7 @@ def override_by_strip(bpy, garment) -> None:
     action = armature.animation_data.action
     override_by_action(bpy, garment)
     armature.animation_data.action = None
-    armature.animation_data.nla_tracks.new().strips.new("Above", 1, action)
+    armature.animation_data.nla_tracks.new().strips.new("Above", 1, action).name = "Above"  # 4.5: the action's
 
 
 def override_by_constraint(bpy, garment) -> None:

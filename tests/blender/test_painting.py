@@ -52,6 +52,8 @@ def test_painting_starts_tight_with_a_palette(bpy, quad):
 
 @pytest.mark.parametrize("value, number", [("PINNED", 0), ("TIGHT", 1), ("LOOSE", 2)])
 def test_blenders_brush_paints_the_chosen_class(bpy, quad, value, number):
+    if bpy.app.version < (4, 5):
+        pytest.skip("without a window Blender 4.2 crashes in its own fill")
     bpy.ops.ssilk.paint_classes()
     assert bpy.ops.ssilk.brush_class(value=value) == {"FINISHED"}
     from blender_addon.scene.classes import is_chosen

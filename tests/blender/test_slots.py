@@ -79,6 +79,38 @@ def test_each_character_plays_its_own_slot(bpy, cast, change, rename):
     assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
 
 
+@pytest.mark.parametrize("muted", [True, False])
+def test_a_strip_of_another_characters_slot_does_not_make_that_slot_its_own(bpy, cast, muted):
+    """A strip that was left over, or that borrows the villain's motion, stands below the own one."""
+    hero, villain, action = cast
+    own, theirs = hero.animation_data.action_slot, villain.animation_data.action_slot
+    hero.animation_data.action = None
+    for number, slot in enumerate((theirs, own)):
+        track = hero.animation_data.nla_tracks.new()
+        track.strips.new(f"Strip{number}", 1 + 50 * number, action).action_slot = slot
+        track.mute = muted and slot == theirs
+    if muted:
+        hero.name = "Renamed"
+    assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+
+
+def test_strips_of_several_slots_stand_by_themselves_where_nothing_tells_the_own(bpy, cast):
+    from blender_addon.errors import SetupError
+    from blender_addon.motions.sources import sources
+
+    hero, villain, action = cast
+    slots = [villain.animation_data.action_slot, hero.animation_data.action_slot]
+    hero.animation_data_clear()
+    hero.name = "Held"
+    for number, slot in enumerate(slots):
+        track = hero.animation_data_create().nla_tracks.new()
+        track.strips.new(f"Strip{number}", 1 + 50 * number, action).action_slot = slot
+    hero.animation_data.last_slot_identifier = ""
+    assert [source.kind for source in sources(hero)][-2:] == ["STRIP", "STRIP"]
+    with pytest.raises(SetupError, match="none is told to be of 'Held'"):
+        leaning(bpy, hero, action, 12)
+
+
 def test_frames_are_those_of_the_slot(bpy, cast):
     from blender_addon.motions.sources import ACTION, Source, frames_of
 

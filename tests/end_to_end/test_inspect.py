@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.cli import main
 from ssilk_core.scene.assets import Motion
@@ -192,6 +192,51 @@ def test_jumping_roots_and_still_joints_are_found(tmp_path, capsys):
     assert code == 0
     assert found["findings"]["root-jumps"]["prim"].endswith("jumps.usda:/Animation")
     assert "Spine" in found["findings"]["still-joints"]["found"]
+
+
+def write_lying_in_an_xform(path: Path) -> Path:
+    """The pillar with z up in the space of its skeleton, stood up by an Xform."""
+    stage = Usd.Stage.Open(str(write_hero(path)))
+    over = Gf.Matrix4d().SetRotate(Gf.Rotation(Gf.Vec3d(1, 0, 0), 90))
+    UsdGeom.Xformable(stage.GetPrimAtPath("/Hero")).AddRotateXOp().Set(-90.0)
+    UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")).GetBindTransformsAttr().Set([over] * 2)
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr()
+    points.Set([Gf.Vec3f(over.Transform(Gf.Vec3d(point))) for point in points.Get()])
+    stage.Save()
+    return path
+
+
+def write_pose(path: Path, lean: float, *, meters: float = 1.0, up: str | None = "Y") -> Path:
+    """A clip alone in which the hips lean back by so many degrees."""
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, meters)
+    if up:
+        UsdGeom.SetStageUpAxis(stage, up)
+    animation = UsdSkel.Animation.Define(stage, "/Clip")
+    animation.CreateJointsAttr(["Hips", "Hips/Spine"])
+    turn = Gf.Quatf(Gf.Rotation(Gf.Vec3d(1, 0, 0), lean).GetQuat())
+    for frame in range(30):
+        animation.CreateRotationsAttr().Set([turn, Gf.Quatf(1)], frame)
+        animation.CreateTranslationsAttr().Set([Gf.Vec3f(0)] * 2, frame)
+    stage.Save()
+    return path
+
+
+def test_a_clip_whose_axis_posture_alone_tells_is_named(tmp_path, capsys):
+    """A character whose axis stands in an Xform, and a clip of the same unit: it may lie, and be read as standing."""
+    hero, cloth = write_lying_in_an_xform(tmp_path / "hero.usda"), write_damaged(tmp_path / "tube.usda")
+
+    def told(clip: Path) -> dict | None:
+        return inspect(capsys, hero, "--garment", cloth, "--motion", clip)[1]["findings"].get("axis-by-posture")
+
+    by_file, by_xforms = told(write_pose(tmp_path / "a.usda", 0)), told(write_pose(tmp_path / "b.usda", 80))
+    assert by_file and by_file["severity"] == "warning" and by_file["prim"].endswith("a.usda:/Clip")
+    assert "in the axes of its file, by which the character leans by 0 degrees on average" in by_file["found"]
+    assert "or in those of the character's Xforms, by which it leans by 90" in by_file["found"]
+    assert by_xforms and by_xforms["severity"] == "info"
+    assert "the axes of the character's Xforms, by which the character leans by 10" in by_xforms["found"]
+    assert not told(write_pose(tmp_path / "c.usda", 0, up=None))  # nothing but the Xforms says an axis
+    assert not told(write_pose(tmp_path / "d.usda", 90, up="Z"))  # both say the same one
 
 
 def test_what_is_wrong_with_one_motion_does_not_hide_the_rest(tmp_path, capsys):

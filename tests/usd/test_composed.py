@@ -10,6 +10,7 @@ import pytest
 from pxr import Gf, Sdf, Ts, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from ssilk_usd.reading.character import read_character
 from ssilk_usd.reading.frame_range import read_frame_range
+from ssilk_usd.reading.garment import read_garment
 from ssilk_usd.reading.mesh import read_mesh
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.scene import read_scene
@@ -330,6 +331,32 @@ def test_the_fabric_is_the_one_that_usd_binds(bind):
     assert bound.GetPath() == "/Stiff"
     found = read_surface(mesh.GetPrim(), read_mesh(mesh.GetPrim(), np.eye(4)))
     assert found and found.youngs_modulus == pytest.approx(5e5)
+
+
+def test_fabrics_of_parts_of_a_garment_are_told(tmp_path):
+    """Panels may have physics materials of their own; a look of theirs says nothing of cloth."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "cape.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    mesh = UsdGeom.Mesh.Define(stage, "/Cape")
+    mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)])
+    mesh.CreateFaceVertexCountsAttr([3, 3])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 2, 1, 3])
+    soft, stiff, red = (UsdShade.Material.Define(stage, f"/{name}") for name in ("Soft", "Stiff", "Red"))
+    for material, modulus in ((soft, 1e4), (stiff, 5e5)):
+        material.GetPrim().CreateAttribute("physics:youngsModulus", Sdf.ValueTypeNames.Float).Set(modulus)
+    api = UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim())
+    api.Bind(soft, materialPurpose="physics")
+    for name, material, face, purpose in (("belt", stiff, 0, "physics"), ("hem", red, 1, "")):
+        subset = api.CreateMaterialBindSubset(name, [face]).GetPrim()
+        UsdShade.MaterialBindingAPI.Apply(subset).Bind(material, materialPurpose=purpose)
+    character = Usd.Stage.CreateInMemory()
+    define_hero(character)
+    messages: list[str] = []
+    skeleton = read_character(character).skeleton
+    read_garment(stage, skeleton, report=lambda event: messages.append(getattr(event, "text", "")))
+    (told,) = messages
+    assert "fabrics of parts of it are left out: Stiff of belt; a garment has one fabric" in told
 
 
 @pytest.mark.parametrize(("weight", "told"), [(0.5, True), (1.3, True), (0.999, False)])

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils
+from ssilk_usd.checking.shot import check_shot
 from ssilk_usd.reading.mesh import read_mesh
 from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.shots.shot import ShotSummary, write_shot
@@ -296,6 +297,56 @@ def test_what_is_lost_is_told_by_name(hero, tmp_path):
     garment = replace(deformer.scene.garment, mesh=cut)
     other = replace(deformer, scene=replace(deformer.scene, garment=garment))
     assert "Shawl loses its look" in shoot(other, tmp_path / "other.usda").left_out
+
+
+def test_variants_that_are_not_selected_are_told_by_name(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    for path, name in (("/Hero", "bodyType"), ("/Hero/Cape", "shadingVariant")):
+        sets = stage.GetPrimAtPath(path).GetVariantSets().AddVariantSet(name)
+        for each in ("a", "b"):
+            sets.AddVariant(each)
+        sets.SetVariantSelection("b")
+    stage.Save()
+    of_hero, of_cape = (f"the variant set {name}, of which 'b' is kept" for name in ("bodyType", "shadingVariant"))
+    left = write_rigged_stage(hero, worn(hero).scene, tmp_path / "rigged.usda")
+    assert left == f"Hero loses {of_hero}; Cape loses {of_cape}"
+    left = shoot(worn(hero), tmp_path / "shot.usda").left_out
+    assert left == f"Cape loses {of_hero}, {of_cape}; Body loses {of_hero}"
+
+
+def test_relationships_name_what_is_written_or_are_told(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    rivet = UsdGeom.Xform.Define(stage, "/Hero/Rivet").GetPath()
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    for name, targets in (("driver", ["/Hero/Body"]), ("both", [rivet, "/Hero/Body.points"]), ("rivets", [rivet])):
+        cape.CreateRelationship(f"rigging:{name}").SetTargets(targets)
+    stage.Save()
+    summary = shoot(worn(hero), tmp_path / "shot.usda")
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    written = shot.GetPrimAtPath("/Hero/Cape")
+    assert written.GetRelationship("rigging:driver").GetTargets() == [Sdf.Path("/Hero/Body")]
+    assert written.GetRelationship("rigging:both").GetTargets() == [Sdf.Path("/Hero/Body.points")]
+    assert not written.HasRelationship("rigging:rivets")
+    assert summary.left_out == (
+        "Cape loses rigging:both to /Hero/Rivet, which is not written with it, "
+        "rigging:rivets to /Hero/Rivet, which is not written with it"
+    )
+
+
+def test_materials_of_renderers_and_subsets_that_are_only_looked_at_are_no_fault_of_a_shot(hero, tmp_path):
+    """usd-core knows no shaders of MaterialX, Arnold or MDL, and a texture may lie where only a farm finds it."""
+    stage = Usd.Stage.Open(str(hero))
+    for name, code in (("Standard", "ND_standard_surface_surfaceshader"), ("Ai", "ArnoldStandardSurface")):
+        UsdShade.Shader.Define(stage, f"/Looks/Cape_cloth/{name}").CreateIdAttr(code)
+    mdl = UsdShade.Shader.Define(stage, "/Looks/Cape_cloth/Mdl")
+    mdl.SetSourceAsset("OmniPBR.mdl", "mdl")
+    UsdGeom.Subset.SetFamilyType(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Cape")), "materialBind", "unrestricted")
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usda")
+    found = check_shot(tmp_path / "shot.usda")
+    assert {finding.severity for finding in found} == {"warning"}
+    told = " ".join(finding.text for finding in found)
+    assert "OmniPBR.mdl" in told and "invalid family type" in told and "sdrRegistry" not in told
 
 
 def test_cloth_without_a_look_is_seen_from_both_sides(hero, tmp_path):

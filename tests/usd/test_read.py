@@ -768,6 +768,15 @@ def test_what_is_assumed_is_said():
     assert "metersPerUnit is not authored" in said[1].text
 
 
+def test_a_garment_that_usd_skins_otherwise_is_told():
+    stage, said = author(Usd.Stage.CreateInMemory()), []
+    Sdf.CopySpec(stage.GetRootLayer(), BODY, stage.GetRootLayer(), "/Hero/Cape")
+    UsdSkel.BindingAPI(stage.GetPrimAtPath("/Hero/Cape")).CreateSkinningMethodAttr("dualQuaternion")
+    read_scene(stage, garment="Cape", report=said.append)
+    (told,) = said
+    assert told.text.endswith("/Hero/Cape: its dualQuaternion skinning is evaluated as linear blend skinning")
+
+
 @pytest.mark.parametrize("arc", ["references", "payload", "subLayers"])
 def test_missing_layers_are_named(arc, tmp_path, capfd):
     path = tmp_path / "shot.usda"

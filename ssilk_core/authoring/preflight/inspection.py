@@ -114,6 +114,8 @@ def _on_motions(inputs: PreflightInput) -> Findings:
         yield from motion.root_jumps(clip, skeleton)
     for clip in inputs.motions:
         yield from motion.lying(clip, skeleton)
+    for file in inputs.files:
+        yield from motion.axis_by_posture(file)
     for clip in inputs.motions:
         yield from motion.joint_jumps(clip, skeleton)
     for clip in inputs.motions:

@@ -39,11 +39,16 @@ class MotionFile:
     Attributes:
         joints: indices of the skeleton's joints that it animates.
         times: times of the samples [s], shape (S,).
+        upright: where posture alone told its up axis, how upright the character is on average by the axis taken and
+            by the other, from 1 as at rest to -1 upside down.
+        is_of_file: whether its file's axis was taken, and not that of the character's Xforms.
     """
 
     path: str
     joints: Ints
     times: Floats
+    upright: tuple[float, float] | None = None
+    is_of_file: bool = False
 
 
 def unread_motion(path: str, reason: str) -> Finding:
@@ -104,6 +109,23 @@ def lying(motion: Motion, skeleton: Skeleton) -> Findings:
         fix="if it should stand, correct upAxis of the motion's file, or export it together with its character",
         elements="frames",
         indices=index_tuple(down),
+    )
+
+
+def axis_by_posture(file: MotionFile) -> Findings:
+    """Yield that posture alone told a clip's up axis: a character that lies in it was stood up, or the reverse."""
+    if file.upright is None:
+        return
+    taken, other = ("its file", "the character's Xforms")[:: 1 if file.is_of_file else -1]
+    leans, would = np.degrees(np.arccos(np.clip(file.upright, -1, 1)))
+    yield Finding(
+        severity="warning" if file.is_of_file else "info",  # bound to the character, USD shows it by the Xforms
+        code="axis-by-posture",
+        prim=file.path,
+        found=f"it stands alone, and may be in the axes of {taken}, by which the character leans by {leans:.0f} "
+        f"degrees on average, or in those of {other}, by which it leans by {would:.0f}; the former are taken",
+        why="both have one unit of length, so posture alone tells them apart, and a character may lie",
+        fix="if the other one is right, export it with its character, or bound to its Skeleton",
     )
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel, UsdValidation
+from pxr import Usd, UsdGeom, UsdShade, UsdSkel, UsdUtils, UsdValidation
 
 from ssilk_core.errors import VerificationError
 from ssilk_core.scene.assets import Floats
@@ -34,10 +34,16 @@ _SEVERITIES = {
     UsdValidation.ValidationErrorType.Error: "error",
     UsdValidation.ValidationErrorType.Warn: "warning",
 }
+# Shaders of MaterialX, MDL and renderers are known where their plugins are, which are not here.
+_OF_PLUGINS = ("MissingShaderIdInRegistry", "MissingSourceTypeInRegistry")
+# A texture, since a stage with a missing layer is not opened; subsets for materials, which may not say how they part.
+_OF_LOOKS = ("UnresolvableDependency", "InvalidFamilyType")
 
 
 def check_shot(path: str | Path) -> list[ShotFinding]:
     """Return the findings about a shot: those of UsdValidation, then those of our checks; empty if it is valid.
+
+    Materials and subsets are copied from the character's stage, so what is wrong with these is a warning.
 
     Extents are compared with the skinned points only where nothing else is wrong.
 
@@ -53,11 +59,21 @@ def check_shot(path: str | Path) -> list[ShotFinding]:
 
 def _validate(stage: Usd.Stage) -> Iterator[ShotFinding]:
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-    for error in UsdValidation.ValidationContext(validators).Validate(stage):
-        prims = [str(site.GetPrim().GetPath()) for site in error.GetSites() if site.IsPrim()]
+    quiet = UsdUtils.CoalescingDiagnosticDelegate()  # what follows says the same
+    errors = UsdValidation.ValidationContext(validators).Validate(stage)
+    del quiet
+    for error in errors:
+        prims = [site.GetPrim() for site in error.GetSites() if site.IsPrim()]
         severity = _SEVERITIES.get(error.GetType())
-        if severity:
-            yield ShotFinding(severity, ", ".join(prims), error.GetMessage())
+        if not severity or error.GetName() in _OF_PLUGINS:
+            continue
+        is_of_look = error.GetName() in _OF_LOOKS or (prims and all(map(_is_in_material, prims)))
+        paths = ", ".join(str(prim.GetPath()) for prim in prims)
+        yield ShotFinding("warning" if is_of_look else severity, paths, error.GetMessage())
+
+
+def _is_in_material(prim: Usd.Prim) -> bool:
+    return any(prim.GetStage().GetPrimAtPath(path).IsA(UsdShade.Material) for path in prim.GetPath().GetPrefixes())
 
 
 def _check_stage(stage: Usd.Stage) -> Iterator[ShotFinding]:

@@ -5,10 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
-from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.events import Reporter, silent
 from ssilk_core.scene.assets import Body, Character, Floats, SkinWeights
 
 from ..names import GEOM_BIND, SKEL
@@ -29,10 +29,8 @@ from .carried import carried_by
 from .mesh import is_drawn, is_garment, read_mesh, rendered
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton
-from .skin import read_skin
+from .skin import read_skin, tell_method
 from .spaces import SkelSource
-
-SKINNING_METHOD = "primvars:skel:skinningMethod"
 
 
 @needs_whole_files
@@ -110,10 +108,7 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
 
 
 def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report: Reporter) -> Body:
-    method = inherited(prim, SKINNING_METHOD)
-    chosen = None if method is None else method.Get(EARLIEST)
-    if chosen not in (None, UsdSkel.Tokens.classicLinear):
-        report(Message(f"{location(prim)}: its {chosen} skinning is evaluated as linear blend skinning", "warning"))
+    tell_method(prim, report)
     purpose = str(UsdGeom.Imageable(prim).ComputePurpose())
     carried = None if is_skinned(prim, skel) else carried_by(prim, skel)
     if carried:

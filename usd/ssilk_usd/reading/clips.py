@@ -9,6 +9,8 @@ which tells the axis too. Where both have one unit, the character stands upright
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ssilk_core.scene.assets import Floats, Ints, Skeleton
@@ -28,10 +30,35 @@ def spread(codes: Floats, count: int) -> Floats:
     return codes[np.unique(np.linspace(0, len(codes) - 1, min(len(codes), count)).round().astype(int))]
 
 
-def clip_placement(
-    local: Floats, match: Ints, units: StageUnits, skeleton: Skeleton, *, says_axis: bool
-) -> Floats | None:
-    """Return what brings a clip's root joints into the world [m], shape (4, 4); None where its file's units do.
+@dataclass(frozen=True)
+class Posture:
+    """How upright a character is on average by both axes that its clip may be in, from 1 as at rest to -1.
+
+    Attributes:
+        by_character, by_file: by the axis of the character's Xforms, and by that of the clip's file.
+        is_of_file: whether the clip is read by the latter.
+    """
+
+    by_character: float
+    by_file: float
+    is_of_file: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ClipSpace:
+    """What space a clip is in.
+
+    Attributes:
+        placement: from it to the world [m], (4, 4), for root joints; None where the units of the clip's file do that.
+        posture: what told the up axis; None where anything else did.
+    """
+
+    placement: Floats | None
+    posture: Posture | None = None
+
+
+def clip_space(local: Floats, match: Ints, units: StageUnits, skeleton: Skeleton, *, says_axis: bool) -> ClipSpace:
+    """Return the space that a clip is in, which stands alone.
 
     Args:
         local: joint to parent in some frames of the clip, as authored, in the skeleton's order, (F, J, 4, 4).
@@ -44,7 +71,7 @@ def clip_placement(
     above = skeleton.placement
     scale = similarity_scale(above)
     metres = _scale_of_bones(local, match, skeleton, (scale, units.meters_per_unit))
-    turn = above[:3, :3] / scale
+    turn, posture = above[:3, :3] / scale, None
     if abs(scale / units.meters_per_unit - 1) > SAME:  # the unit tells the space: a character may lie
         is_converted = metres == units.meters_per_unit
     elif np.abs(turn - units.rotation).max() < SAME or not says_axis:
@@ -54,12 +81,14 @@ def clip_placement(
             _uprightness(local, match, each, metres, skeleton) for each in (turn, units.rotation)
         )
         is_converted = by_file > by_character + UPRIGHT
+        if np.abs(turn[1] - units.rotation[1]).max() > SAME:  # they differ in what is up
+            posture = Posture(by_character, by_file, is_converted)
     if is_converted:
-        return None
+        return ClipSpace(None, posture)
     placement = np.eye(4)
     placement[:3, :3] = turn * metres
     placement[:3, 3] = above[:3, 3]
-    return placement
+    return ClipSpace(placement, posture)
 
 
 def _scale_of_bones(local: Floats, match: Ints, skeleton: Skeleton, choice: tuple[float, float]) -> float:
@@ -76,7 +105,7 @@ def _scale_of_bones(local: Floats, match: Ints, skeleton: Skeleton, choice: tupl
 
 
 def _uprightness(local: Floats, match: Ints, turn: Floats, metres: float, skeleton: Skeleton) -> float:
-    """Return how upright the character's hub is on average, from 1 as at rest to -1 upside down."""
+    """Return how upright the character's hub is on average, as `Posture` has it."""
     placement = np.eye(4)
     placement[:3, :3] = turn * metres
     posed = joints_to_core(local, skeleton.parents, placement, StageUnits())

@@ -34,9 +34,9 @@ from .mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
 from .rebinding import blended_moves, character_source, common_move, joint_moves, need_one_motion, used_moves
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton, skeletons
-from .skin import match_joints, read_influences, read_skin
+from .skin import match_joints, read_influences, read_skin, tell_method
 from .spaces import SkelSource
-from .surface import read_surface
+from .surface import read_surface, tell_parts
 
 
 @needs_whole_files
@@ -62,7 +62,8 @@ def read_garment(
         garment: the mesh, by path or name, if there are several.
         root: the character that the garment is fitted to, if the stage has several.
         shaped: with the blendshapes that are on at the earliest time; those of a baked garment move it in its shot.
-        report: hears of weights that do not sum to one.
+        report: hears of weights that do not sum to one, of other skinning than linear blend skinning, and of fabrics
+            of parts.
 
     Raises:
         SsilkError: there is no garment or several, or the data is malformed.
@@ -76,6 +77,7 @@ def read_garment(
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
     if skel and is_skinned(prim, skel):
         need_skinned(prim)
+        tell_method(prim, report)
     carried = carried_by(prim, skel) if skel and skin is None and not has_value(prim, PROXIES) else None
     if carried:
         assert skel is not None
@@ -84,6 +86,7 @@ def read_garment(
     pins, levels = (_per_point(prim, name) for name in (PIN, LEVEL))
     pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
     surface = read_surface(prim, mesh)
+    tell_parts(prim, report)
     return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface, display_colour(prim))
 
 

@@ -28,7 +28,7 @@ from ..opening.stage import (
 from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
 from .animation import PosedJoints, animation_source, posed_joints
-from .clips import LOOKED_AT, clip_placement, spread
+from .clips import LOOKED_AT, ClipSpace, Posture, clip_space, spread
 from .skeleton import of_bodies, skeletons
 from .skin import match_joints, need_unique
 from .spaces import joints_to_core, need_similarity, similarity_scale
@@ -122,10 +122,7 @@ def read_motion(
         need_similarity(placed, placements)
     units = StageUnits.of(stage)
     if placed is None and skeleton.placement is not None:
-        sample = read_samples(animation, spread(codes, LOOKED_AT), len(joints), where)
-        posed_so = rigid(matrix_from_quaternion(sample[0]), sample[1])[:, match]
-        says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
-        found = clip_placement(posed_so, match, units, skeleton, says_axis=says_axis)
+        found = _space(animation, joints, match, codes, skeleton).placement
         placements, units = (placements, units) if found is None else (found[None], StageUnits())
     scale = similarity_scale(placements)
     rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
@@ -147,6 +144,31 @@ def read_motion(
     _check_places(translations, skeleton, codes, where)
     start = float(codes[0] * fps / stage.GetTimeCodesPerSecond())
     return Motion(where, fps, rotations, translations, start)
+
+
+def clip_posture(motion: Motion, skeleton: Skeleton) -> Posture | None:
+    """Return by what posture the up axis of a motion was told; None where it stands in files.
+
+    `motion` was read for `skeleton`, from a file that still exists.
+    """
+    file, prim = split_location(motion.path)
+    stage = open_stage(file)
+    animation, placed = find_animation(stage, prim, None)
+    if placed is not None or skeleton.placement is None:
+        return None
+    joints = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    match = np.array(match_joints(skeleton.joint_names, joints))
+    codes, _ = _time_codes(stage, animation, None, None)
+    return _space(animation, joints, match, codes, skeleton).posture
+
+
+def _space(animation: Usd.Prim, joints: tuple[str, ...], match: Ints, codes: Floats, skeleton: Skeleton) -> ClipSpace:
+    """Return the space of an animation that stands alone, of a character whose Xforms place it."""
+    stage = animation.GetStage()
+    turns, places = read_samples(animation, spread(codes, LOOKED_AT), len(joints), location(animation))
+    local = rigid(matrix_from_quaternion(turns), places)[:, match]
+    says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
+    return clip_space(local, match, StageUnits.of(stage), skeleton, says_axis=says_axis)
 
 
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:

@@ -7,7 +7,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
@@ -17,6 +17,7 @@ from ..names import GEOM_BIND, JOINTS, SKEL
 from ..opening.stage import EARLIEST, inherited, location
 from ..opening.times import change_times
 
+METHOD = "primvars:skel:skinningMethod"
 STILL = 1e-5  # of the largest value: rounding
 WHOLE = 0.01  # how far weights of a vertex may sum from one: half floats and rounding tools stay within
 
@@ -49,6 +50,14 @@ class AuthoredInfluences:
             text = f"{self.path}: the weights of {np.count_nonzero(off)} of {len(off)} vertices sum {said}"
             text += ", and are made to sum to one; until they are normalised, USD shows these vertices elsewhere"
             report(Message(text, "warning"))
+
+
+def tell_method(prim: Usd.Prim, report: Reporter) -> None:
+    """Report a mesh that USD skins otherwise than by linear blend skinning."""
+    method = inherited(prim, METHOD)
+    chosen = None if method is None else method.Get(EARLIEST)
+    if chosen not in (None, UsdSkel.Tokens.classicLinear):
+        report(Message(f"{location(prim)}: its {chosen} skinning is evaluated as linear blend skinning", "warning"))
 
 
 def match_joints(names: tuple[str, ...], among: tuple[str, ...]) -> list[int]:

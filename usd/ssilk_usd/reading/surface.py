@@ -13,9 +13,10 @@ from collections.abc import Sequence
 from math import inf, nan
 
 import numpy as np
-from pxr import Usd, UsdPhysics, UsdShade
+from pxr import Usd, UsdGeom, UsdPhysics, UsdShade
 
 from ssilk_core.errors import fail
+from ssilk_core.events import Message, Reporter
 from ssilk_core.scene.assets import PLATE_THICKNESS, Floats, Mesh, SurfaceMaterial
 
 from ..opening.stage import has_value, location, value
@@ -93,6 +94,18 @@ def bound_material(prim: Usd.Prim) -> Usd.Prim | None:
     """Return the material that is bound to a mesh for physics, else for all: by itself, above, or by collection."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(PHYSICS)
     return material.GetPrim() if material else None
+
+
+def tell_parts(prim: Usd.Prim, report: Reporter) -> None:
+    """Report fabrics that are bound to subsets of a mesh: a garment has one."""
+    whole, parts = bound_material(prim), []
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
+        found = bound_material(subset.GetPrim())
+        if found and found != whole and _is_of_surfaces(found):
+            parts.append(f"{found.GetName()} of {subset.GetPrim().GetName()}")
+    if parts:
+        text = f"{location(prim)}: fabrics of parts of it are left out: {', '.join(parts)}"
+        report(Message(f"{text}; a garment has one fabric throughout, that of the mesh", "warning"))
 
 
 def deformable_body(prim: Usd.Prim) -> Usd.Prim | None:

@@ -54,10 +54,11 @@ class LeftOut:
 
     names: dict[str, list[str]] = field(default_factory=dict)
 
-    def add(self, mesh: str, name: str) -> None:
-        found = self.names.setdefault(mesh, [])
-        if name not in found:
-            found.append(name)
+    def add(self, mesh: str, *names: str) -> None:
+        for name in names:
+            found = self.names.setdefault(mesh, [])
+            if name not in found:
+                found.append(name)
 
     def __str__(self) -> str:
         return "; ".join(f"{mesh} loses {', '.join(names)}" for mesh, names in self.names.items())
@@ -117,6 +118,10 @@ def copy_looks(
         for path, look in looks:
             _copy_properties(flat, layer, look, path, left)
     for path, look in looks:
+        above = [opened.GetPrimAtPath(prefix) for prefix in look.prim.GetPath().GetPrefixes()]
+        for variants in map(variants_of, above):
+            left.add(path.name, *variants)
+        _keep_targets(stage, look, path, looks, left)
         _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
         _copy_subsets(flat, stage, look, path)
         _bind_materials(flat, stage, root, look, path, materials, left)
@@ -124,6 +129,33 @@ def copy_looks(
     folder = os.path.abspath(os.path.dirname(output))
     UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
     return left
+
+
+def variants_of(prim: Usd.Prim) -> list[str]:
+    """Return in words which variant sets of a prim a copy of what is selected in them lacks."""
+    sets = prim.GetVariantSets()
+    names = sets.GetNames()
+    return [f"the variant set {name}, of which '{sets.GetVariantSelection(name)}' is kept" for name in names]
+
+
+def _keep_targets(
+    stage: Usd.Stage, look: LookSource, path: Sdf.Path, looks: Sequence[tuple[Sdf.Path, LookSource]], left: LeftOut
+) -> None:
+    """Let relationships of a mesh name what is written; those that would name nothing are left out."""
+    prim, written = stage.GetPrimAtPath(path), {other.prim.GetPath(): to for to, other in looks}
+    for relationship in prim.GetAuthoredRelationships():
+        source = look.prim.GetRelationship(relationship.GetName())
+        if not source or relationship.GetName().startswith(_OTHER_SPACES) or relationship.GetName() in _OTHERS:
+            continue
+        named = [written.get(target, target) for target in source.GetForwardedTargets()]
+        kept = [target for target in named if stage.GetObjectAtPath(target)]
+        if kept:
+            relationship.SetTargets(kept)
+        else:
+            prim.RemoveProperty(relationship.GetName())
+        if len(kept) < len(named):
+            missing = next(target for target in named if target not in kept)
+            left.add(path.name, f"{relationship.GetName()} to {missing}, which is not written with it")
 
 
 def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:

@@ -37,7 +37,7 @@ from ..reading.surface import bound_material
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
-from .look import copy_looks
+from .look import copy_looks, variants_of
 from .look_above import LookFromAbove
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
@@ -60,13 +60,14 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
 
     Returns:
-        What the garment loses of its look where it is copied or moved, for messages; empty where nothing.
+        What the copy loses: variants that are not selected, and of the garment's look where it is copied or moved;
+        for messages, empty where nothing.
 
     Raises:
         SsilkError: the output cannot be written.
     """
     need_layer_suffix(out)
-    layer = _flattened(source, scene)
+    layer, variants = _flattened(source, scene)
     stage = Usd.Stage.Open(layer)
     skel = find_skeleton(stage, root=_prim_path(scene.character.skeleton.path))
     old, left_out, wanted = _in_stage(stage, source, scene.garment), "", None
@@ -84,11 +85,11 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     if look:
         left_out = look.keep(mesh.GetPrim())
     export(layer, out)
-    return left_out
+    return "; ".join(filter(None, [*variants, left_out]))
 
 
-def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
-    """Flatten the source into one layer, without instances on the paths of the rig."""
+def _flattened(source: str | Path, scene: Scene) -> tuple[Sdf.Layer, list[str]]:
+    """Flatten the source into one layer, without instances on the paths of the rig; also say what that loses."""
     stage = open_stage(source)
     stage.SetEditTarget(stage.GetSessionLayer())
     for path in (_prim_path(scene.character.path), _prim_path(scene.garment.mesh.path)):
@@ -98,7 +99,12 @@ def _flattened(source: str | Path, scene: Scene) -> Sdf.Layer:
     while instances := [prim for prim in Usd.PrimRange(top) if prim.IsInstance()]:
         for prim in instances:
             _expand(prim)
-    return stage.Flatten()
+    lost = [
+        f"{prim.GetName()} loses {', '.join(variants)}"
+        for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
+        if (variants := variants_of(prim))
+    ]
+    return stage.Flatten(), lost
 
 
 def _expand(prim: Usd.Prim) -> None:

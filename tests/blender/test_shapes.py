@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bodies and garments are read in the shape that Blender shows, whatever shape keys make it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+
+def fuller(thing: Any, value: float = 0.0, name: str = "Full", amount: float = 0.2) -> Any:
+    """Give an object a shape key that makes it wider, at some value."""
+    if not thing.data.shape_keys:
+        thing.shape_key_add(name="Basis")
+    key = thing.shape_key_add(name=name, from_mix=False)
+    for vertex, point in zip(thing.data.vertices, key.data):
+        point.co = vertex.co[0] * (1 + amount), vertex.co[1] * (1 + amount), vertex.co[2]
+    key.slider_min, key.value = -2.0, value
+    return key
+
+
+def masked(thing: Any) -> None:
+    thing.vertex_groups.new(name="Mask").add(list(range(0, len(thing.data.vertices), 2)), 0.5, "REPLACE")
+    fuller(thing, 1.0).vertex_group = "Mask"
+
+
+def pinned(thing: Any) -> None:
+    fuller(thing)
+    thing.active_shape_key_index, thing.show_only_shape_key = 1, True
+
+
+def driven(thing: Any) -> None:
+    fuller(thing).driver_add("value").driver.expression = "0.8"
+
+
+def keyed(thing: Any) -> None:
+    key = fuller(thing)
+    for frame, key.value in ((1, 1.0), (20, 0.2)):
+        key.keyframe_insert("value", frame=frame)
+
+
+def on_another(thing: Any) -> None:
+    fuller(thing, name="More", amount=0.4).relative_key = fuller(thing)
+    thing.data.shape_keys.key_blocks["More"].value = 0.5
+
+
+def refined(thing: Any) -> None:
+    fuller(thing, 0.7)
+    thing.modifiers.new("Smooth", "SUBSURF")
+
+
+CASES: dict[str, Callable[[Any], Any]] = {
+    "on": lambda thing: fuller(thing, 1.0),
+    "negative": lambda thing: fuller(thing, -0.5),
+    "muted": lambda thing: setattr(fuller(thing, 1.0), "mute", True),
+    "masked": masked, "pinned": pinned, "driven": driven, "keyed": keyed, "on another": on_another,
+}  # fmt: skip
+
+
+def shown_at_rest(bpy, thing) -> np.ndarray:
+    """Return where Blender shows vertices at rest [m], y up."""
+    rig = bpy.data.objects["Rig"].data
+    rig.pose_position = "REST"
+    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    points = np.array([evaluated.matrix_world @ vertex.co for vertex in evaluated.data.vertices])
+    rig.pose_position = "POSE"
+    return points[:, [0, 2, 1]] * [1, 1, -1]
+
+
+@pytest.mark.parametrize("name", ["Pillar", "Skirt"])
+@pytest.mark.parametrize("change", CASES.values(), ids=CASES)
+def test_a_mesh_is_read_in_the_shape_that_blender_shows(ready, skirt, change, name):
+    from blender_addon.scene.gather import gather
+
+    thing = ready.data.objects[name]
+    change(thing)
+    ready.context.scene.frame_set(1)
+    scene = gather(skirt, classes=False, proxies=False)
+    found = {"Skirt": scene.garment.mesh, "Pillar": scene.character.bodies[0].mesh}[name]
+    np.testing.assert_allclose(found.points, shown_at_rest(ready, thing), atol=1e-6)
+
+
+def test_what_refines_a_body_adds_no_vertices_to_its_shape(ready, skirt):
+    from blender_addon.scene.gather import gather
+
+    pillar = ready.data.objects["Pillar"]
+    refined(pillar)
+    mesh = gather(skirt, classes=False, proxies=False).character.bodies[0].mesh
+    pillar.modifiers["Smooth"].show_viewport = False
+    np.testing.assert_allclose(mesh.points, shown_at_rest(ready, pillar), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["Pillar", "Skirt"])
+def test_absolute_keys_are_refused(ready, skirt, name):
+    from blender_addon.errors import SetupError
+    from blender_addon.scene.gather import gather
+
+    thing = ready.data.objects[name]
+    fuller(thing)
+    thing.data.shape_keys.use_relative = False
+    with pytest.raises(SetupError, match=f"The shape keys of '{name}' are absolute"):
+        gather(skirt)
+
+
+@pytest.mark.parametrize("change", [keyed, driven])
+def test_shapes_that_change_are_told(ready, trained, change):
+    from blender_addon.motions.shapes import tell_changing_shapes
+
+    said: list[str] = []
+    operator = SimpleNamespace(report=lambda kind, text: said.append(text))
+    tell_changing_shapes(operator, trained)
+    assert not said
+    change(ready.data.objects["Pillar"])
+    tell_changing_shapes(operator, trained)
+    (told,) = said
+    assert told.startswith("The shape key 'Full' of 'Pillar' changes over time, which is not followed")
+
+
+def test_keys_that_correct_a_bake_come_after_the_shape_that_was_trained(ready, skirt):
+    from blender_addon.scene.shapes import earlier_shapes, worn_points
+
+    fuller(skirt, 1.0)
+    trained = worn_points(skirt)
+    fuller(skirt, 0.5, "Fix")
+    shapes = list(earlier_shapes(skirt))
+    np.testing.assert_array_equal(shapes[0], worn_points(skirt))
+    np.testing.assert_array_equal(shapes[1], trained)
+    assert np.abs(shapes[0] - trained).max() > 0.01
+
+
+def test_a_garment_that_was_trained_in_a_shape_is_baked_in_no_other(ready, trained):
+    fuller(trained, 1.0)
+    ready.context.scene.frame_end = 4
+    assert ready.ops.ssilk.bake(pre_roll=0.0) == {"FINISHED"}  # a key of later, which corrects the bake
+    reference = trained.data.shape_keys.reference_key
+    for point in reference.data:
+        point.co.x *= 1.2
+    with pytest.raises(RuntimeError, match="has another shape or place at rest than when it was trained"):
+        ready.ops.ssilk.bake(pre_roll=0.0)
+
+
+def test_a_body_in_another_shape_than_in_training_is_told(ready, trained, folder):
+    """The armature may stand elsewhere meanwhile, and the body with it."""
+    from blender_addon.playback.bodies import reshaped
+    from blender_addon.scene.armature import read_joints
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.handover import STAGE, hand_over
+    from blender_addon.scene.objects import Pair
+
+    rig, pillar = ready.data.objects["Rig"], ready.data.objects["Pillar"]
+    (folder / "given").mkdir()
+    hand_over(gather(trained), Pair.of(trained, rig), folder / "given")
+    for thing in (rig, pillar, trained):
+        thing.location.x += 3.0
+    ready.context.view_layer.update()
+    joints = read_joints(rig, trained).character
+    assert reshaped(trained, joints, folder / "given" / STAGE) == ""
+    fuller(pillar, 1.0)
+    found = reshaped(trained, joints, folder / "given" / STAGE)
+    assert found == " ('Pillar' is up to 30 mm off its shape in training, which the cloth met)"
