@@ -47,8 +47,8 @@ def intersecting(figures: dict[str, Any] | None) -> str:
 
 
 def other_methods() -> str:
-    """Energies of all methods, cloth through cloth, and their excess and velocities beside the simulator."""
-    energies, dynamics, rows = cells("table1"), cells("table2"), []
+    """Energies of all methods, and cloth through cloth."""
+    energies, rows = cells("table1"), []
     crossed = any("intersections_mean" in row for row in energies.values())
     iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
     for name, words in GARMENTS.items():
@@ -56,17 +56,11 @@ def other_methods() -> str:
             keys = [(IN_RESULTS[name], method, split) for split in SPLITS]
             row = ["" if number else words, shown, iterations.get((IN_RESULTS[name], method), "")]
             row += [digits(mean(energies[key]["total"])) for key in keys]
-            for key in keys[1:]:
-                row.append(digits(mean(energies[key]["total_excess"])) if "total_excess" in energies[key] else "")
-            for key in keys[1:]:
-                found = dynamics.get(key, {}).get("velocity_error")
-                row.append(fixed(mean(found), 2) if found else "")
             for key in keys[1:] if crossed else ():
                 own = {name: energies[key].get(f"intersections_{name}", ()) for name in ("mean", "worst")}
                 row.append(intersecting({name: mean(each) for name, each in own.items()} if own["mean"] else None))
             rows.append(row)
-    header = ("garment", "method", "iterations", "`valid` [J]", "`test` [J]", "flips [J]", "excess, `test` [J]",
-              "flips [J]", "velocity, `test` [m/s]", "flips [m/s]",
+    header = ("garment", "method", "iterations", "`valid` [J]", "`test` [J]", "flips [J]",
               *(("intersect, `test` [%]", "flips [%]") if crossed else ()))  # fmt: skip
     return table(header, rows, 2)
 
