@@ -17,7 +17,7 @@ SPLITS = {"test": "`test`", "flips": "flips"}
 SIMULATOR, OFF = "simulator", "simulator, 1 mm off"
 DEVICES = {"cpu": "one core", "cuda": "GPU"}
 SHOWN = {"refine 4": "`--refine 4`", **{level: f"`{level}`" for level in ("crowd", "game", "latent", "hero")}}
-SIZED = {"network": "as trained"}  # what `ssilk trade` calls it
+WHOLE, PACKED = "as trained", "hero"  # in `ssilk trade`: the whole model with its shots, and as it ships, in 16 bits
 DRAWN_AFTER = "10"  # frames
 PANEL = (3.5, 2.7)  # [inches]
 NAMED = {"2 in latents": "2", "4 in latents": "4"}  # in the picture, behind "1 in latents"
@@ -48,7 +48,6 @@ def dial() -> str:
         for number, (place, splits) in enumerate(places(garment).items()):
             own = [splits[split] for split in SPLITS if split in splits]
             spent = (took.get((place, device)) for device in DEVICES)
-            size = sizes.get((garment, SIZED.get(place, place)))
             rows.append([
                 "" if number else words,
                 SHOWN.get(place, place),
@@ -60,12 +59,23 @@ def dial() -> str:
                 _pair([percent(mean(row["limbs"]), 0) for row in own]),
                 _pair([percent(mean(row["intersecting"]), 1) for row in own]),
                 _pair([fixed(median(row["jitter"]), 1, 1e-3) for row in own]),
-                *(fixed(size[name], 1, 1e6) if size else "" for name in ("model_bytes", "shot_bytes")),
+                *_sizes(place, {variant: at for (model, variant), at in sizes.items() if model == garment}),
             ])  # fmt: skip
     header = ("garment", "place", "one core [ms]", "GPU [ms]", "after 10 [mm]", "30 [mm]", "velocity [m/s]",
               "energy [J]", "shows [%]", "limbs [%]", "intersect [%]", "jitter [mm]", "model [MB]",
               "shot [MB]")  # fmt: skip
     return table(header, rows, 2)
+
+
+def _sizes(place: str, variants: dict[str, Row]) -> tuple[str, str]:
+    """Return the sizes of the model and of a shot of a place [MB], with the variants of `ssilk trade`."""
+    if place == OFF:
+        return "", ""
+    reduced = place in ("crowd", "game")
+    solved = place in (SIMULATOR, "hero", "refine 4")  # whose shots are fitted to vertices
+    model = variants[place if reduced else PACKED]["model_bytes"]
+    shot = variants[place if reduced or place == SIMULATOR else PACKED if solved else WHOLE]["shot_bytes"]
+    return "" if place == SIMULATOR else fixed(model, 1, 1e6), fixed(shot, 1, 1e6)
 
 
 def _pair(figures: Sequence[str]) -> str:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The reference simulator: implicit Euler on the training energy, several shots at once.
 
-A shot starts with the quasi-static state of its first pose and the velocity of linear blend skinning, so that a
-character that starts walking does not leave its garment behind. Each step is solved relative to the character's root,
-where single precision is finest; between steps positions are kept in world space, in float64.
+A shot starts with the quasi-static state of its first pose, to which the garment is carried from the bind pose, and
+with the velocity of linear blend skinning, so that a character that starts walking does not leave its garment behind.
+Each step is solved relative to the character's root, where single precision is finest; between steps positions are
+kept in world space, in float64.
 """
 
 from __future__ import annotations
