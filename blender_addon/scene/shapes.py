@@ -52,7 +52,7 @@ def shape_bytes(thing: bpy.types.Object) -> bytes:
 
 
 def _mixes(thing: bpy.types.Object, *, baked: bool) -> Iterator[np.ndarray]:
-    """Yield the points without keys, with the first that is on, with the first two, and so on; or as one is pinned."""
+    """Yield the points without keys, with the first that is on, with two, and so on; or as one is pinned."""
     mixed, keys, pinned = rest_points(thing), thing.data.shape_keys, thing.active_shape_key
     if keys and thing.show_only_shape_key and pinned is not None:
         if not pinned.mute and (baked or not pinned.name.startswith(PREFIX)):

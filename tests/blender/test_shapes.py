@@ -35,7 +35,7 @@ def pinned(thing: Any) -> None:
 
 
 def pinned_and_masked(thing: Any) -> None:
-    """What is masked out of a pinned key has the shape of the reference key, whatever the pinned one is relative to."""
+    """What is masked out of a pinned key has the shape of the reference key, whatever that is relative to."""
     on_another(thing)
     thing.vertex_groups.new(name="Mask").add(list(range(0, len(thing.data.vertices), 2)), 0.5, "REPLACE")
     thing.data.shape_keys.key_blocks["More"].vertex_group = "Mask"
