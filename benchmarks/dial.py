@@ -79,10 +79,14 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
     """Measure the places that the garment's file lacks; the simulator goes on from several at once."""
     need_predicates()
     bench = DialBench(options, report)
-    known = {row.place for row in bench.rows}
+    measured = {(row.split, row.place) for row in bench.rows}
+    names = {place for _, place in bench.names}
+    known = {name for name in names if all((split, name) in measured for split in bench.splits)}
     missing = [place for place in PLACES if place.name not in known and place.name in options.places]
     if {SIMULATOR, OFF} - known:
         missing = [NETWORK, *(place for place in missing if place != NETWORK)]
+        known -= {NETWORK.name, SIMULATOR, OFF}  # the three are measured together
+    bench.rows = [row for row in bench.rows if row.place in known]
     count = sum(map(len, bench.windows.windows.values()))
     frames = max(take.frame_count for take in bench.windows.takes)
     report(Message(f"{bench.subject.name}: {count} windows, of takes of {frames} frames at most"))

@@ -11,21 +11,31 @@ from ..scene.garment import armature_of, bodies_of
 from ..scene.meshes import PREFIX
 from .keys import SLOTS, curves_of
 
+STEADY = 1e-6  # of a key's value: rounding
+
 
 def changing_shapes(thing: bpy.types.Object) -> list[str]:
-    """Return the names of an object's own shape keys that keys or drivers change."""
+    """Return the names of an object's own shape keys that keys or drivers change; none where one is pinned."""
     keys = thing.data.shape_keys
     animation = keys.animation_data if keys else None
-    if keys is None or animation is None:
+    if keys is None or animation is None or thing.show_only_shape_key:
         return []
-    players: list[Any] = [animation, *(strip for track in animation.nla_tracks for strip in track.strips)]
+    tracks = [track for track in animation.nla_tracks if not track.mute]
+    players: list[Any] = [animation, *(strip for track in tracks for strip in track.strips if not strip.mute)]
     curves = list(animation.drivers)
     for player in players:
         if player.action and not (SLOTS and player.action_slot is None):
-            curves += curves_of(player.action, player.action_slot if SLOTS else None)
+            played = curves_of(player.action, player.action_slot if SLOTS else None)
+            curves += [curve for curve in played if not _is_constant(curve)]
     paths = {curve.data_path for curve in curves}
     own = [key for key in keys.key_blocks if not key.name.startswith(PREFIX) and not key.mute]
     return [key.name for key in own if key.path_from_id("value") in paths]
+
+
+def _is_constant(curve: bpy.types.FCurve) -> bool:
+    """Return whether a curve keeps one value, as where an artist keyed a shape once."""
+    values = {value for key in curve.keyframe_points for value in (key.co.y, key.handle_left.y, key.handle_right.y)}
+    return bool(values) and max(values) - min(values) < STEADY and not curve.modifiers
 
 
 def tell_changing_shapes(operator: bpy.types.Operator, garment: bpy.types.Object) -> None:

@@ -42,7 +42,7 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
         if mesh is None or reshapes(thing) or mesh.vertex_count != len(thing.data.vertices):
             continue
         world = np.array(rest_world(thing))
-        points = scene_units().points_to_core(mixed_points(thing) @ world[:3, :3].T + world[:3, 3])
+        points = scene_units().points_to_core(mixed_points(thing, baked=False) @ world[:3, :3].T + world[:3, 3])
         away = np.linalg.norm(points @ back[:3, :3].T + back[:3, 3] - mesh.points, axis=1).max()
         if away > SAME:
             return f" ('{thing.name}' is up to {1000 * away:.0f} mm off its shape in training, which the cloth met)"

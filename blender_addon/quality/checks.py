@@ -24,7 +24,7 @@ from ..scene.armature import is_evenly_scaled
 from ..scene.garment import armature_of
 from ..scene.gather import read_mesh
 from ..scene.modifiers import objections
-from ..scene.shapes import mixed_points
+from ..scene.shapes import mixed_points, shape_bytes
 
 SCALE, MODIFIER = "unequal-scale", "shaping-modifier"
 
@@ -73,7 +73,7 @@ CHECKS: dict[str, Callable[[Mesh], Iterator[Finding]]] = {
 
 
 def mark_of(name: str) -> str:
-    """Return what differs once an object's mesh or place has changed; empty where there is no such mesh."""
+    """Return what differs once an object's mesh, shape or place has changed; empty where there is no such mesh."""
     thing = bpy.data.objects.get(name)
     if not thing or thing.type != "MESH":
         return ""
@@ -82,7 +82,10 @@ def mark_of(name: str) -> str:
     mesh.vertices.foreach_get("co", points)
     mesh.loops.foreach_get("vertex_index", corners)
     place = np.array(thing.matrix_world, np.float32)
-    return f"{zlib.crc32(place.tobytes(), zlib.crc32(corners.tobytes(), zlib.crc32(points.tobytes()))):08x}"
+    mark = 0
+    for part in (points.tobytes(), shape_bytes(thing), corners.tobytes(), place.tobytes()):
+        mark = zlib.crc32(part, mark)
+    return f"{mark:08x}"
 
 
 def look_again(preflight: bpy.types.PropertyGroup) -> bool:

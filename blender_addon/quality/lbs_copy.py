@@ -14,6 +14,7 @@ from ..playback.models import TrainedGarment, model_of
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
 from ..scene.linked import local_copy, open_collection, own_copy
+from ..scene.meshes import need_relative
 from ..scene.shapes import worn_points
 from ..scene.weights import write_groups
 from .heat import ATTRIBUTE
@@ -31,8 +32,9 @@ def show_copy(garment: bpy.types.Object) -> None:
     """Show a copy without proxies and shapes to the side. In object mode.
 
     Raises:
-        SsilkError: there is no model, it cannot be read, or it is of other bones.
+        SsilkError: there is no model, it cannot be read, or it is of other bones; shape keys are absolute.
     """
+    need_relative(garment)
     armature = armature_of(garment)
     joints = read_joints(armature, garment)
     copy = _lbs_copy(garment, TrainedGarment(model_of(garment), garment, armature, joints))

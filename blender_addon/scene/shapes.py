@@ -3,38 +3,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 
 import bpy
 import numpy as np
 
 from .meshes import PREFIX, need_relative, rest_points
-from .weights import read_groups
+from .weights import has_weights, read_groups
 
 
-def mixed_points(thing: bpy.types.Object, *, baked: bool = True, without: Collection[str] = ()) -> np.ndarray:
+def mixed_points(thing: bpy.types.Object, *, baked: bool = True) -> np.ndarray:
     """Return the points as shape keys shape them now, in the object's own space, shape (V, 3).
 
     Args:
         baked: with the keys of a bake, or the artist's own alone.
-        without: names of keys that are left out, unless one is pinned.
     """
-    mixed, keys = rest_points(thing), thing.data.shape_keys
-    if keys is None:
-        return mixed
-    if thing.show_only_shape_key and thing.active_shape_key is not None:
-        pinned = thing.active_shape_key
-        is_left = pinned.mute or (pinned.name.startswith(PREFIX) and not baked)
-        return mixed if is_left else _points_of(pinned)
-    for key in keys.key_blocks:
-        if key.name in without:
-            continue
-        if key.value and not key.mute and key != keys.reference_key and (baked or not key.name.startswith(PREFIX)):
-            share = key.value
-            if key.vertex_group in thing.vertex_groups:
-                share = share * read_groups(thing, thing.data, [key.vertex_group])
-            mixed += share * (_points_of(key) - _points_of(key.relative_key))
-    return mixed
+    return deque(_mixes(thing, baked=baked), maxlen=1)[0]
 
 
 def worn_points(thing: bpy.types.Object) -> np.ndarray:
@@ -47,12 +32,58 @@ def worn_points(thing: bpy.types.Object) -> np.ndarray:
     return mixed_points(thing, baked=False)
 
 
-def earlier_shapes(thing: bpy.types.Object) -> Iterator[np.ndarray]:
-    """Yield `worn_points`, then without the last of the artist's keys, and so on: corrections of a bake come last."""
+def earlier_shapes(thing: bpy.types.Object) -> list[np.ndarray]:
+    """Return `worn_points`, then without the last of the artist's keys that are on, and so on down to none.
+
+    Keys that correct a bake come last.
+    """
+    return [*_mixes(thing, baked=False)][::-1]
+
+
+def shape_bytes(thing: bpy.types.Object) -> bytes:
+    """Return what differs once the artist's keys are set or edited; not for masks that are painted, slow to read."""
+    pinned, keys = thing.active_shape_key, _keys_on(thing, baked=False)
+    if thing.show_only_shape_key and pinned is not None:
+        keys = [pinned]
+    settings = [(key.name, key.value, key.mute, key.vertex_group, key.relative_key.name) for key in keys]
+    return b"".join(
+        [repr((thing.show_only_shape_key, settings)).encode(), *(_points_of(key).tobytes() for key in keys)]
+    )
+
+
+def _mixes(thing: bpy.types.Object, *, baked: bool) -> Iterator[np.ndarray]:
+    """Yield the points without keys, with the first that is on, with two, and so on; or as one is pinned."""
+    mixed, keys, pinned = rest_points(thing), thing.data.shape_keys, thing.active_shape_key
+    if keys and thing.show_only_shape_key and pinned is not None:
+        if not pinned.mute and (baked or not pinned.name.startswith(PREFIX)):
+            mixed = mixed + _masks(thing, [pinned]).get(pinned.vertex_group, 1.0) * (_points_of(pinned) - mixed)
+        yield mixed
+        return
+    yield mixed
+    on = _keys_on(thing, baked=baked)
+    masks = _masks(thing, on)
+    for key in on:
+        share = key.value * masks.get(key.vertex_group, 1.0)
+        mixed = mixed + share * (_points_of(key) - _points_of(key.relative_key))
+        yield mixed
+
+
+def _keys_on(thing: bpy.types.Object, *, baked: bool) -> list[bpy.types.ShapeKey]:
+    """Return the keys that shape a mesh now, where none is pinned."""
     keys = thing.data.shape_keys
-    own = [key.name for key in keys.key_blocks if not key.name.startswith(PREFIX)] if keys else []
-    for count in range(len(own) + 1):
-        yield mixed_points(thing, baked=False, without=own[len(own) - count :])
+    on = [key for key in keys.key_blocks if key.value and not key.mute and key != keys.reference_key] if keys else []
+    return [key for key in on if baked or not key.name.startswith(PREFIX)]
+
+
+def _masks(thing: bpy.types.Object, keys: Sequence[bpy.types.ShapeKey]) -> dict[str, np.ndarray]:
+    """Return how far keys shape each vertex, shape (V, 1), by vertex group.
+
+    Keys without a group shape all, and so do all of a mesh without weights, as in Blender.
+    """
+    names = sorted({key.vertex_group for key in keys} & set(thing.vertex_groups.keys()))
+    if not names or not has_weights(thing.data):
+        return {}
+    return dict(zip(names, read_groups(thing, thing.data, names).T[..., None]))
 
 
 def _points_of(key: bpy.types.ShapeKey) -> np.ndarray:

@@ -38,6 +38,12 @@ def read_groups(thing: bpy.types.Object, mesh: bpy.types.Mesh, names: Sequence[s
     return matrix
 
 
+def has_weights(mesh: bpy.types.Mesh) -> bool:
+    """Return whether a mesh holds weights of vertex groups at all, be they of no vertex."""
+    with opened(mesh) as content:
+        return content.verts.layers.deform.active is not None
+
+
 def _elements(mesh: bpy.types.Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return of how many groups each vertex is, shape (V,), and one after another these and its weights."""
     counts: list[int] = []

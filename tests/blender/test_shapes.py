@@ -34,6 +34,20 @@ def pinned(thing: Any) -> None:
     thing.active_shape_key_index, thing.show_only_shape_key = 1, True
 
 
+def pinned_and_masked(thing: Any) -> None:
+    """What is masked out of a pinned key has the shape of the reference key, whatever that is relative to."""
+    on_another(thing)
+    thing.vertex_groups.new(name="Mask").add(list(range(0, len(thing.data.vertices), 2)), 0.5, "REPLACE")
+    thing.data.shape_keys.key_blocks["More"].vertex_group = "Mask"
+    thing.active_shape_key_index, thing.show_only_shape_key = 2, True
+
+
+def masked_by_no_weights(thing: Any) -> None:
+    """Blender masks nothing in a mesh whose vertices are in no group."""
+    thing.vertex_groups.new(name="Mask")
+    fuller(thing, 1.0).vertex_group = "Mask"
+
+
 def driven(thing: Any) -> None:
     fuller(thing).driver_add("value").driver.expression = "0.8"
 
@@ -58,7 +72,8 @@ CASES: dict[str, Callable[[Any], Any]] = {
     "on": lambda thing: fuller(thing, 1.0),
     "negative": lambda thing: fuller(thing, -0.5),
     "muted": lambda thing: setattr(fuller(thing, 1.0), "mute", True),
-    "masked": masked, "pinned": pinned, "driven": driven, "keyed": keyed, "on another": on_another,
+    "masked": masked, "pinned": pinned, "pinned and masked": pinned_and_masked,
+    "masked by no weights": masked_by_no_weights, "driven": driven, "keyed": keyed, "on another": on_another,
 }  # fmt: skip
 
 
@@ -121,6 +136,68 @@ def test_shapes_that_change_are_told(ready, trained, change):
     assert told.startswith("The shape key 'Full' of 'Pillar' changes over time, which is not followed")
 
 
+def test_shapes_that_only_could_change_are_not_told(ready, skirt):
+    from blender_addon.motions.shapes import changing_shapes
+
+    key = fuller(skirt, 1.0)
+    for frame in (1, 20):
+        key.keyframe_insert("value", frame=frame)
+    assert changing_shapes(skirt) == []  # one value throughout
+    key.value = 0.2
+    key.keyframe_insert("value", frame=20)
+    assert changing_shapes(skirt) == ["Full"]
+    skirt.show_only_shape_key = True
+    assert changing_shapes(skirt) == []
+    skirt.show_only_shape_key = False
+    animation = skirt.data.shape_keys.animation_data
+    track = animation.nla_tracks.new()
+    track.strips.new("Strip", 1, animation.action)
+    animation.action = None
+    assert changing_shapes(skirt) == ["Full"]
+    track.mute = True
+    assert changing_shapes(skirt) == []
+
+
+def test_a_mesh_is_another_once_its_keys_shape_it_otherwise(ready, skirt):
+    """By this mark findings of the preflight are looked at again."""
+    from blender_addon.quality.checks import mark_of
+
+    key, marks = fuller(skirt), [mark_of("Skirt")]
+    fuller(skirt, 0.7, "SSILK 1")  # a bake is no other shape
+    assert mark_of("Skirt") == marks[0]
+    key.value = 1.0
+    marks.append(mark_of("Skirt"))
+    key.data[0].co.x += 0.1
+    marks.append(mark_of("Skirt"))
+    skirt.active_shape_key_index, skirt.show_only_shape_key = 0, True
+    marks.append(mark_of("Skirt"))
+    assert len(set(marks)) == 4
+
+
+def test_groups_that_mask_keys_are_read_once(ready, skirt, monkeypatch):
+    """For each key, a face of forty keys and 50,000 vertices took five seconds, and a bake three minutes."""
+    from blender_addon.scene import shapes
+
+    read: list[object] = []
+    own = shapes.read_groups
+    monkeypatch.setattr(shapes, "read_groups", lambda *args: read.append(args) or own(*args))
+    masked(skirt)
+    fuller(skirt, 0.5, "More").vertex_group = "Mask"
+    assert len(shapes.earlier_shapes(skirt)) == 3 and len(read) == 1
+
+
+def test_an_lbs_copy_of_absolute_keys_leaves_nothing_behind(ready, trained):
+    from blender_addon.errors import SetupError
+    from blender_addon.quality.lbs_copy import show_copy
+
+    fuller(trained)
+    trained.data.shape_keys.use_relative = False
+    before = {thing.name for thing in (*ready.data.objects, *ready.data.meshes)}
+    with pytest.raises(SetupError, match="are absolute"):
+        show_copy(trained)
+    assert {thing.name for thing in (*ready.data.objects, *ready.data.meshes)} == before
+
+
 def test_keys_that_correct_a_bake_come_after_the_shape_that_was_trained(ready, skirt):
     from blender_addon.scene.shapes import earlier_shapes, worn_points
 
@@ -163,3 +240,21 @@ def test_a_body_in_another_shape_than_in_training_is_told(ready, trained, folder
     fuller(pillar, 1.0)
     found = reshaped(trained, joints, folder / "given" / STAGE)
     assert found == " ('Pillar' is up to 30 mm off its shape in training, which the cloth met)"
+
+
+def test_the_bake_of_a_body_is_no_other_shape_of_it(ready, trained, folder):
+    from blender_addon.playback.bodies import reshaped
+    from blender_addon.scene.armature import read_joints
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.handover import STAGE, hand_over
+    from blender_addon.scene.objects import Pair
+
+    rig, pillar = ready.data.objects["Rig"], ready.data.objects["Pillar"]
+    (folder / "renamed").mkdir()
+    hand_over(gather(trained), Pair.of(trained, rig), folder / "renamed")
+    trained.name = "Gown"  # the body is found all the same
+    joints = read_joints(rig, trained).character
+    fuller(pillar, 1.0, "SSILK 1")  # as where it is another garment
+    assert reshaped(trained, joints, folder / "renamed" / STAGE) == ""
+    fuller(pillar, 1.0)
+    assert "'Pillar' is up to 30 mm off" in reshaped(trained, joints, folder / "renamed" / STAGE)

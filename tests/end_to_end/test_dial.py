@@ -80,6 +80,17 @@ def test_what_was_cut_off_goes_on(measured, script, world, capsys):
             assert row["distance"]["4"] == pytest.approx(known["distance"]["4"], rel=1e-3)
 
 
+def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measured, script, world):
+    cut = {**measured, "unfinished": "yes"}
+    gone = (("flips", "crowd"), ("flips", "simulator, 1 mm off"))
+    cut["figures"] = [row for row in measured["figures"] if (row["split"], row["place"]) not in gone]
+    (world / "between.json").write_text(json.dumps(cut))
+    script(f"errors {OPTIONS} --output between.json --batch 1")
+    found = json.loads((world / "between.json").read_text())
+    names = [(row["split"], row["place"]) for row in found["figures"]]
+    assert "unfinished" not in found and names == [(row["split"], row["place"]) for row in measured["figures"]]
+
+
 @pytest.mark.parametrize(("shots", "at_once"), [("", 1), ("--shots 3", 3)])
 def test_times_are_kept_beside_the_errors(measured, script, world, shots, at_once):
     path = world / f"times{at_once}.json"

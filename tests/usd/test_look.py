@@ -349,6 +349,38 @@ def test_materials_of_renderers_and_subsets_that_are_only_looked_at_are_no_fault
     assert "OmniPBR.mdl" in told and "invalid family type" in told and "sdrRegistry" not in told
 
 
+def test_a_shader_whose_inputs_have_other_types_is_no_fault_of_a_shot(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Surface")).CreateInput("roughness", TINT.Double).Set(0.5)
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usda")
+    (found,) = check_shot(tmp_path / "shot.usda")
+    assert (found.severity, found.prim) == ("warning", "/Hero/Looks/Cape_cloth/Surface.inputs:roughness")
+
+
+def test_relationships_to_what_is_written_of_a_look_are_kept(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    for name, target in (("part", "/Hero/Cape/trim"), ("cloth", "/Looks/Body_cloth/Surface.inputs:diffuseColor")):
+        cape.CreateRelationship(f"rigging:{name}").SetTargets([target])
+    stage.Save()
+    assert not shoot(worn(hero), tmp_path / "shot.usda").left_out
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    written = shot.GetPrimAtPath("/Hero/Cape")
+    assert written.GetRelationship("rigging:part").GetTargets() == [Sdf.Path("/Hero/Cape/trim")]
+    kept = written.GetRelationship("rigging:cloth").GetTargets()
+    assert kept == [Sdf.Path("/Hero/Looks/Body_cloth/Surface.inputs:diffuseColor")]
+
+
+def test_a_variant_set_without_selection_is_told_so(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    stage.GetPrimAtPath("/Hero/Cape").GetVariantSets().AddVariantSet("shade").AddVariant("a")
+    stage.Save()
+    assert shoot(worn(hero), tmp_path / "shot.usda").left_out == (
+        "Cape loses the variant set shade, of which none is kept"
+    )
+
+
 def test_cloth_without_a_look_is_seen_from_both_sides(hero, tmp_path):
     stage = Usd.Stage.Open(str(hero))
     stage.GetPrimAtPath("/Hero/Cape").RemoveProperty("doubleSided")

@@ -63,17 +63,22 @@ def _validate(stage: Usd.Stage) -> Iterator[ShotFinding]:
     errors = UsdValidation.ValidationContext(validators).Validate(stage)
     del quiet
     for error in errors:
-        prims = [site.GetPrim() for site in error.GetSites() if site.IsPrim()]
+        places = [
+            site.GetPrim() if site.IsPrim() else site.GetProperty()
+            for site in error.GetSites()
+            if site.IsPrim() or site.IsProperty()
+        ]
         severity = _SEVERITIES.get(error.GetType())
         if not severity or error.GetName() in _OF_PLUGINS:
             continue
-        is_of_look = error.GetName() in _OF_LOOKS or (prims and all(map(_is_in_material, prims)))
-        paths = ", ".join(str(prim.GetPath()) for prim in prims)
+        is_of_look = error.GetName() in _OF_LOOKS or (places and all(map(_is_in_material, places)))
+        paths = ", ".join(str(place.GetPath()) for place in places)
         yield ShotFinding("warning" if is_of_look else severity, paths, error.GetMessage())
 
 
-def _is_in_material(prim: Usd.Prim) -> bool:
-    return any(prim.GetStage().GetPrimAtPath(path).IsA(UsdShade.Material) for path in prim.GetPath().GetPrefixes())
+def _is_in_material(place: Usd.Prim | Usd.Property) -> bool:
+    paths = place.GetPath().GetPrimPath().GetPrefixes()
+    return any(place.GetStage().GetPrimAtPath(path).IsA(UsdShade.Material) for path in paths)
 
 
 def _check_stage(stage: Usd.Stage) -> Iterator[ShotFinding]:

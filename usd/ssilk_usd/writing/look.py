@@ -9,7 +9,7 @@ they would not turn with the cloth.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -121,11 +121,13 @@ def copy_looks(
         above = [opened.GetPrimAtPath(prefix) for prefix in look.prim.GetPath().GetPrefixes()]
         for variants in map(variants_of, above):
             left.add(path.name, *variants)
-        _keep_targets(stage, look, path, looks, left)
         _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
         _copy_subsets(flat, stage, look, path)
         _bind_materials(flat, stage, root, look, path, materials, left)
         _keep_stand_in(stage, look, path, looks)
+    written = {look.prim.GetPath(): path for path, look in looks} | materials
+    for path, look in looks:
+        _keep_targets(stage, look, path, written, left)
     folder = os.path.abspath(os.path.dirname(output))
     UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
     return left
@@ -135,19 +137,26 @@ def variants_of(prim: Usd.Prim) -> list[str]:
     """Return in words which variant sets of a prim a copy of what is selected in them lacks."""
     sets = prim.GetVariantSets()
     names = sets.GetNames()
-    return [f"the variant set {name}, of which '{sets.GetVariantSelection(name)}' is kept" for name in names]
+    kept = {name: sets.GetVariantSelection(name) for name in names}
+    return [
+        f"the variant set {name}, of which {repr(kept[name]) if kept[name] else 'none'} is kept" for name in names
+    ]
 
 
 def _keep_targets(
-    stage: Usd.Stage, look: LookSource, path: Sdf.Path, looks: Sequence[tuple[Sdf.Path, LookSource]], left: LeftOut
+    stage: Usd.Stage, look: LookSource, path: Sdf.Path, written: Mapping[Sdf.Path, Sdf.Path], left: LeftOut
 ) -> None:
-    """Let relationships of a mesh name what is written; those that would name nothing are left out."""
-    prim, written = stage.GetPrimAtPath(path), {other.prim.GetPath(): to for to, other in looks}
+    """Let relationships of a mesh name what is written; those that would name nothing are left out.
+
+    Args:
+        written: where meshes and materials of the source are written, with all that is in them.
+    """
+    prim = stage.GetPrimAtPath(path)
     for relationship in prim.GetAuthoredRelationships():
         source = look.prim.GetRelationship(relationship.GetName())
         if not source or relationship.GetName().startswith(_OTHER_SPACES) or relationship.GetName() in _OTHERS:
             continue
-        named = [written.get(target, target) for target in source.GetForwardedTargets()]
+        named = [_rewritten(target, written) for target in source.GetForwardedTargets()]
         kept = [target for target in named if stage.GetObjectAtPath(target)]
         if kept:
             relationship.SetTargets(kept)
@@ -156,6 +165,12 @@ def _keep_targets(
         if len(kept) < len(named):
             missing = next(target for target in named if target not in kept)
             left.add(path.name, f"{relationship.GetName()} to {missing}, which is not written with it")
+
+
+def _rewritten(target: Sdf.Path, written: Mapping[Sdf.Path, Sdf.Path]) -> Sdf.Path:
+    """Return where a prim or property is written; as it is where nobody knows."""
+    above = [path for path in target.GetPrimPath().GetPrefixes() if path in written]
+    return target.ReplacePrefix(above[-1], written[above[-1]]) if above else target
 
 
 def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:
