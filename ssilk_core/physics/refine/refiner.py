@@ -195,7 +195,14 @@ class Refiner:
         Args:
             motions: at the rate of the refinement, without cuts, by decreasing length.
             networks: garment vertices of each frame of each shot in world space [m], shape (V, 3).
+
+        Raises:
+            SsilkError: the refinement has no feedback, whose frames need no order, or the shots are not in theirs.
         """
+        counts = [motion.frame_count for motion in motions]
+        if not self.options.feedback or counts != sorted(counts, reverse=True):
+            found = f"shots of {counts} frames, {'with' if self.options.feedback else 'without'} feedback"
+            fail("refinement", found, "shots are refined at once with feedback, the longest first")
         tail, points = None, [iter(network) for network in networks]
         for number in range(motions[0].frame_count):
             running = [motion for motion in motions if motion.frame_count > number]

@@ -139,6 +139,10 @@ def test_shots_at_once_are_what_each_is_by_itself(scene, rollout) -> None:
         alone, changes = refined(scene, *shot, iterations=3, feedback=True)
         assert np.abs(found - alone).max() < 1e-5
         assert frames[2][number].change.after == pytest.approx(changes[2].after, rel=1e-4)
+    with pytest.raises(SsilkError, match="the longest first"):
+        next(refiner.shots_at_once(*zip(*shots[::-1])))
+    with pytest.raises(SsilkError, match="without feedback"):
+        next(Refiner(scene, CLOTH, RefineOptions(iterations=3), fps=motion.fps).shots_at_once(*zip(*shots)))
 
 
 def test_a_cut_is_not_looked_back_over(scene, rollout) -> None:
