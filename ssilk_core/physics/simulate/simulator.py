@@ -33,7 +33,7 @@ from .newton import Solution, SolverOptions, minimise_from
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
 POSES = 8  # from the bind pose to one in which cloth comes to rest
-ON_THE_WAY = 5  # iterations for each of these but the last
+ON_THE_WAY = 10  # iterations for each of these but the last
 
 
 @dataclass(frozen=True, kw_only=True)

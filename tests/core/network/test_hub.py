@@ -16,6 +16,7 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import garment_poses
 from ssilk_core.network.runtime import Player
 from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.quality.stress.drives import ProceduralMotion, about, rotate_character
 from ssilk_core.scene.assets import Motion, Scene, Skeleton, SkinWeights
 from ssilk_core.scene.fabrics import FABRICS, Fabric
@@ -145,7 +146,7 @@ def test_a_rollout_is_the_same_in_torch_and_in_numpy(scene, toy_model, toy_motio
 
 def test_the_air_moves_along_with_a_runner(scene, toy_motion):
     """Cloth of a runner whose first joint stands still felt a headwind of the runner's own speed."""
-    options = SimulationOptions(fps=30)
+    options = SimulationOptions(fps=30, quasi_static_solver=SolverOptions(tolerance=1e-4, iterations=300))
     fabric = Fabric("toy", bending=1e-4, margin=0.01, drag=2.0)
     motion = running(toy_motion, scene, 6)
     (plain,) = simulate(scene, fabric, [motion], options)

@@ -70,7 +70,7 @@ def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model,
     for frame, (still, seen) in enumerate(zip(rest, pose)):
         cloth = model.seen_from(states[-2], states[-1], body[frame : frame + 3])
         states.append(model.step(states[-2], states[-1], still, seen, cloth))
-    torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(torch.stack(rolled), torch.stack(states), rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.parametrize("translations", [False, True])

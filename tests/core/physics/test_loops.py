@@ -129,8 +129,8 @@ def test_results_do_not_depend_on_the_number_of_threads(body, queries):
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
 
 
-def test_a_step_does_not_depend_on_the_number_of_threads(scene, toy_model, toy_motion, toy_objective):
-    """Energies, contact, skinning and proxies, forward and backward."""
+def test_a_step_depends_on_the_number_of_threads_by_rounding_alone(scene, toy_model, toy_motion, toy_objective):
+    """Energies, contact, skinning and proxies, forward and backward; PyTorch splits its products by threads."""
     model = toy_model(scene, translations=True)
     objective = toy_objective(scene, model, toy_motion(scene, 40))
     frames, down = torch.arange(3, 36), torch.tensor([[0.0, -1.0, 0.0]]).expand(33, 3)
@@ -140,7 +140,9 @@ def test_a_step_does_not_depend_on_the_number_of_threads(scene, toy_model, toy_m
         model.zero_grad()
         sum(values.sum() for values in objective.static(frames, down).values()).backward()
         results.append([value.grad.clone() for value in model.parameters() if value.grad is not None])
-    assert len(results[0]) > 5 and all(torch.equal(*pair) for pair in zip(*results))
+    assert len(results[0]) > 5
+    for one, other in zip(*results):
+        torch.testing.assert_close(one, other, rtol=0, atol=3e-6 * float(one.abs().max()))
 
 
 def test_loops_take_the_threads_that_pytorch_leaves_to_them():

@@ -359,10 +359,11 @@ def test_pairs_are_looked_for_once_at_the_same_positions(scene, toy_grid, monkey
 
 
 def test_shots_of_different_lengths_go_on_with_it(scene, toy_motion):
-    simulator = Simulator(scene, FABRIC, SimulationOptions(self_contact=True))
+    at_rest = SolverOptions(tolerance=1e-4, iterations=300)  # what the tolerance leaves a rest state is millimetres
+    simulator = Simulator(scene, FABRIC, SimulationOptions(self_contact=True, quasi_static_solver=at_rest))
     motions = [toy_motion(scene, 3), toy_motion(scene, 2)]  # the second one is the beginning of the first
     found = {(frame.shot, frame.number): frame for frame in simulator.frames(motions)}
     assert sorted(found) == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1)]
     for (_, number), frame in found.items():
-        np.testing.assert_allclose(frame.points, found[0, number].points, atol=1e-5)
+        np.testing.assert_allclose(frame.points, found[0, number].points, atol=1e-4)
         assert frame.residual < 1e-2
