@@ -47,9 +47,7 @@ def tell_changing_shapes(operator: bpy.types.Operator, garment: bpy.types.Object
     things = [*bodies, garment]
     for body in bodies:
         for name in unmet_modifiers(body):
-            text = (
-                f"The modifier '{name}' of '{body.name}' comes after its bones; cloth meets the body without it"
-            )
+            text = f"The modifier '{name}' of '{body.name}' comes after its bones; cloth meets the body without it"
             operator.report({"WARNING"}, f"{text}. Move it above the Armature modifier, or apply it.")
     names = [f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing)]
     if names:

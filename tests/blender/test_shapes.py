@@ -189,9 +189,7 @@ def test_what_shapes_a_body_after_its_bones_is_told(ready, trained, kind):
     pillar = ready.data.objects["Pillar"]
     pillar.modifiers.new("Late", kind)
     (told,) = said_of(trained)
-    assert told.startswith(
-        "The modifier 'Late' of 'Pillar' comes after its bones; cloth meets the body"
-    )
+    assert told.startswith("The modifier 'Late' of 'Pillar' comes after its bones; cloth meets the body")
     pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
     assert not said_of(trained)
 
