@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Shape keys of the artist that change over time: cloth meets the shape of the frame that it was read in."""
+"""Shapes that are not followed: shape keys that change over time, and what shapes a body after its bones."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import bpy
 
 from ..scene.garment import armature_of, bodies_of
 from ..scene.meshes import PREFIX
+from ..scene.modifiers import unmet_modifiers
 from .keys import SLOTS, curves_of
 
 STEADY = 1e-6  # of a key's value: rounding
@@ -20,16 +21,18 @@ def changing_shapes(thing: bpy.types.Object) -> list[str]:
     animation = keys.animation_data if keys else None
     if keys is None or animation is None or thing.show_only_shape_key:
         return []
-    tracks = [track for track in animation.nla_tracks if not track.mute]
+    tracks = [track for track in animation.nla_tracks if animation.use_nla and not track.mute]
     players: list[Any] = [animation, *(strip for track in tracks for strip in track.strips if not strip.mute)]
-    curves = list(animation.drivers)
+    curves: list[Any] = list(animation.drivers)
     for player in players:
         if player.action and not (SLOTS and player.action_slot is None):
             played = curves_of(player.action, player.action_slot if SLOTS else None)
             curves += [curve for curve in played if not _is_constant(curve)]
-    paths = {curve.data_path for curve in curves}
-    own = [key for key in keys.key_blocks if not key.name.startswith(PREFIX) and not key.mute]
-    return [key.name for key in own if key.path_from_id("value") in paths]
+    paths = {curve.data_path for curve in curves if not curve.mute}
+    own = [key for key in keys.key_blocks if not key.name.startswith(PREFIX)]
+    mutes = {key.name for key in own if key.path_from_id("mute") in paths}
+    values = {key.name for key in own if key.path_from_id("value") in paths and not key.mute}
+    return [key.name for key in own if key.name in mutes | values]
 
 
 def _is_constant(curve: bpy.types.FCurve) -> bool:
@@ -39,8 +42,13 @@ def _is_constant(curve: bpy.types.FCurve) -> bool:
 
 
 def tell_changing_shapes(operator: bpy.types.Operator, garment: bpy.types.Object) -> None:
-    """Report which shapes of a garment and its bodies change, and are not followed."""
-    things = [*bodies_of(garment, armature_of(garment)), garment]
+    """Report which shapes of a garment and its bodies change, or come after bones, and are not followed."""
+    bodies = bodies_of(garment, armature_of(garment))
+    things = [*bodies, garment]
+    for body in bodies:
+        for name in unmet_modifiers(body):
+            text = f"The modifier '{name}' of '{body.name}' comes after its bones; cloth meets the body without it"
+            operator.report({"WARNING"}, f"{text}. Move it above the Armature modifier, or apply it.")
     names = [f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing)]
     if names:
         more = f" and {len(names) - 1} more change" if len(names) > 1 else " changes"

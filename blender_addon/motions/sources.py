@@ -148,8 +148,11 @@ def _own_slots(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any
     if animation and animation.action == action and animation.action_slot in candidates:
         return [animation.action_slot]
     used = _slots_of_strips(animation, action, candidates) if animation else []
-    own = used or [slot for slot in candidates if armature in slot.users() or not slot.users()]
     last = animation.last_slot_identifier if animation else ""
+    free = [slot for slot in candidates if not {*slot.users()} - {armature}]
+    if not any(slot in free for slot in used) and any(slot.identifier == last for slot in free):
+        used = []  # its strips only borrow what others play
+    own = used or [slot for slot in candidates if armature in slot.users() or not slot.users()]
     for wanted in (last, f"OB{armature.name}"):
         found = [slot for slot in own if slot.identifier == wanted]
         if found:

@@ -116,6 +116,14 @@ def reshapes(thing: bpy.types.Object) -> bool:
     return any(modifier.show_viewport and modifier.type not in passed for modifier in before)
 
 
+def unmet_modifiers(body: bpy.types.Object) -> list[str]:
+    """Return the names of modifiers that shape a body after bones, or add parts to it: cloth does not meet that."""
+    kinds = [modifier.type for modifier in body.modifiers]
+    after = body.modifiers[kinds.index("ARMATURE") + 1 :] if "ARMATURE" in kinds else []
+    passed = HARMLESS | REFINING | {"ARMATURE"}  # a second Armature is refused
+    return [modifier.name for modifier in after if modifier.show_viewport and modifier.type not in passed]
+
+
 def is_refined(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:
     """Return whether modifiers change how many vertices an object has."""
     return len(thing.evaluated_get(depsgraph).data.vertices) != len(thing.data.vertices)

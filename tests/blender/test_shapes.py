@@ -136,6 +136,64 @@ def test_shapes_that_change_are_told(ready, trained, change):
     assert told.startswith("The shape key 'Full' of 'Pillar' changes over time, which is not followed")
 
 
+def said_of(garment) -> list[str]:
+    from blender_addon.motions.shapes import tell_changing_shapes
+
+    said: list[str] = []
+    tell_changing_shapes(SimpleNamespace(report=lambda kind, text: said.append(text)), garment)
+    return said
+
+
+def test_a_key_that_is_switched_on_later_is_told(ready, trained):
+    key = fuller(ready.data.objects["Pillar"], 1.0)
+    for frame, key.mute in ((1, True), (20, False)):
+        key.keyframe_insert("mute", frame=frame)
+    ready.context.scene.frame_set(1)
+    (told,) = said_of(trained)
+    assert told.startswith("The shape key 'Full' of 'Pillar' changes over time")
+
+
+def a_muted_driver(thing: Any) -> None:
+    curve = fuller(thing, 0.5).driver_add("value")
+    curve.driver.expression, curve.mute = "frame", True
+
+
+def muted_keys(thing: Any) -> None:
+    from blender_addon.motions.keys import SLOTS, curves_of
+
+    keyed(thing)
+    animation = thing.data.shape_keys.animation_data
+    for curve in curves_of(animation.action, animation.action_slot if SLOTS else None):
+        curve.mute = True
+
+
+def strips_that_are_off(thing: Any) -> None:
+    keyed(thing)
+    animation = thing.data.shape_keys.animation_data
+    animation.nla_tracks.new().strips.new("Full", 1, animation.action)
+    animation.action, animation.use_nla = None, False
+
+
+@pytest.mark.parametrize("change", [a_muted_driver, muted_keys, strips_that_are_off])
+def test_shapes_whose_animation_is_off_are_not_told(ready, trained, change):
+    pillar, values = ready.data.objects["Pillar"], set()
+    change(pillar)
+    for frame in (1, 10, 20):
+        ready.context.scene.frame_set(frame)
+        values.add(pillar.data.shape_keys.key_blocks["Full"].value)
+    assert len(values) == 1 and not said_of(trained)
+
+
+@pytest.mark.parametrize("kind", ["MIRROR", "SMOOTH", "DISPLACE"])
+def test_what_shapes_a_body_after_its_bones_is_told(ready, trained, kind):
+    pillar = ready.data.objects["Pillar"]
+    pillar.modifiers.new("Late", kind)
+    (told,) = said_of(trained)
+    assert told.startswith("The modifier 'Late' of 'Pillar' comes after its bones; cloth meets the body")
+    pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
+    assert not said_of(trained)
+
+
 def test_shapes_that_only_could_change_are_not_told(ready, skirt):
     from blender_addon.motions.shapes import changing_shapes
 

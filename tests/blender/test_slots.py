@@ -94,6 +94,17 @@ def test_a_strip_of_another_characters_slot_does_not_make_that_slot_its_own(bpy,
     assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
 
 
+def test_a_single_strip_that_borrows_anothers_slot_leaves_the_own_motion(bpy, cast):
+    from blender_addon.motions.sources import sources
+
+    hero, villain, action = cast
+    hero.animation_data.action = None
+    strip = hero.animation_data.nla_tracks.new().strips.new("Walk", 1, action)
+    strip.action_slot = villain.animation_data.action_slot
+    assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+    assert [source.kind for source in sources(hero)] == ["TIMELINE", "ACTION", "STRIP"]
+
+
 def test_strips_of_several_slots_stand_by_themselves_where_nothing_tells_the_own(bpy, cast):
     from blender_addon.errors import SetupError
     from blender_addon.motions.sources import sources

@@ -458,3 +458,133 @@ def test_a_rig_says_what_a_garment_from_its_own_file_loses(hero, tmp_path):
     character, read, _ = read_scene(str(hero), garment=str(garment))
     assert write_rigged_stage(hero, scene_of(character, read), tmp_path / "rigged.usda") == "Cloak loses normals"
     assert write_rigged_stage(hero, worn(hero).scene, tmp_path / "other.usda") == ""
+
+
+def varied(stage: Usd.Stage) -> None:
+    sets = stage.GetPrimAtPath("/Looks/Cape_cloth").GetVariantSets().AddVariantSet("colour")
+    sets.AddVariant("blue")
+    sets.SetVariantSelection("blue")
+
+
+def connected(stage: Usd.Stage) -> None:
+    rivet = UsdGeom.Xform.Define(stage, "/Hero/Rivet").GetPrim().CreateAttribute("worn", TINT.Float)
+    stage.GetPrimAtPath("/Hero/Cape").CreateAttribute("rigging:worn", TINT.Float).AddConnection(rivet.GetPath())
+
+
+def of_a_material(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/Looks/Cape_cloth").CreateRelationship("rigging:rig").SetTargets(["/Hero/Rig"])
+
+
+def chosen_over_time(stage: Usd.Stage) -> None:
+    stage.GetPrimAtPath("/Hero/Cape/trim").GetAttribute("indices").Set([3], 2)
+
+
+def left_out_of_a_collection(stage: Usd.Stage) -> None:
+    for path in ("/Hero/Cape", "/Hero/Cape/trim"):
+        UsdShade.MaterialBindingAPI(stage.GetPrimAtPath(path)).UnbindAllBindings()
+    hero = stage.GetPrimAtPath("/Hero")
+    collection = Usd.CollectionAPI.Apply(hero, "cloth")
+    collection.CreateIncludesRel().SetTargets(["/Hero/Cape"])
+    collection.CreateExcludesRel().SetTargets(["/Hero/Cape/trim"])
+    wool = material(stage, "/Looks/Wool", "map1")
+    UsdShade.MaterialBindingAPI.Apply(hero).Bind(collection, wool, "cloth")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (varied, "Cape_cloth loses the variant set colour, of which 'blue' is kept"),
+        (connected, "Cape loses rigging:worn to /Hero/Rivet.worn, which is not written with it"),
+        (of_a_material, "Cape_cloth loses rigging:rig to /Hero/Rig, which is not written with it"),
+        (chosen_over_time, "Cape loses the animation of trim.indices, which keeps its first value"),
+        (left_out_of_a_collection, "Cape loses the lack of a material of trim, which takes on Wool from above"),
+    ],
+)
+def test_what_materials_connections_and_subsets_lose_is_told_by_name(hero, tmp_path, change, told):
+    stage = Usd.Stage.Open(str(hero))
+    change(stage)
+    stage.Save()
+    assert shoot(worn(hero), tmp_path / "shot.usda").left_out == told
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    for prim in shot.Traverse():
+        for each in prim.GetAuthoredProperties():
+            targets = each.GetTargets() if isinstance(each, Usd.Relationship) else each.GetConnections()
+            assert all(shot.GetObjectAtPath(target) for target in targets), each
+
+
+def test_what_connects_to_what_is_written_is_kept(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    cape.CreateAttribute("rigging:colour", TINT.Color3f).AddConnection("/Looks/Body_cloth/Texture.outputs:rgb")
+    stage.GetPrimAtPath("/Looks/Cape_cloth").CreateRelationship("rigging:like").SetTargets(["/Looks/Body_trim"])
+    Usd.CollectionAPI.Apply(cape, "panels").CreateIncludesRel().SetTargets(["/Hero/Cape/trim"])
+    stage.Save()
+    assert not shoot(worn(hero), tmp_path / "shot.usda").left_out
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    cape, looks = shot.GetPrimAtPath("/Hero/Cape"), Sdf.Path("/Hero/Looks")
+    colour = looks.AppendPath("Body_cloth/Texture.outputs:rgb")
+    assert cape.GetAttribute("rigging:colour").GetConnections() == [colour]
+    like = shot.GetPrimAtPath(looks.AppendPath("Cape_cloth")).GetRelationship("rigging:like")
+    assert like.GetTargets() == [looks.AppendPath("Body_trim")]
+    query = Usd.CollectionAPI(cape, "panels").ComputeMembershipQuery()
+    assert query.IsPathIncluded(Sdf.Path("/Hero/Cape/trim"))
+
+
+def test_a_material_plays_as_fast_in_a_shot_of_another_rate(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    stage.SetTimeCodesPerSecond(24)
+    wet = UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Surface")).CreateInput("roughness", TINT.Float)
+    wet.Set(0.0, 0)
+    wet.Set(1.0, 24)
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usda")
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    written = UsdShade.Shader(shot.GetPrimAtPath("/Hero/Looks/Cape_cloth/Surface")).GetInput("roughness")
+    assert shot.GetTimeCodesPerSecond() == 30
+    assert written.Get(15) == pytest.approx(wet.Get(12)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("variants", [True, False])
+def test_words_of_hidden_faces_are_hidden_with_them(hero, tmp_path, variants):
+    stage = Usd.Stage.Open(str(hero))
+    api = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/Hero/Body"))
+    words = api.CreatePrimvar("panel", TINT.StringArray, "uniform")
+    words.Set([f"panel {face}" for face in range(COLUMNS * ROWS)])
+    stage.Save()
+    mask = np.arange(COLUMNS * ROWS) == 3
+    shoot(worn(hero), tmp_path / "shot.usda", hidden_polygons=HiddenPolygons((mask,), variants))
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usda"))
+    found = UsdGeom.PrimvarsAPI(shot.GetPrimAtPath("/Hero/Body"))
+    assert list(found.GetPrimvar("panel").Get()) == [f"panel {face}" for face in range(COLUMNS * ROWS) if face != 3]
+
+
+def test_tiles_that_are_named_without_a_dot_are_found_from_a_shot(hero, tmp_path):
+    """USD looks up `<UDIM>` beside the layer that names it, as it does the other textures."""
+    (hero.parent / "textures" / "linen.1001.png").write_bytes(b"linen")
+    stage = Usd.Stage.Open(str(hero))
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Texture")).GetInput("file")
+    texture.Set(Sdf.AssetPath("textures/linen.<UDIM>.png"))
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shots" / "shot.usda")
+    shot = Usd.Stage.Open(str(tmp_path / "shots" / "shot.usda"))
+    written = shot.GetPrimAtPath("/Hero/Looks/Cape_cloth/Texture").GetAttribute("inputs:file").Get()
+    assert UsdShade.UdimUtils.ResolveUdimPath(written.path, shot.GetRootLayer())
+
+
+def test_a_rig_says_what_a_garment_without_a_material_takes_on(hero, tmp_path):
+    character = Usd.Stage.Open(str(hero))
+    skin = material(character, "/Looks/Skin", "map1")
+    UsdShade.MaterialBindingAPI.Apply(character.GetPrimAtPath("/Hero")).Bind(skin)
+    character.Save()
+    stage = Usd.Stage.CreateNew(str(tmp_path / "cape.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    cloak = dressed(stage, "/Wardrobe/Cloak", 0.2).GetPrim()
+    for prim in (cloak, cloak.GetChild("trim")):
+        UsdShade.MaterialBindingAPI(prim).UnbindAllBindings()
+    stage.Save()
+    hero_of_ours, read, _ = read_scene(str(hero), garment=str(tmp_path / "cape.usda"))
+    assert write_rigged_stage(hero, scene_of(hero_of_ours, read), tmp_path / "rigged.usda") == (
+        "Cloak loses the lack of a material of Cloak, which takes on Skin from above, "
+        "the lack of a material of trim, which takes on Skin from above"
+    )

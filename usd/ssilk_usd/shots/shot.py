@@ -84,12 +84,12 @@ def write_shot(
     with replacing(path) as temporary:
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
+        span = TimeSpan.of(motion, start, samples_per_frame)
+        set_metadata(stage, span, units)  # first, for what is copied has the times of the rate
         hiding = hidden_polygons if include_body else None
         asset = define_asset(
             stage, deformer, bodies, units, record=record, info=info, hidden_polygons=hiding, output=path
         )
-        span = TimeSpan.of(motion, start, samples_per_frame)
-        set_metadata(stage, span, units)
         set_visibility(stage, asset.root, span, hidden)
         del stage  # nobody has to hear of each sample
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step)

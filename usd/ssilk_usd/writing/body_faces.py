@@ -78,6 +78,8 @@ class _FaceRows:
         else:
             rows = np.repeat(kept, counts) if self.kind == "corner" else kept
             found = array.reshape(len(rows), -1, *array.shape[1:])[rows].reshape(-1, *array.shape[1:])
+        if not hasattr(self.values, "FromNumpy"):  # words
+            return type(self.values)(found.tolist())
         return type(self.values).FromNumpy(np.ascontiguousarray(found.astype(array.dtype)))
 
 

@@ -23,7 +23,7 @@ from ssilk_core.scene.assets import Ints, Mesh
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
 from ..reading.mesh import is_garment, kept_faces, polygons
 from .body_faces import face_kind
-from .look_above import OTHER_PRIMVARS, PURPOSES, inherited_primvars
+from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
 
 LOOKS = "Looks"  # scope of materials beneath the root
 _OTHERS = {
@@ -32,11 +32,10 @@ _OTHERS = {
 }  # fmt: skip
 _OTHER_SPACES = (
     *OTHER_PRIMVARS, "xformOp:", "skel:", "ssilk:", "physics:", "omniphysics:", "physx", "material:binding",
-    "collection:",
 )  # fmt: skip
 _LEFT = ("normals", "primvars:normals", "velocities", "accelerations")
 _METADATA = ("customData", "assetInfo", "displayName", "documentation", "kind")
-_OTHER_SCHEMAS = ("Skel", "Ssilk", "MaterialBinding", "Collection", "Physics", "Physx", "Omni", "Deformable")
+_OTHER_SCHEMAS = ("Skel", "Ssilk", "MaterialBinding", "Physics", "Physx", "Omni", "Deformable")
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +110,7 @@ def copy_looks(
         if look is None:
             left.add(mesh.path.rpartition("/")[2], f"its look, since {source} has no mesh of its polygons")
     looks = [(path, look) for _, path, look in found if look is not None]
-    flat = _flattened(opened, [look.prim for _, look in looks])
+    flat = _flattened(opened, [look.prim for _, look in looks], stage.GetTimeCodesPerSecond())
     layer = stage.GetEditTarget().GetLayer()
     materials: dict[Sdf.Path, Sdf.Path] = {}
     with Sdf.ChangeBlock():
@@ -122,12 +121,18 @@ def copy_looks(
         for variants in map(variants_of, above):
             left.add(path.name, *variants)
         _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
-        _copy_subsets(flat, stage, look, path)
+        _copy_subsets(flat, stage, look, path, left)
         _bind_materials(flat, stage, root, look, path, materials, left)
         _keep_stand_in(stage, look, path, looks)
     written = {look.prim.GetPath(): path for path, look in looks} | materials
     for path, look in looks:
-        _keep_targets(stage, look, path, written, left)
+        prim = stage.GetPrimAtPath(path)
+        _keep_targets(look.prim, prim.GetAuthoredProperties(), path.name, written, left)
+        _tell_bindings(stage, look, path, materials, left)
+    for material, path in materials.items():
+        for prim in Usd.PrimRange(stage.GetPrimAtPath(path)):
+            shader = opened.GetPrimAtPath(prim.GetPath().ReplacePrefix(path, material))
+            _keep_targets(shader, prim.GetAuthoredRelationships(), path.name, written, left)
     folder = os.path.abspath(os.path.dirname(output))
     UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
     return left
@@ -144,27 +149,37 @@ def variants_of(prim: Usd.Prim) -> list[str]:
 
 
 def _keep_targets(
-    stage: Usd.Stage, look: LookSource, path: Sdf.Path, written: Mapping[Sdf.Path, Sdf.Path], left: LeftOut
-) -> None:
-    """Let relationships of a mesh name what is written; those that would name nothing are left out.
+    source: Usd.Prim, properties: Sequence[Usd.Property], holder: str, written: Mapping[Sdf.Path, Sdf.Path],
+    left: LeftOut,
+) -> None:  # fmt: skip
+    """Let relationships and connections of a copy name what is written; those that would name nothing are left out.
 
     Args:
+        source: the prim that was copied.
+        properties: of the copy.
+        holder: name of the mesh or material, for messages.
         written: where meshes and materials of the source are written, with all that is in them.
     """
-    prim = stage.GetPrimAtPath(path)
-    for relationship in prim.GetAuthoredRelationships():
-        source = look.prim.GetRelationship(relationship.GetName())
-        if not source or relationship.GetName().startswith(_OTHER_SPACES) or relationship.GetName() in _OTHERS:
+    for found in properties:
+        name = found.GetName()
+        own = source.GetProperty(name) if source else None
+        if not own or name.startswith(_OTHER_SPACES) or name in _OTHERS:
             continue
-        named = [_rewritten(target, written) for target in source.GetForwardedTargets()]
-        kept = [target for target in named if stage.GetObjectAtPath(target)]
-        if kept:
-            relationship.SetTargets(kept)
+        is_relationship = isinstance(found, Usd.Relationship)
+        targets = own.GetForwardedTargets() if is_relationship else own.GetConnections()
+        if not targets and not is_relationship:
+            continue
+        named = [_rewritten(target, written) for target in targets]
+        kept = [target for target in named if found.GetStage().GetObjectAtPath(target)]
+        if not is_relationship:
+            found.SetConnections(kept) if kept else found.ClearConnections()
+        elif kept:
+            found.SetTargets(kept)
         else:
-            prim.RemoveProperty(relationship.GetName())
+            found.GetPrim().RemoveProperty(name)
         if len(kept) < len(named):
             missing = next(target for target in named if target not in kept)
-            left.add(path.name, f"{relationship.GetName()} to {missing}, which is not written with it")
+            left.add(holder, f"{name} to {missing}, which is not written with it")
 
 
 def _rewritten(target: Sdf.Path, written: Mapping[Sdf.Path, Sdf.Path]) -> Sdf.Path:
@@ -173,15 +188,23 @@ def _rewritten(target: Sdf.Path, written: Mapping[Sdf.Path, Sdf.Path]) -> Sdf.Pa
     return target.ReplacePrefix(above[-1], written[above[-1]]) if above else target
 
 
-def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:
-    """Return a layer of the meshes and of all materials that are bound to them or to their subsets, composed."""
+def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim], rate: float) -> Sdf.Layer:
+    """Return a layer of the meshes and of all materials that are bound to them or to their subsets, composed.
+
+    Its samples have `rate` time codes in a second.
+    """
     wanted = [prim.GetPath() for prim in prims]
     for prim in prims:
         subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
         for holder in (prim, *(subset.GetPrim() for subset in subsets)):
             wanted += [material.GetPath() for material, _ in _bound(holder)]
     mask = Usd.StagePopulationMask([Sdf.Path(path) for path in wanted] or [Sdf.Path("/__none")])
-    part = Usd.Stage.OpenMasked(stage.GetRootLayer(), Sdf.Layer.CreateAnonymous(), mask)
+    top = stage.GetRootLayer()
+    if rate != stage.GetTimeCodesPerSecond():  # USD scales the times of a sublayer that has another rate
+        top = Sdf.Layer.CreateAnonymous()
+        top.subLayerPaths.append(stage.GetRootLayer().identifier)
+        top.timeCodesPerSecond, top.expressionVariables = rate, stage.GetRootLayer().expressionVariables
+    part = Usd.Stage.OpenMasked(top, Sdf.Layer.CreateAnonymous(), mask)
     part.ExpandPopulationMask()
     part.SetEditTarget(part.GetSessionLayer())
     for path in wanted:
@@ -189,7 +212,26 @@ def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim]) -> Sdf.Layer:
             prim = part.GetPrimAtPath(prefix)
             if prim and prim.IsInstance():
                 prim.SetInstanceable(False)
-    return part.Flatten()
+    flat = part.Flatten()
+    _anchor_tiles(part, flat)
+    return flat
+
+
+def _anchor_tiles(part: Usd.Stage, flat: Sdf.Layer) -> None:
+    """Make paths of tiled textures absolute where USD finds tiles by the layer that names them.
+
+    USD flattens those that begin with a dot alone.
+    """
+    for prim in Usd.PrimRange.Stage(part, PRIMS):
+        for attribute in prim.GetAuthoredAttributes():
+            named = attribute.Get() if attribute.GetTypeName() == Sdf.ValueTypeNames.Asset else None
+            spec = flat.GetAttributeAtPath(attribute.GetPath())
+            if not (named and spec and UsdShade.UdimUtils.IsUdimIdentifier(named.path)):
+                continue
+            layer = attribute.GetPropertyStack()[0].layer
+            found = UsdShade.UdimUtils.ResolveUdimPath(named.path, layer)
+            if found:
+                spec.default = Sdf.AssetPath(found)
 
 
 def _copy_properties(flat: Sdf.Layer, layer: Sdf.Layer, look: LookSource, path: Sdf.Path, left: LeftOut) -> None:
@@ -261,7 +303,7 @@ def _keep_stand_in(
             UsdGeom.Imageable(stage.GetPrimAtPath(path)).CreateProxyPrimRel().SetTargets(named)
 
 
-def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf.Path) -> None:
+def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf.Path, left: LeftOut) -> None:
     layer = stage.GetEditTarget().GetLayer()
     position = np.full(int(look.faces.max(initial=-1)) + 1, -1)
     position[look.faces] = np.arange(len(look.faces))
@@ -272,8 +314,13 @@ def _copy_subsets(flat: Sdf.Layer, stage: Usd.Stage, look: LookSource, path: Sdf
         for name in [each.name for each in spec.properties if each.name.startswith("material:binding")]:
             spec.RemoveProperty(spec.properties[name])
         copied = UsdGeom.Subset(stage.GetPrimAtPath(to))
+        first = subset.GetIndicesAttr().Get(EARLIEST) or []
+        if copied.GetIndicesAttr().GetNumTimeSamples():
+            copied.GetIndicesAttr().Clear()
+            copied.GetIndicesAttr().Set(first)
+            left.add(path.name, f"the animation of {to.name}.indices, which keeps its first value")
         if copied.GetElementTypeAttr().Get() == UsdGeom.Tokens.face:
-            indices = np.array(subset.GetIndicesAttr().Get(EARLIEST) or [], dtype=np.int64)
+            indices = np.array(first, dtype=np.int64)
             found = position[indices[(indices >= 0) & (indices < len(position))]]
             copied.GetIndicesAttr().Set(Vt.IntArray.FromNumpy(found[found >= 0].astype(np.int32)))
     family = flat.GetPrimAtPath(look.prim.GetPath())
@@ -303,14 +350,31 @@ def _bind_materials(
         for material, purpose in _bound(source):
             if source != look.prim and (purpose, material.GetPath()) in inherited:
                 continue
-            copied = materials.get(material.GetPath()) or _copy_material(flat, stage, root, material, left)
+            copied = materials.get(material.GetPath()) or _copy_material(flat, stage, root, look, material, left)
             materials[material.GetPath()] = copied
             api = UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(to))
             api.Bind(UsdShade.Material(stage.GetPrimAtPath(copied)), UsdShade.Tokens.fallbackStrength, purpose)
 
 
+def _tell_bindings(
+    stage: Usd.Stage, look: LookSource, path: Sdf.Path, materials: Mapping[Sdf.Path, Sdf.Path], left: LeftOut
+) -> None:
+    """Tell where USD binds another material to a mesh or a subset of it than it did: what is above takes hold."""
+    for holder in (
+        look.prim,
+        *(each.GetPrim() for each in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Mesh(look.prim))),
+    ):
+        written = stage.GetPrimAtPath(holder.GetPath().ReplacePrefix(look.prim.GetPath(), path))
+        for purpose in PURPOSES:
+            before, now = (bound_material_path(each, purpose) for each in (holder, written))
+            if now != materials.get(before, before):
+                had = f"the material {before.name} of" if before else "the lack of a material of"
+                to = f"takes on {now.name} from above" if now else "has none"
+                left.add(path.name, f"{had} {written.GetName()}, which {to}")
+
+
 def _copy_material(
-    flat: Sdf.Layer, stage: Usd.Stage, root: Sdf.Path, material: UsdShade.Material, left: LeftOut
+    flat: Sdf.Layer, stage: Usd.Stage, root: Sdf.Path, look: LookSource, material: UsdShade.Material, left: LeftOut
 ) -> Sdf.Path:
     layer, scope = stage.GetEditTarget().GetLayer(), root.AppendChild(LOOKS)
     if not stage.GetPrimAtPath(scope):
@@ -320,6 +384,10 @@ def _copy_material(
     name = next(each for each in (own, *(f"{own}_{copy}" for copy in range(2, len(taken) + 3))) if each not in taken)
     to = scope.AppendChild(name)
     Sdf.CopySpec(flat, material.GetPath(), layer, to)
+    above = [material.GetPrim().GetStage().GetPrimAtPath(prefix) for prefix in material.GetPath().GetPrefixes()]
+    for prim in (*above[:-1], *Usd.PrimRange(material.GetPrim(), PRIMS)):
+        if not look.prim.GetPath().HasPrefix(prim.GetPath()):  # those above the mesh are told of it
+            left.add(name, *variants_of(prim))
     for prim in Usd.PrimRange(stage.GetPrimAtPath(to)):
         for attribute in prim.GetAuthoredAttributes():
             outside = [path for path in attribute.GetConnections() if not path.HasPrefix(to)]

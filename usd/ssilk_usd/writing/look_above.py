@@ -32,7 +32,9 @@ class LookFromAbove:
         """Return what a mesh has from above."""
         subsets = UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim))
         holders = [prim, *(subset.GetPrim() for subset in subsets)]
-        materials = [(each.GetPath(), purpose, _material(each, purpose)) for each in holders for purpose in PURPOSES]
+        materials = [
+            (each.GetPath(), purpose, bound_material_path(each, purpose)) for each in holders for purpose in PURPOSES
+        ]
         purpose = str(UsdGeom.Imageable(prim).ComputePurpose())
         return cls(prim.GetPath(), tuple(materials), tuple(inherited_primvars(prim)), purpose)
 
@@ -49,10 +51,10 @@ class LookFromAbove:
         lost: dict[str, None] = {}
         for path, purpose, material in self.materials:
             holder = stage.GetPrimAtPath(path.ReplacePrefix(self.path, prim.GetPath()))
-            if material and _material(holder, purpose) != material:
+            if material and bound_material_path(holder, purpose) != material:
                 api = UsdShade.MaterialBindingAPI.Apply(holder)
                 api.Bind(UsdShade.Material(stage.GetPrimAtPath(material)), materialPurpose=purpose)
-            found = _material(holder, purpose)
+            found = bound_material_path(holder, purpose)
             if found != material:
                 had = f"has {material.name}" if material else "has no material"
                 lost[f"{holder.GetName()} {had}, and takes on {found.name if found else 'none'} from above"] = None
@@ -69,7 +71,7 @@ def inherited_primvars(prim: Usd.Prim) -> list[Sdf.Path]:
     return found
 
 
-def _material(prim: Usd.Prim, purpose: str) -> Sdf.Path | None:
+def bound_material_path(prim: Usd.Prim, purpose: str) -> Sdf.Path | None:
     """Return the path of the material that USD binds to a prim."""
     material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
     return material.GetPath() if material else None
