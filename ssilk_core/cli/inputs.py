@@ -27,6 +27,7 @@ KINDS = {
     "model": MODEL,
     "models": MODEL,
     "stepper_of": MODEL,
+    "start_from": MODEL,
     "stage": Kind("file", "a USD stage with a character is needed"),
     "motion": MOTIONS,
     "motions": MOTIONS,

@@ -54,7 +54,15 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
         "schedule is scaled to the number that fits; one seed gives one model only for one such number",
     )
-    verb.add_argument(
+    onward = verb.add_mutually_exclusive_group()
+    onward.add_argument(
+        "--start-from",
+        type=Path,
+        metavar="MODEL",
+        help="train all networks of a trained model of this scene on, with the size that they have: with other "
+        "motion, or with intersection_weight",
+    )
+    onward.add_argument(
         "--stepper-of",
         type=Path,
         metavar="MODEL",
@@ -150,9 +158,10 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
-    base = load_model(options.stepper_of) if options.stepper_of else None
+    trained = options.stepper_of or options.start_from
+    base = load_model(trained) if trained else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
-    files |= {options.stepper_of} if base else set()
+    files |= {trained} if base else set()
     return TrainJob(
         scene=scene,
         motions=motions,
@@ -166,6 +175,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         inputs={str(path): sha256(path) for path in sorted(files)},
         minutes=options.minutes,
         base=base,
+        whole=options.start_from is not None,
     )
 
 

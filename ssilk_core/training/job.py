@@ -43,8 +43,9 @@ class TrainJob:
         output: the model file to write; the run's other files go to the same folder.
         inputs: hashes of the input files by name, for the provenance.
         minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
-        base: a trained model of the same scene, whose initialiser and decoder stay as they are while a new stepper
-            learns; None to train all.
+        base: a trained model of the same scene that training goes on from; None to train anew.
+        whole: whether all networks of `base` learn, with its settings. Otherwise its initialiser and decoder stay as
+            they are while a new stepper learns.
     """
 
     scene: Scene
@@ -59,10 +60,16 @@ class TrainJob:
     inputs: dict[str, str] | None = None
     minutes: float | None = None
     base: ModelFile | None = None
+    whole: bool = False
 
     def __post_init__(self) -> None:
         if self.base:
             _need_same_scene(self.base, self.scene)
+        if self.base and self.whole:
+            object.__setattr__(self, "model", self.base.config)
+            # P and D are trained.
+            object.__setattr__(self, "train", replace(self.train, static_fraction=0, pretraining_batch=1))
+        elif self.base:
             own = {name: getattr(self.model, name) for name in STEPPER_SETTINGS}
             object.__setattr__(self, "model", replace(self.base.config, **own))
             # There is no P to train on single poses.
@@ -86,6 +93,11 @@ class TrainJob:
                 perturbations=0,
             )
             object.__setattr__(self, "train", least)
+
+    @property
+    def stepper_alone(self) -> bool:
+        """Whether only the stepper learns."""
+        return self.base is not None and not self.whole
 
     @property
     def has_loose(self) -> bool:

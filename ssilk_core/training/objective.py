@@ -11,6 +11,8 @@ from ..physics.collision import CollisionBody, Contacts
 from ..physics.collision.contacts import no_planes
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
+from ..physics.intersections.contours import IntersectionContours
+from ..physics.intersections.figures import INTERSECTION
 from ..physics.skinning import Skinning
 from ..scene.assets import SkinWeights
 from .latent_regularization import LATENT_SCALE, latent_distortion
@@ -19,6 +21,7 @@ from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
+CROSSED_EVERY = 4  # of so many frames of a batch one is searched for contours
 REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
 
 
@@ -33,6 +36,8 @@ class Objective:
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
         clearance, patches: see `settings.TrainConfig`; `patches` is `contact_patches`.
+        contours, intersection_weight: those of the garment, and the weight of their length [N]; None and zero for
+            cloth that does not know of cloth.
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
     """
@@ -48,9 +53,12 @@ class Objective:
         clearance: float = 0.0,
         buried: Tensor | None = None,
         patches: bool = True,
+        contours: IntersectionContours | None = None,
+        intersection_weight: float = 0.0,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface, self.clearance, self.buried = surface, clearance, buried
+        self.contours, self.intersection_weight = contours, intersection_weight
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
@@ -104,6 +112,14 @@ class Objective:
             return no_planes(x)
         normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
         return normal, offset + self.clearance
+
+    def _intersection(self, x: Tensor) -> Tensor:
+        """Return the energy of contours (N,) at positions x (V, 3, N): that of some frames stands for the others."""
+        found = x.new_zeros(x.shape[-1])
+        assert self.contours is not None
+        lengths = self.contours.lengths(x[..., ::CROSSED_EVERY].contiguous())
+        found[::CROSSED_EVERY] = CROSSED_EVERY * self.intersection_weight * lengths
+        return found
 
     def _buried(self, frames: Tensor) -> Tensor | None:
         return None if self.buried is None else self.buried[:, frames]
@@ -163,6 +179,8 @@ class Objective:
         character = bank.character(asked)
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
         terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character, self._buried(asked))
+        if self.contours:
+            terms[INTERSECTION] = self._intersection(x)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}

@@ -79,7 +79,8 @@ class TrainingParts:
         surface = config.closest_point == "triangles"
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
-            self.buried if surface else None, config.contact_patches,
+            self.buried if surface else None, config.contact_patches, self.validator.contours,
+            config.intersection_weight,
         )  # fmt: skip
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
@@ -103,7 +104,9 @@ def build_parts(
     joints = job.base.joints if job.base else model_joints(scene, reach.joints)
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed)
-    if job.base:
+    if job.base and not job.stepper_alone:
+        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in job.base.parameters.items()})
+    elif job.base:
         goes_on = _take_over(model, job.base)
         start = "goes on from that of the given model" if goes_on else "starts anew: it steps otherwise, or sees less"
         report(Message(f"the stepper {start}"))
@@ -119,9 +122,10 @@ def build_parts(
     whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, skeleton, fps)
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans)
-    smoothing = None if job.base else ShapeSmoothing.of(model, job.train.shape_smoothing)
-    if smoothing:
+    weight = job.train.intersection_weight
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, weight)
+    smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
+    if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
     return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)
 

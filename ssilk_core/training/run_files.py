@@ -78,6 +78,6 @@ class RunFiles:
                 "validation": summary(score),
                 "lbs": summary(lbs),
                 "worse_than_lbs": is_worse(score, lbs),
-                **({"base": self.job.base.provenance} if self.job.base else {}),
+                **({"base": self.job.base.provenance, "whole": self.job.whole} if self.job.base else {}),
             }
         )

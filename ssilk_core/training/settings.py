@@ -37,6 +37,8 @@ class TrainConfig:
             weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
         newton_weight: weight of the distance to a Newton step beside the energy (`training.newton_distance`); zero
             for the energy alone, as in the paper.
+        intersection_weight: weight of the length of contours along which the garment intersects itself, in dynamic
+            training [N] (`intersections.contours`); zero for cloth that does not know of cloth, as in the paper.
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.
@@ -85,6 +87,7 @@ class TrainConfig:
     tumbling: float = 0.25
     outlier_energy: float = 0.1
     newton_weight: float = 0.0
+    intersection_weight: float = 0.0
     clearance: float = 5e-3
     static_batch: int = 512
     initial_loss: bool = False
@@ -138,6 +141,7 @@ class TrainConfig:
             "skinning_learning_rate_scale",
             "outlier_energy",
             "newton_weight",
+            "intersection_weight",
             "clearance",
             "weight_decay",
         )

@@ -19,8 +19,9 @@ from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
 from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
-from ..physics.intersections.figures import SelfIntersections
-from ..physics.intersections.pairs import can_find
+from ..physics.intersections.contours import IntersectionContours
+from ..physics.intersections.figures import INTERSECTION, SelfIntersections
+from ..physics.intersections.pairs import can_find, need_predicates
 from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
@@ -85,6 +86,7 @@ class Validator:
     Args:
         frames: most frames of a clip.
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
+        intersection_weight: with it contours of the garment are a term, as in training, which needs libigl.
     """
 
     def __init__(
@@ -98,12 +100,18 @@ class Validator:
         frames: int,
         group: ProcessGroup = SINGLE_PROCESS,
         spans: Sequence[Motion] | None = None,
+        intersection_weight: float = 0.0,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
         self.cloth = ClothIntersections.of(scene) if can_find() else None
+        self.intersection_weight, self.contours = intersection_weight, None
+        if intersection_weight:
+            need_predicates()
+            cloth = self.cloth or ClothIntersections.of(scene)
+            self.contours = IntersectionContours(cloth, scene.classes, rest.device)
         self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -135,7 +143,7 @@ class Validator:
         dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
         scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
         joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
-        terms = {name: joined[name] for name in TERMS}
+        terms = {name: joined[name] for name in (*TERMS, INTERSECTION) if name in joined}
         shown, crossed = self._shown(model, states), self._crossed(model, states)
         steps = self._step_errors(model, states)
         return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps)
@@ -267,6 +275,8 @@ class Validator:
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.pose(character, limbs=False)
             terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
+            if self.contours:
+                terms[INTERSECTION] = self.intersection_weight * self.contours.lengths(x)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

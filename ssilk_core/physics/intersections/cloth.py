@@ -66,7 +66,7 @@ class ClothIntersections:
         self._first = _first_places(self.mesh.points)
         self._is_doubled = bool((self._first != np.arange(self.mesh.vertex_count)).any())
         allowed = [self._keys(self._pairs(self.mesh.points)), self._keys(_stitched_pairs(self.mesh))]
-        self._allowed = np.unique(np.concatenate(allowed))
+        self.allowed = np.unique(np.concatenate(allowed))
 
     @classmethod
     def of(cls, scene: Scene) -> ClothIntersections:
@@ -81,7 +81,7 @@ class ClothIntersections:
             points: finite positions of the garment's vertices [m], shape (V, 3).
         """
         found = self._pairs(points)
-        return found[~np.isin(self._keys(found), self._allowed)]
+        return found[~np.isin(self._keys(found), self.allowed)]
 
     def triangles(self, points: Floats) -> NDArray[np.bool_]:
         """Return which triangles intersect others in a frame, shape (F,): all where it is not finite.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 EVERY = 4  # of so many frames one is counted, as libigl takes some 30 ms for one; cloth hardly crosses itself in less
 LIBIGL = "2.6.3"  # the first version with the predicates that find what intersects
 
+INTERSECTION = "intersection"  # the term of contours in a training that has their weight
 SHARE = "triangles that intersect others"
 NOT_COUNTED = f"not counted, as libigl {LIBIGL} or newer was missing"  # in place of figures
 
