@@ -2,9 +2,9 @@
 """Contours along which a garment intersects itself, as an energy that draws cloth out of cloth.
 
 Two triangles that intersect have a segment in common, and these segments are the contours. Where a vertex has come
-through other cloth is not seen there, but the contour is, and cloth that leaves the other by the shortest way shortens
-it. With a weight per length [N] it is a potential (Volino and Magnenat-Thalmann, "Resolving Surface Collisions through
-Intersection Contour Minimization", 2006).
+through other cloth is not seen there, but the contour is, and cloth that leaves the other by the shortest way
+shortens it. With a weight per length [N] it is a potential (Volino and Magnenat-Thalmann, "Resolving Surface
+Collisions through Intersection Contour Minimization", 2006).
 
 A segment ends where an edge of one triangle crosses the other. Such an end r slides along its edge e as the plane of
 the face, with normal n, moves: a force g on it is g - (g.e / n.e) n on the edge, and the opposite of the last part on
