@@ -130,8 +130,12 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     said = capsys.readouterr().err
     assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
     made = load_model(shipped.shipped_path("cape")).provenance
-    last, middle, first = (f"{each['iteration']:,}" for each in (made, made["base"], made["base"]["base"]))
-    trained = f"{first} iterations, then {middle} and {last} of the stepper alone,"
+    chain = [made]
+    while "base" in chain[-1]:
+        chain.append(chain[-1]["base"])
+    whole, last, middle, first = (f"{each['iteration']:,}" for each in chain)
+    alone = "of the stepper alone"
+    trained = f"{first} iterations, then {middle} {alone}, then {last} {alone}, then {whole}"
     assert f"shipped cape: {trained} on {len(made['motions'])} motions, seed" in said
     assert {path.name for path in tmp_path.iterdir()} == {
         *("wardrobe", "motions", "shot.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")

@@ -11,6 +11,8 @@ import torch
 from ssilk_core.network.schemes import SCHEMES
 from ssilk_core.physics.collision import signed_distance_to_planes
 from ssilk_core.physics.constants import GRAVITY
+from ssilk_core.physics.intersections.cloth import ClothIntersections
+from ssilk_core.physics.intersections.contours import IntersectionContours
 from ssilk_core.physics.skinning import Skinning
 from ssilk_core.training.objective import Objective, total
 from ssilk_core.training.settings import TrainConfig
@@ -117,6 +119,28 @@ def test_a_window_equals_a_plain_loop(objective, bptt, clearance):
         np.testing.assert_allclose(
             value, theirs[name], atol=2e-3 * float(theirs[name].abs().max()) + 1e-9, err_msg=name
         )
+
+
+def test_the_contours_of_every_fourth_frame_stand_for_all(objective, monkeypatch):
+    pytest.importorskip("igl")
+    assert "intersection" not in objective.window(sampler_of(objective, CONFIG), torch.zeros(2, 3, 8), *POSES)[0]
+    mesh, classes = objective.model.scene.garment.mesh, objective.model.scene.classes
+    objective.contours = IntersectionContours(ClothIntersections(mesh), classes, torch.device("cpu"))
+    objective.intersection_weight = 0.5
+    posed = objective.model.vertices
+    crumpled = 0.1 * torch.randn(mesh.vertex_count, 3, 1, generator=torch.Generator().manual_seed(1))
+    decoded = []
+    monkeypatch.setattr(
+        objective.model, "vertices", lambda *known: decoded.append(posed(*known) + crumpled) or decoded[-1]
+    )
+    dynamic, static_batch, _ = objective.window(sampler_of(objective, CONFIG), torch.zeros(2, 3, 8), *POSES)
+    found = torch.cat([dynamic["intersection"], static_batch["intersection"]])
+    expected = objective.contours.lengths(decoded[-1])
+    assert len(found) == len(expected) == 15 and expected.min() > 0.1
+    torch.testing.assert_close(found[::4], 4 * 0.5 * expected[::4])
+    assert not found.reshape(-1)[torch.arange(15) % 4 > 0].any()
+    slopes = gradients(objective, found.sum())
+    assert all(slopes[name].abs().max() > 0 for name in ("decoder.shapes", "stepper.0.weight", "initialiser.0.weight"))
 
 
 def test_through_time_the_stepper_answers_for_later_frames(objective):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A new stepper for a trained model: what is kept, what learns, and whose it may be."""
+"""Training that goes on from a trained model: what is kept, what learns, and whose it may be."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.training.job import TrainJob
-from ssilk_core.training.parts import FIRST_WEIGHT, _take_over
+from ssilk_core.training.parts import FIRST_WEIGHT, _take_over, build_parts
 from ssilk_core.training.settings import TrainConfig
 
+CPU = torch.device("cpu")
 
-def job(scene, base, motion, **model) -> TrainJob:
+
+def job(scene, base, motion, *, whole: bool = False, **model) -> TrainJob:
     config = ModelConfig(**{"latent": 99, "feedback_points": 5, **model})
     return TrainJob(
         scene=scene, motions=[motion], held_out=[motion], model=config,
-        train=TrainConfig(), fabric=FABRICS["silk"], output=Path("out.safetensors"), base=base,
+        train=TrainConfig(), fabric=FABRICS["silk"], output=Path("out.safetensors"), base=base, whole=whole,
+        device="cpu",
     )  # fmt: skip
 
 
@@ -72,3 +75,15 @@ def test_a_model_of_another_garment_is_refused(scene, toy_model, toy_scene, toy_
     base = model_file(toy_model(toy_scene(proxies=0)), FABRICS["silk"], {})
     with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
         job(scene, base, toy_motion(scene, 9))
+
+
+def test_a_whole_model_goes_on_as_it_is_and_all_of_it_learns(scene, toy_model, toy_motion):
+    base = model_file(toy_model(scene, feedback_points=3), FABRICS["silk"], {})
+    asked = job(scene, base, toy_motion(scene, 9), whole=True)
+    assert asked.model == base.config and asked.train.static_iterations == 0
+    assert asked.train.static_batch == TrainConfig().static_batch  # P learns, too
+    parts = build_parts(replace(asked, train=replace(asked.train, recombinations=0, perturbations=0)), CPU)
+    for name, parameter in parts.model.named_parameters():
+        assert parameter.requires_grad
+        assert torch.equal(parameter, torch.from_numpy(base.parameters[name]))
+    assert parts.smoothing

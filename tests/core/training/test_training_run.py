@@ -27,6 +27,7 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.energy import TERMS, GarmentEnergy
+from ssilk_core.physics.intersections.contours import IntersectionContours
 from ssilk_core.physics.skin.covered_skin import CoveredSkin
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.scene.fabrics import Fabric
@@ -811,6 +812,13 @@ def test_a_validation_counts_triangles_that_intersect_in_frames_spread_over_its_
     assert Score.of(document).intersections == found
     del document["intersections"]
     assert Score.of(document).intersections is None
+    weighed = Validator(
+        bank, energy, body, scene, model.decoder.rest, 30.0, 50, spans=clips, intersection_weight=0.5
+    ).score(model)
+    every = validator.lbs_vertices(bank.character(torch.arange(50))) + crumpled
+    contours = IntersectionContours(validator.cloth, scene.classes, torch.device("cpu")).lengths(every)
+    assert weighed.terms["intersection"] == pytest.approx(0.5 * float(contours.mean())) and contours.min() > 0.1
+    assert weighed.total == pytest.approx(score.total + weighed.terms["intersection"])
 
 
 def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goes_on(tmp_path, monkeypatch, capsys):
