@@ -188,23 +188,14 @@ def _edge(points, ia, ib, ja, jb, jc, own):
 
 
 @triton.jit
-def _pull(points, gradient, ia, ib, ja, jb, jc, own, hits, gx, gy, gz, steepest):
-    """Add the gradient of the contour's end on edges ia ib; return how many ends there are now."""
-    inside, t, u, v, nx, ny, nz, _, _, _, ex, ey, ez = _edge(points, ia, ib, ja, jb, jc, own)
-    sign = tl.where(hits == 0, 1.0, -1.0)
-    fx, fy, fz = sign * gx, sign * gy, sign * gz
-    slope = dot(nx, ny, nz, ex, ey, ez)
-    least = steepest * tl.sqrt(dot(nx, ny, nz, nx, ny, nz) * dot(ex, ey, ez, ex, ey, ez)) + TINY
-    slope = tl.where(slope < 0, -1.0, 1.0) * tl.maximum(tl.abs(slope), least)
-    along = -dot(fx, fy, fz, ex, ey, ez) / slope
-    nx, ny, nz = along * nx, along * ny, along * nz
-    fx, fy, fz = fx + nx, fy + ny, fz + nz
-    _add(gradient, ia, inside, (1 - t) * fx, (1 - t) * fy, (1 - t) * fz)
-    _add(gradient, ib, inside, t * fx, t * fy, t * fz)
-    _add(gradient, ja, inside, -(1 - u - v) * nx, -(1 - u - v) * ny, -(1 - u - v) * nz)
-    _add(gradient, jb, inside, -u * nx, -u * ny, -u * nz)
-    _add(gradient, jc, inside, -v * nx, -v * ny, -v * nz)
-    return hits + inside.to(tl.int32)
+def _chosen(edge, ia, ib, ic, ja, jb, jc):
+    """The ends of an edge, 0 to 2 of triangle i and 3 to 5 of j, and the corners of the other triangle."""
+    of_first = edge < 3
+    corner = edge % 3
+    a, b, c = tl.where(of_first, ia, ja), tl.where(of_first, ib, jb), tl.where(of_first, ic, jc)
+    start = tl.where(corner == 0, a, tl.where(corner == 1, b, c))
+    end = tl.where(corner == 0, b, tl.where(corner == 1, c, a))
+    return start, end, tl.where(of_first, ja, ia), tl.where(of_first, jb, ib), tl.where(of_first, jc, ic)
 
 
 @triton.jit
@@ -222,7 +213,7 @@ def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, 
     name = tl.load(pairs + place * slots + slot, mask=counts, other=0)
     low = tl.zeros((slots,), tl.int32)
     high = low + allowed_count
-    for _ in tl.static_range(halvings):
+    for halving in tl.static_range(halvings):
         middle = (low + high) // 2
         less = tl.load(allowed + middle, mask=low < high, other=0) < name
         low, high = tl.where((low < high) & less, middle + 1, low), tl.where((low < high) & ~less, middle, high)
@@ -232,28 +223,36 @@ def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, 
     ja, jb, jc = tl.load(faces + 3 * j), tl.load(faces + 3 * j + 1), tl.load(faces + 3 * j + 2)
     hits = tl.zeros((slots,), tl.int32)
     zero = tl.zeros((slots,), tl.float32)
-    sx, sy, sz, ex, ey, ez = zero, zero, zero, zero, zero, zero
-    for edge in tl.static_range(6):
-        if edge < 3:
-            a, b = (ia, ib) if edge == 0 else ((ib, ic) if edge == 1 else (ic, ia))
-            inside, _, _, _, _, _, _, rx, ry, rz, _, _, _ = _edge(points, a, b, ja, jb, jc, counts)
-        else:
-            a, b = (ja, jb) if edge == 3 else ((jb, jc) if edge == 4 else (jc, ja))
-            inside, _, _, _, _, _, _, rx, ry, rz, _, _, _ = _edge(points, a, b, ia, ib, ic, counts)
+    sx, sy, sz, lx, ly, lz = zero, zero, zero, zero, zero, zero
+    for edge in range(6):
+        start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
+        edge_hit = _edge(points, start, end, fa, fb, fc, counts)
+        inside, rx, ry, rz = edge_hit[0], edge_hit[7], edge_hit[8], edge_hit[9]
         first = inside & (hits == 0)
         sx, sy, sz = tl.where(first, rx, sx), tl.where(first, ry, sy), tl.where(first, rz, sz)
-        ex, ey, ez = tl.where(inside, rx, ex), tl.where(inside, ry, ey), tl.where(inside, rz, ez)
+        lx, ly, lz = tl.where(inside, rx, lx), tl.where(inside, ry, ly), tl.where(inside, rz, lz)
         hits += inside.to(tl.int32)
     counts &= hits == 2
-    gx, gy, gz = sx - ex, sy - ey, sz - ez
+    gx, gy, gz = sx - lx, sy - ly, sz - lz
     length = tl.sqrt(dot(gx, gy, gz, gx, gy, gz))
     tl.store(lengths + place, tl.sum(tl.where(counts, length, 0.0), 0))
     length = tl.maximum(length, TINY)
     gx, gy, gz = gx / length, gy / length, gz / length
-    hits = tl.zeros((slots,), tl.int32)
-    hits = _pull(points, gradient, ia, ib, ja, jb, jc, counts, hits, gx, gy, gz, steepest)
-    hits = _pull(points, gradient, ib, ic, ja, jb, jc, counts, hits, gx, gy, gz, steepest)
-    hits = _pull(points, gradient, ic, ia, ja, jb, jc, counts, hits, gx, gy, gz, steepest)
-    hits = _pull(points, gradient, ja, jb, ia, ib, ic, counts, hits, gx, gy, gz, steepest)
-    hits = _pull(points, gradient, jb, jc, ia, ib, ic, counts, hits, gx, gy, gz, steepest)
-    _pull(points, gradient, jc, ja, ia, ib, ic, counts, hits, gx, gy, gz, steepest)
+    ends = tl.zeros((slots,), tl.int32)
+    for edge in range(6):
+        start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
+        inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
+        sign = tl.where(ends == 0, 1.0, -1.0)
+        fx, fy, fz = sign * gx, sign * gy, sign * gz
+        slope = dot(nx, ny, nz, ex, ey, ez)
+        least = steepest * tl.sqrt(dot(nx, ny, nz, nx, ny, nz) * dot(ex, ey, ez, ex, ey, ez)) + TINY
+        slope = tl.where(slope < 0, -1.0, 1.0) * tl.maximum(tl.abs(slope), least)
+        along = -dot(fx, fy, fz, ex, ey, ez) / slope
+        nx, ny, nz = along * nx, along * ny, along * nz
+        fx, fy, fz = fx + nx, fy + ny, fz + nz
+        _add(gradient, start, inside, (1 - t) * fx, (1 - t) * fy, (1 - t) * fz)
+        _add(gradient, end, inside, t * fx, t * fy, t * fz)
+        _add(gradient, fa, inside, -(1 - u - v) * nx, -(1 - u - v) * ny, -(1 - u - v) * nz)
+        _add(gradient, fb, inside, -u * nx, -u * ny, -u * nz)
+        _add(gradient, fc, inside, -v * nx, -v * ny, -v * nz)
+        ends += inside.to(tl.int32)
