@@ -213,7 +213,7 @@ def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, 
     name = tl.load(pairs + place * slots + slot, mask=counts, other=0)
     low = tl.zeros((slots,), tl.int32)
     high = low + allowed_count
-    for halving in tl.static_range(halvings):
+    for _halving in tl.static_range(halvings):
         middle = (low + high) // 2
         less = tl.load(allowed + middle, mask=low < high, other=0) < name
         low, high = tl.where((low < high) & less, middle + 1, low), tl.where((low < high) & ~less, middle, high)
