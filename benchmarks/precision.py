@@ -34,9 +34,10 @@ from ssilk_core.quality.evaluation.takes import back_and_forth
 from ssilk_core.scene.assets import Motion
 from ssilk_core.training.motion_bank import roll_states
 
-MOST_RMS = 1e-4  # [m] over all vertices, frames and clips
-# [m] any vertex in any frame: amid a cartwheel a rollout makes millimetres of any rounding, for a few frames.
-MOST_MOVED = 5e-3
+# Amid a cartwheel, or where a cape lies on the head of someone who gets up, a rollout makes millimetres of any
+# rounding, for a few frames, at the same energy.
+MOST_RMS = 2.5e-4  # [m] over all vertices, frames and clips
+MOST_MOVED = 1e-2  # [m] any vertex in any frame
 MOST_CHANGED = 1e-3  # of each energy, relative to the sizes of all of them
 HELD_OUT, HARDEST = ("valid", "flips"), ("inertia", "flips")
 LOOPED, FRAMES, STRETCHES = ("02_04", "02_02", "49_08a"), 1000, 4

@@ -36,8 +36,7 @@ class Objective:
             because training cannot move them.
         newton_weight: see `NewtonDistance`; zero for the energy alone.
         clearance, patches: see `settings.TrainConfig`; `patches` is `contact_patches`.
-        contours, intersection_weight: those of the garment, and the weight of their length [N]; None and zero for
-            cloth that does not know of cloth.
+        contours: those of the garment; None for cloth that does not know of cloth.
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
     """
@@ -54,11 +53,10 @@ class Objective:
         buried: Tensor | None = None,
         patches: bool = True,
         contours: IntersectionContours | None = None,
-        intersection_weight: float = 0.0,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface, self.clearance, self.buried = surface, clearance, buried
-        self.contours, self.intersection_weight = contours, intersection_weight
+        self.contours = contours
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
@@ -117,8 +115,7 @@ class Objective:
         """Return the energy of contours (N,) at positions x (V, 3, N): that of some frames stands for the others."""
         found = x.new_zeros(x.shape[-1])
         assert self.contours is not None
-        lengths = self.contours.lengths(x[..., ::CROSSED_EVERY].contiguous())
-        found[::CROSSED_EVERY] = CROSSED_EVERY * self.intersection_weight * lengths
+        found[::CROSSED_EVERY] = CROSSED_EVERY * self.contours.energy(x[..., ::CROSSED_EVERY].contiguous())
         return found
 
     def _buried(self, frames: Tensor) -> Tensor | None:

@@ -13,7 +13,11 @@ from ..events import Message, Reporter, format_count, silent
 from ..network.checkpoint import ModelFile
 from ..network.model.network import GarmentModel, model_joints
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
+from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
+from ..physics.intersections.cloth import ClothIntersections
+from ..physics.intersections.contours import IntersectionContours
+from ..physics.intersections.pairs import need_predicates
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .job import TrainJob
 from .motion_bank import MotionBank, build_bank, usable_spans
@@ -80,7 +84,6 @@ class TrainingParts:
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
             self.buried if surface else None, config.contact_patches, self.validator.contours,
-            config.intersection_weight,
         )  # fmt: skip
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
@@ -92,9 +95,11 @@ def build_parts(
     """Build what a run needs, and say before each long part what is done.
 
     Raises:
-        SsilkError: the motions are too short.
+        SsilkError: the motions are too short, or libigl is missing where `intersection_weight` needs it.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
+    if job.train.intersection_weight:
+        need_predicates()
     motions, extra = job.training_motions(), job.extra_motions()
     if extra != (job.train.recombinations, job.train.perturbations):
         report(Message("{} recombined and {} perturbed motions are added for each, as many as fit".format(*extra)))
@@ -122,8 +127,10 @@ def build_parts(
     whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, skeleton, fps)
-    weight = job.train.intersection_weight
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, weight)
+    contours = None
+    if tension := job.train.intersection_weight * GRAVITY * float(energy.mass.sum()):
+        contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned

@@ -37,8 +37,9 @@ class TrainConfig:
             weight times its size; zero for the plain mean over frames, as in the paper (`training.objective.total`).
         newton_weight: weight of the distance to a Newton step beside the energy (`training.newton_distance`); zero
             for the energy alone, as in the paper.
-        intersection_weight: weight of the length of contours along which the garment intersects itself, in dynamic
-            training [N] (`intersections.contours`); zero for cloth that does not know of cloth, as in the paper.
+        intersection_weight: tension of the contours along which the garment intersects itself, relative to the
+            garment's weight, in dynamic training (`intersections.contours`); zero for cloth that does not know of
+            cloth, as in the paper.
         clearance: by which contact begins further from the body in training than in the fabric's own law [m]. A
             network misses the minimum by millimetres; this keeps them off the skin. Zero in the paper.
         static_batch: single poses in each step of dynamic training, to which P is still fitted.

@@ -21,7 +21,7 @@ from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
 from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.figures import INTERSECTION, SelfIntersections
-from ..physics.intersections.pairs import can_find, need_predicates
+from ..physics.intersections.pairs import can_find
 from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
@@ -86,7 +86,7 @@ class Validator:
     Args:
         frames: most frames of a clip.
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
-        intersection_weight: with it contours of the garment are a term, as in training, which needs libigl.
+        contours: those of the garment, whose energy is a term where training has it.
     """
 
     def __init__(
@@ -100,18 +100,14 @@ class Validator:
         frames: int,
         group: ProcessGroup = SINGLE_PROCESS,
         spans: Sequence[Motion] | None = None,
-        intersection_weight: float = 0.0,
+        contours: IntersectionContours | None = None,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
         self.cloth = ClothIntersections.of(scene) if can_find() else None
-        self.intersection_weight, self.contours = intersection_weight, None
-        if intersection_weight:
-            need_predicates()
-            cloth = self.cloth or ClothIntersections.of(scene)
-            self.contours = IntersectionContours(cloth, scene.classes, rest.device)
+        self.contours = contours
         self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -276,7 +272,7 @@ class Validator:
             posed = self.body.pose(character, limbs=False)
             terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
             if self.contours:
-                terms[INTERSECTION] = self.intersection_weight * self.contours.lengths(x)
+                terms[INTERSECTION] = self.contours.energy(x)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

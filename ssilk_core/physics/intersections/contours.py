@@ -3,7 +3,7 @@
 
 Two triangles that intersect have a segment in common, and these segments are the contours. Where a vertex has come
 through other cloth is not seen there, but the contour is, and cloth that leaves the other by the shortest way
-shortens it. With a weight per length [N] it is a potential (Volino and Magnenat-Thalmann, "Resolving Surface
+shortens it. With a line tension [N] its length is a potential (Volino and Magnenat-Thalmann, "Resolving Surface
 Collisions through Intersection Contour Minimization", 2006).
 
 A segment ends where an edge of one triangle crosses the other. Such an end r slides along its edge e as the plane of
@@ -36,11 +36,12 @@ class IntersectionContours:
     Args:
         cloth: the garment, and what may intersect.
         classes: of its vertices, shape (V,).
+        tension: of the contours [N].
     """
 
-    def __init__(self, cloth: ClothIntersections, classes: Ints, device: torch.device) -> None:
+    def __init__(self, cloth: ClothIntersections, classes: Ints, tension: float, device: torch.device) -> None:
         mesh = cloth.mesh
-        self._cloth = cloth
+        self._cloth, self.tension = cloth, tension
         # Near triangles are neighbours in the order of a curve that fills space.
         order = _spatial_order(mesh.points[mesh.faces].mean(axis=1))
         place = np.empty_like(order)
@@ -57,6 +58,10 @@ class IntersectionContours:
         self._moves = tensor((classes[faces] == LOOSE).any(axis=1))
         self._allowed = tensor(allowed if len(allowed) else np.array([-1]), torch.int64)
         self._order = order
+
+    def energy(self, x: Tensor) -> Tensor:
+        """Return the energy of the contours in each frame [J], shape (N,)."""
+        return self.tension * self.lengths(x)
 
     def lengths(self, x: Tensor) -> Tensor:
         """Return the length of the contours in each frame [m], shape (N,), with a gradient."""
@@ -87,16 +92,16 @@ class IntersectionContours:
 
 class _Lengths(Function):
     @staticmethod
-    def forward(ctx, x, *tables):  # type: ignore[no-untyped-def]
+    def forward(ctx, x, faces, places, moves, allowed):
         from ..kernels.contours import contours_kernel
 
-        lengths, gradient = contours_kernel(x.detach(), *tables, STEEPEST)
+        lengths, gradient = contours_kernel(x.detach(), faces, places, moves, allowed, STEEPEST)
         ctx.save_for_backward(gradient)
         return lengths
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, upstream):  # type: ignore[no-untyped-def]
+    def backward(ctx, upstream):
         return ctx.saved_tensors[0] * upstream, *[None] * 4
 
 

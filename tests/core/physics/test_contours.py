@@ -36,7 +36,7 @@ def mesh() -> Mesh:
 
 
 def contours_of(mesh: Mesh, kind: int = LOOSE, device: torch.device = CPU) -> IntersectionContours:
-    return IntersectionContours(ClothIntersections(mesh), np.full(mesh.vertex_count, kind), device)
+    return IntersectionContours(ClothIntersections(mesh), np.full(mesh.vertex_count, kind), 0.5, device)
 
 
 def crossing(mesh: Mesh, seed: int = 0, noise: float = 0.0) -> np.ndarray:
@@ -63,6 +63,7 @@ def test_two_sheets_meet_along_a_line(mesh) -> None:
     found = contours_of(mesh).lengths(x)
     assert found[0] == 0
     assert found[1].item() == pytest.approx(0.1 * np.hypot(0.9, 0.1), rel=1e-9)
+    torch.testing.assert_close(contours_of(mesh).energy(x), 0.5 * found)
 
 
 def test_gradients_are_those_by_differences_where_edges_are_steep(mesh) -> None:

@@ -125,8 +125,7 @@ def test_the_contours_of_every_fourth_frame_stand_for_all(objective, monkeypatch
     pytest.importorskip("igl")
     assert "intersection" not in objective.window(sampler_of(objective, CONFIG), torch.zeros(2, 3, 8), *POSES)[0]
     mesh, classes = objective.model.scene.garment.mesh, objective.model.scene.classes
-    objective.contours = IntersectionContours(ClothIntersections(mesh), classes, torch.device("cpu"))
-    objective.intersection_weight = 0.5
+    objective.contours = IntersectionContours(ClothIntersections(mesh), classes, 0.5, torch.device("cpu"))
     posed = objective.model.vertices
     crumpled = 0.1 * torch.randn(mesh.vertex_count, 3, 1, generator=torch.Generator().manual_seed(1))
     decoded = []

@@ -812,12 +812,12 @@ def test_a_validation_counts_triangles_that_intersect_in_frames_spread_over_its_
     assert Score.of(document).intersections == found
     del document["intersections"]
     assert Score.of(document).intersections is None
+    contours = IntersectionContours(validator.cloth, scene.classes, 0.5, torch.device("cpu"))
     weighed = Validator(
-        bank, energy, body, scene, model.decoder.rest, 30.0, 50, spans=clips, intersection_weight=0.5
+        bank, energy, body, scene, model.decoder.rest, 30.0, 50, spans=clips, contours=contours
     ).score(model)
-    every = validator.lbs_vertices(bank.character(torch.arange(50))) + crumpled
-    contours = IntersectionContours(validator.cloth, scene.classes, torch.device("cpu")).lengths(every)
-    assert weighed.terms["intersection"] == pytest.approx(0.5 * float(contours.mean())) and contours.min() > 0.1
+    lengths = contours.lengths(validator.lbs_vertices(bank.character(torch.arange(50))) + crumpled)
+    assert weighed.terms["intersection"] == pytest.approx(0.5 * float(lengths.mean())) and lengths.min() > 0.1
     assert weighed.total == pytest.approx(score.total + weighed.terms["intersection"])
 
 
