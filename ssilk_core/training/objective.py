@@ -21,7 +21,6 @@ from .newton_distance import NewtonDistance
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
-CROSSED_EVERY = 4  # of so many frames of a batch one is searched for contours
 REGULARIZATION = "latent regularization"  # a term of latents, which has no frames
 
 
@@ -111,13 +110,6 @@ class Objective:
         normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
         return normal, offset + self.clearance
 
-    def _intersection(self, x: Tensor) -> Tensor:
-        """Return the energy of contours (N,) at positions x (V, 3, N): that of some frames stands for the others."""
-        found = x.new_zeros(x.shape[-1])
-        assert self.contours is not None
-        found[::CROSSED_EVERY] = CROSSED_EVERY * self.contours.energy(x[..., ::CROSSED_EVERY].contiguous())
-        return found
-
     def _buried(self, frames: Tensor) -> Tensor | None:
         return None if self.buried is None else self.buried[:, frames]
 
@@ -177,7 +169,7 @@ class Objective:
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
         terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character, self._buried(asked))
         if self.contours:
-            terms[INTERSECTION] = self._intersection(x)
+            terms[INTERSECTION] = self.contours.energy(x)
         count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}

@@ -194,6 +194,7 @@ PRESETS = {
                 static_batch=8,
                 recombinations=0,
                 perturbations=0,
+                intersection_weight=0.02,
                 rotated_fraction=0.3,
                 static_learning_rate=2e-3,
                 learning_rate=6e-4,
@@ -210,14 +211,22 @@ PRESETS = {
             name="preview",
             model=ModelConfig(translations=True),
             train=TrainConfig(
-                iterations=16_000, static_fraction=0.2, shape_learning_rate_scale=1.0, validate_every=1600
+                iterations=16_000,
+                static_fraction=0.2,
+                intersection_weight=0.02,
+                shape_learning_rate_scale=1.0,
+                validate_every=1600,
             ),
         ),
         Preset(
             name="light",
             model=ModelConfig(latent=32, widths=(64, 64), shapes=16),
             train=TrainConfig(
-                iterations=16_000, static_fraction=0.2, shape_learning_rate_scale=1.0, validate_every=1600
+                iterations=16_000,
+                static_fraction=0.2,
+                intersection_weight=0.02,
+                shape_learning_rate_scale=1.0,
+                validate_every=1600,
             ),
         ),
         Preset(
@@ -228,6 +237,7 @@ PRESETS = {
                 static_fraction=0.5,
                 recombinations=24,
                 perturbations=24,
+                intersection_weight=0.02,
                 static_learning_rate=5e-4,
                 shape_learning_rate_scale=1.0,
                 weight_decay=0.5,

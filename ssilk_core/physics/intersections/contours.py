@@ -26,6 +26,7 @@ from ...scene.assets import LOOSE, Ints
 from ...scene.mesh.topology import merged_places
 from .. import kernels
 from .cloth import ClothIntersections
+from .figures import EVERY
 
 STEEPEST = 0.2  # sine of the angle between an edge and a face, from which on the end of a contour slides freely
 
@@ -60,8 +61,13 @@ class IntersectionContours:
         self._order = order
 
     def energy(self, x: Tensor) -> Tensor:
-        """Return the energy of the contours in each frame [J], shape (N,)."""
-        return self.tension * self.lengths(x)
+        """Return the energy of the contours [J], shape (N,), whose mean is that of one frame in `EVERY`.
+
+        Only these frames are searched. They stand for those that follow them, which have zero.
+        """
+        found = x.new_zeros(x.shape[-1])
+        found[::EVERY] = EVERY * self.tension * self.lengths(x[..., ::EVERY].contiguous())
+        return found
 
     def lengths(self, x: Tensor) -> Tensor:
         """Return the length of the contours in each frame [m], shape (N,), with a gradient."""
