@@ -5,6 +5,9 @@ A shot starts with the quasi-static state of its first pose, to which the garmen
 with the velocity of linear blend skinning, so that a character that starts walking does not leave its garment behind.
 Each step is solved relative to the character's root, where single precision is finest; between steps positions are
 kept in world space, in float64.
+
+A step in which a limb moves further than it is thick takes it through the cloth, and no minimisation leads back. Such
+steps do not converge. They are taken again in shorter ones, each with the body where it is then.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -34,6 +38,7 @@ PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
 POSES = 8  # from the bind pose to one in which cloth comes to rest
 ON_THE_WAY = 10  # iterations for each of these but the last
+PARTS, SPLITS = 4, 2  # shorter steps for one that does not converge, and how often these are split themselves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +91,9 @@ class SimulatedFrame:
         shot, number: index of the shot, and of the frame in it.
         points: garment vertices in world space [m], float64, shape (V, 3).
         energy: the incremental potential [J], with heights relative to the character's root.
-        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame.
+        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame. Where that was taken in
+            shorter ones, energy and fixed vertices are those of the last of these, the residual is the largest, and
+            iterations are all.
     """
 
     shot: int
@@ -104,11 +111,13 @@ class StepHistory:
 
     Attributes:
         last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
-            in the second step.
+            in the second step. After shorter steps it is where the last velocity leads back to in a whole one.
         root: the character's root one step ago [m], float64, shape (3, N).
         lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
         neighbours: which cloth may touch which, where that is looked at.
         friction: of what presses at the last positions, for the next step; None without.
+        matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
+            body is posed in shorter steps; None where no step is to be split.
     """
 
     last: Tensor
@@ -117,14 +126,19 @@ class StepHistory:
     lbs: Tensor
     neighbours: ClothNeighbours | None = None
     friction: Friction | None = None
+    matrices: Tensor | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
-        before = None if self.before is None else self.before[..., :count]
-        neighbours = self.neighbours and self.neighbours.first(count)
-        friction = self.friction and self.friction.select(torch.arange(count, device=self.last.device))
-        root, lbs = self.root[:, :count], self.lbs[..., :count]
-        return StepHistory(self.last[..., :count], before, root, lbs, neighbours, friction)
+        return self.select(torch.arange(count, device=self.last.device))
+
+    def select(self, shots: Tensor) -> StepHistory:
+        """Return the history of the shots with indices (M,), in ascending order."""
+        before, matrices = (v if v is None else v[..., shots] for v in (self.before, self.matrices))
+        neighbours, friction = self.neighbours and self.neighbours.select(shots), self.friction
+        friction = friction and friction.select(shots)
+        root, lbs = self.root[:, shots], self.lbs[..., shots]
+        return StepHistory(self.last[..., shots], before, root, lbs, neighbours, friction, matrices)
 
     @property
     def local(self) -> Tensor:
@@ -155,7 +169,7 @@ class Simulator:
         self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
         self.poser = CharacterPoser(scene, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
-        self.dt = 1 / (self.options.fps * self.options.substeps)
+        self.dt, self.splits = 1 / (self.options.fps * self.options.substeps), SPLITS
 
     def sampled(self, scene: Scene, cubature: Cubature) -> Simulator:
         """Return a simulator of the same scene on the elements of a cubature, whose vertices alone it moves."""
@@ -200,14 +214,39 @@ class Simulator:
 
     def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
         """Return the states after those of the past, and their solution."""
-        solution = self.step(poses, past)
-        return self._history(solution, poses, past.last), solution
+        solution, before = self.step(poses, past), past.last
+        stuck = (~(solution.residual <= self.options.solver.tolerance)).nonzero()[:, 0]
+        if len(stuck) and self.splits and past.matrices is not None:
+            part, found = self._in_parts(past.select(stuck), poses.select(stuck))
+            assert part.before is not None
+            solution, before = solution.replace_frames(stuck, found), before.index_copy(-1, stuck, part.before)
+        return self._history(solution, poses, before), solution
+
+    def _in_parts(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
+        """Return what `_after` does by way of `PARTS` shorter steps."""
+        shorter = copy.copy(self)
+        shorter.dt, shorter.splits = self.dt / PARTS, self.splits - 1
+        assert past.matrices is not None
+        solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses)
+        if past.before is not None:
+            past = replace(past, before=past.last - (past.last - past.before) / PARTS)
+        for share in np.arange(1, PARTS + 1) / PARTS:
+            past, found = shorter._after(past, poses if share == 1 else between(share))
+            solutions.append(found)
+        assert past.before is not None
+        residual, iterations = (
+            torch.stack([getattr(each, name) for each in solutions]) for name in ("residual", "iterations")
+        )
+        spent = sum(each.cg_iterations for each in solutions)
+        found = replace(found, residual=residual.amax(0), iterations=iterations.sum(0), cg_iterations=spent)
+        return replace(past, before=past.last - PARTS * (past.last - past.before)), found
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
         friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
         world = solution.x.double() + poses.root
-        return StepHistory(world, before, poses.root, poses.lbs, solution.neighbours, friction)
+        known = solution.neighbours, friction, poses.matrices
+        return StepHistory(world, before, poses.root, poses.lbs, *known)
 
     def _first(self, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
