@@ -91,7 +91,7 @@ class Solution:
     neighbours: ClothNeighbours | None = None
 
     def replace_frames(self, frames: Tensor, other: Solution) -> Solution:
-        """Return the solution with frames (M,), in ascending order, from another one; iterations are those of both."""
+        """Return the solution with frames (M,), in ascending order, from another; iterations are those of both."""
         x, energy, residual, fixed = (
             getattr(self, name).index_copy(-1, frames, getattr(other, name))
             for name in ("x", "energy", "residual", "fixed")
