@@ -7,7 +7,10 @@ Each step is solved relative to the character's root, where single precision is 
 kept in world space, in float64.
 
 A step in which a limb moves further than it is thick takes it through the cloth, and no minimisation leads back. Such
-steps do not converge. They are taken again in shorter ones, each with the body where it is then.
+steps do not converge. They are taken again in shorter ones, each with the body where it is then. In these cloth is
+pushed off the limbs that were through it at the end of the last one (`collision.pierced`): which limbs are changes
+from one position to the next, and the energy jumps with it. A shorter step that takes another limb through the cloth
+is split once more.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from ...events import Countdown, Message, Reporter, silent
 from ...scene.assets import Floats, Motion, Scene, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
+from ..collision.pierced import PiercedCloth
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
@@ -118,6 +122,7 @@ class StepHistory:
         friction: of what presses at the last positions, for the next step; None without.
         matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
             body is posed in shorter steps; None where no step is to be split.
+        pierced: the cloth that limbs were through at the last positions, which a shorter step holds on to.
     """
 
     last: Tensor
@@ -127,6 +132,7 @@ class StepHistory:
     neighbours: ClothNeighbours | None = None
     friction: Friction | None = None
     matrices: Tensor | None = None
+    pierced: PiercedCloth | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
@@ -136,9 +142,9 @@ class StepHistory:
         """Return the history of the shots with indices (M,), in ascending order."""
         before, matrices = (v if v is None else v[..., shots] for v in (self.before, self.matrices))
         neighbours, friction = self.neighbours and self.neighbours.select(shots), self.friction
-        friction = friction and friction.select(shots)
+        friction, pierced = friction and friction.select(shots), self.pierced and self.pierced.select(shots)
         root, lbs = self.root[:, shots], self.lbs[..., shots]
-        return StepHistory(self.last[..., shots], before, root, lbs, neighbours, friction, matrices)
+        return StepHistory(self.last[..., shots], before, root, lbs, neighbours, friction, matrices, pierced)
 
     @property
     def local(self) -> Tensor:
@@ -215,11 +221,14 @@ class Simulator:
     def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
         """Return the states after those of the past, and their solution."""
         solution, before = self.step(poses, past), past.last
-        stuck = (~(solution.residual <= self.options.solver.tolerance)).nonzero()[:, 0]
-        if len(stuck) and self.splits and past.matrices is not None:
-            part, found = self._in_parts(past.select(stuck), poses.select(stuck))
-            assert part.before is not None
-            solution, before = solution.replace_frames(stuck, found), before.index_copy(-1, stuck, part.before)
+        if self.splits and past.matrices is not None:
+            stuck = ~(solution.residual <= self.options.solver.tolerance)
+            if past.pierced and (now := self._pierced(solution.x, poses)):
+                stuck |= ((now.radius > 0) & (past.pierced.radius == 0)).any(0)
+            if len(again := stuck.nonzero()[:, 0]):
+                part, found = self._in_parts(past.select(again), poses.select(again))
+                assert part.before is not None
+                solution, before = solution.replace_frames(again, found), before.index_copy(-1, again, part.before)
         return self._history(solution, poses, before), solution
 
     def _in_parts(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
@@ -230,8 +239,11 @@ class Simulator:
         solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses)
         if past.before is not None:
             past = replace(past, before=past.last - (past.last - past.before) / PARTS)
+        at = between(0.0)
         for share in np.arange(1, PARTS + 1) / PARTS:
-            past, found = shorter._after(past, poses if share == 1 else between(share))
+            past = replace(past, pierced=self._pierced(past.local, at))
+            at = poses if share == 1 else between(share)
+            past, found = shorter._after(past, at)
             solutions.append(found)
         assert past.before is not None
         residual, iterations = (
@@ -240,6 +252,9 @@ class Simulator:
         spent = sum(each.cg_iterations for each in solutions)
         found = replace(found, residual=residual.amax(0), iterations=iterations.sum(0), cg_iterations=spent)
         return replace(past, before=past.last - PARTS * (past.last - past.before)), found
+
+    def _pierced(self, x: Tensor, poses: PosedCharacters) -> PiercedCloth | None:
+        return self.potential.contacts.pierced(self.potential.cloth.positions(x), poses.body)
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
@@ -300,8 +315,10 @@ class Simulator:
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         friction = past.friction and past.friction.after(poses.body.points)
-        predicted = predicted.to(past.lbs.dtype)
-        return StepInputs(poses.body, gravity, predicted, past.local, self.dt, poses.lbs, friction=friction)
+        limbs = poses.body.limbs
+        pierced = past.pierced.on(limbs) if past.pierced and limbs else None
+        own = predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs
+        return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced)
 
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
