@@ -144,7 +144,7 @@ class IncrementalPotential:
     ) -> SmoothedDistance | None:
         """Return distances that give the energy and its derivatives at x as `body_distance` does, where those at
         other positions `at` (V, 3, N) are known: on a processor in less time, the nearer the two are."""
-        if inputs.body is None or known is None:
+        if inputs.body is None or known is None or inputs.pierced is not None:
             return self.body_distance(x, inputs)
         positions, within = self.cloth.positions, self.law.start
         return self.contacts.smoothed_nearby(positions(x), inputs.body, known, positions(at), within)
