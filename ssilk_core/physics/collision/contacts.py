@@ -27,7 +27,7 @@ from .distance import MAX_DEPTH, Patches, PosedBody, nearest_planes, signed_dist
 from .limb_axes import loose_faces
 from .nearest_vertex import GARMENT_BLOCK
 from .patches import faces_around, patches_beneath
-from .pierced import Piercing
+from .pierced import PiercedCloth, Piercing
 from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 
@@ -105,11 +105,20 @@ class Contacts:
         normal, offset = self._query_groups(x, body, nearest_planes, no_planes)
         return normal, offset
 
-    def smoothed(self, x: Tensor, body: PosedBody, within: float = math.inf) -> SmoothedDistance:
+    def pierced(self, x: Tensor, body: PosedBody) -> PiercedCloth | None:
+        """Return where limbs pierce the cloth with the samples x (S, 3, N); None where none ever can."""
+        if not (self._piercing and body.limbs):
+            return None
+        return self._piercing.find(x[: self._piercing.count].float(), body.limbs)
+
+    def smoothed(
+        self, x: Tensor, body: PosedBody, within: float = math.inf, held: PiercedCloth | None = None
+    ) -> SmoothedDistance:
         """Return smoothed distances of x (S, 3, N) to the body, in the precision of x.
 
         Args:
             within: distances that matter outside of the body [m] (`smoothed_planes`).
+            held: what limbs pierce, wherever x is; found by default.
         """
 
         def find(x: Tensor, body: PosedBody, blocks: Tensor, patches: Patches | None) -> Sequence[Tensor]:
@@ -120,7 +129,7 @@ class Contacts:
 
         found = SmoothedDistance(*self._query_groups(x, body, find, no_contact))
         if self._piercing and body.limbs:
-            self._piercing.replace_planes(x, body.limbs, found.normal, found.offset, found.curvature)
+            self._piercing.replace_planes(x, body.limbs, found.normal, found.offset, found.curvature, held)
         return found
 
     def touched(self, x: Tensor, search_radius: Tensor, body: PosedBody) -> tuple[Tensor, Tensor, Tensor, Tensor]:

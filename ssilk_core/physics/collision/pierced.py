@@ -34,16 +34,36 @@ class PiercedCloth:
     """Where L limbs pierce the cloth in N frames.
 
     Attributes:
+        bone, step: the last one that is crossed, and its place on the limb's path, shape (L, N).
         point: of the garment at rest, which the crossing nearest to the tip is at [m], shape (L, 3, N).
         direction: of the bone there, towards the tip, shape (L, 3, N).
         tip: where the limb ends, along that direction from the origin [m], shape (L, N).
         radius: of the cloth around the crossing that is pushed [m]; zero where the limb does not pierce, (L, N).
     """
 
+    bone: Tensor
+    step: Tensor
     point: Tensor
     direction: Tensor
     tip: Tensor
     radius: Tensor
+
+    @classmethod
+    def of(cls, bone: Tensor, step: Tensor, point: Tensor, radius: Tensor, limbs: PosedLimbs) -> PiercedCloth:
+        """Return that of crossings on posed limbs."""
+        start, end = (ends.gather(0, bone[:, None].expand(-1, 3, -1)) for ends in (limbs.start, limbs.end))
+        length = (end - start).norm(dim=1).clamp_min(MIN_LENGTH)
+        direction = (end - start) / length[:, None]
+        tip = (direction * end).sum(1) + limbs.beyond.gather(1, step)
+        return cls(bone, step, point, direction, tip, radius)
+
+    def on(self, limbs: PosedLimbs) -> PiercedCloth:
+        """Return the same cloth, pierced by the same limbs in another pose; none by those that are buried in it."""
+        return PiercedCloth.of(self.bone, self.step, self.point, self.radius.where(~limbs.buried, 0), limbs)
+
+    def select(self, frames: Tensor) -> PiercedCloth:
+        """Return that of the frames with indices (M,)."""
+        return PiercedCloth(*(getattr(self, name)[..., frames] for name in vars(self)))
 
 
 class Piercing:
@@ -82,24 +102,27 @@ class Piercing:
         place = torch.arange(1, paths.shape[1] + 1, device=x.device)[:, None]
         step = (place * (counts > 0)).amax(1).sub(1).clamp_min(0)  # the last bone of the path that is crossed
         bone = paths.gather(1, step).clamp_max(len(limbs.start) - 1)
-        start, end = (ends.gather(0, bone[:, None].expand(-1, 3, -1)) for ends in (limbs.start, limbs.end))
         point = self._middles[triangle.gather(0, bone)].movedim(2, 1)
-        length = (end - start).norm(dim=1).clamp_min(MIN_LENGTH)
-        direction = (end - start) / length[:, None]
-        tip = (direction * end).sum(1) + limbs.beyond.gather(1, step)
         radius = (limbs.radii[bone] + MARGIN).where(pierced, 0)
-        return PiercedCloth(point, direction, tip, radius)
+        return PiercedCloth.of(bone, step, point, radius, limbs)
 
     @torch.no_grad()
     def replace_planes(
-        self, x: Tensor, limbs: PosedLimbs, normal: Tensor, offset: Tensor, curvature: Tensor | None = None
+        self,
+        x: Tensor,
+        limbs: PosedLimbs,
+        normal: Tensor,
+        offset: Tensor,
+        curvature: Tensor | None = None,
+        held: PiercedCloth | None = None,
     ) -> None:
         """Replace, in place, the planes that pierced samples of x (S, 3, N) can touch.
 
         Args:
             normal: (S, 3, N); offset: [m], (S, N); curvature: (S, 3, 3, N), as in `SmoothedDistance`.
+            held: what is pierced, wherever x is; found by default.
         """
-        pierced = self.find(x[: self.count].float(), limbs)
+        pierced = self.find(x[: self.count].float(), limbs) if held is None else held
         if curvature is None and kernels.supports(normal):
             from ..kernels.crossings import replace_planes_kernel
 

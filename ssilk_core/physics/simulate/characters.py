@@ -14,10 +14,13 @@ from torch import Tensor
 from ...scene.assets import Floats, Ints, Motion, Scene, Skeleton
 from ...scene.kinematics import (
     frames_at,
+    local_transforms,
     matrix_from_quaternion,
+    quaternion_from_matrix,
     rigid,
     sample_motion,
     skinning_matrices,
+    slerp,
     split_at_cuts,
     world_transforms,
 )
@@ -116,6 +119,25 @@ class CharacterPoser:
         """Return the poses of all spans at a step."""
         rotations = np.stack([span.motion.rotations[step] for span in spans])
         return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
+
+    def between(self, roots: Tensor, matrices: Tensor, poses: PosedCharacters, share: float) -> PosedCharacters:
+        """Return characters a share of the way from others to `poses`, each joint turned about its parent.
+
+        Args:
+            roots, matrices: of the others, (3, N) and (J, 3, 4, N), as in `PosedCharacters`.
+        """
+        ends = (self._local(*each) for each in ((roots, matrices), (poses.root, poses.matrices)))
+        (turned, placed), (rotations, translations) = ends
+        return self.pose(slerp(turned, rotations, np.asarray(share)), (1 - share) * placed + share * translations)
+
+    def _local(self, roots: Tensor, matrices: Tensor) -> tuple[Floats, Floats]:
+        """Return the joints' local rotations (N, J, 4) and translations (N, J, 3) that `pose` takes."""
+        skinning = np.broadcast_to(np.eye(4), (matrices.shape[-1], len(matrices), 4, 4)).copy()
+        skinning[:, :, :3] = matrices.permute(3, 0, 1, 2).double().cpu().numpy()
+        world = skinning @ self.skeleton.bind_transforms
+        world[:, :, :3, 3] += roots.T.cpu().numpy()[:, None]
+        local = local_transforms(world, self.skeleton.parents)
+        return quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3]
 
     def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
         """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""

@@ -25,6 +25,7 @@ from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
+from ..collision.pierced import PiercedCloth
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
@@ -55,6 +56,7 @@ class StepInputs:
         neighbours: which cloth may touch which, or None where cloth may pass through cloth.
         contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
         friction: of what pressed in the step before; None without.
+        pierced: the cloth that limbs are through, wherever it goes; None where that is found at each position.
     """
 
     body: PosedBody | None
@@ -66,6 +68,7 @@ class StepInputs:
     neighbours: ClothNeighbours | None = None
     contacts: ClothContacts | None = None
     friction: Friction | None = None
+    pierced: PiercedCloth | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
         """Return the inputs of the frames with indices (M,)."""
@@ -78,8 +81,9 @@ class StepInputs:
             self.contacts and self.contacts.select(frames),
             self.friction and self.friction.select(frames),
         )
-        gravity = self.gravity[..., frames]
-        return StepInputs(body, gravity, predicted, advected, self.dt, skinned, neighbours, contacts, friction)
+        gravity, pierced = self.gravity[..., frames], self.pierced and self.pierced.select(frames)
+        known = neighbours, contacts, friction, pierced
+        return StepInputs(body, gravity, predicted, advected, self.dt, skinned, *known)
 
 
 class IncrementalPotential:
@@ -132,14 +136,15 @@ class IncrementalPotential:
         """
         if inputs.body is None:
             return None
-        return self.contacts.smoothed(self.cloth.positions(x), inputs.body, self.law.start + allowance)
+        within = self.law.start + allowance
+        return self.contacts.smoothed(self.cloth.positions(x), inputs.body, within, inputs.pierced)
 
     def body_distance_nearby(
         self, x: Tensor, inputs: StepInputs, known: SmoothedDistance | None, at: Tensor
     ) -> SmoothedDistance | None:
         """Return distances that give the energy and its derivatives at x as `body_distance` does, where those at
         other positions `at` (V, 3, N) are known: on a processor in less time, the nearer the two are."""
-        if inputs.body is None or known is None:
+        if inputs.body is None or known is None or inputs.pierced is not None:
             return self.body_distance(x, inputs)
         positions, within = self.cloth.positions, self.law.start
         return self.contacts.smoothed_nearby(positions(x), inputs.body, known, positions(at), within)

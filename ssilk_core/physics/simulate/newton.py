@@ -90,6 +90,18 @@ class Solution:
     cg_iterations: int
     neighbours: ClothNeighbours | None = None
 
+    def replace_frames(self, frames: Tensor, other: Solution) -> Solution:
+        """Return the solution with frames (M,), in ascending order, from another; iterations are those of both."""
+        x, energy, residual, fixed = (
+            getattr(self, name).index_copy(-1, frames, getattr(other, name))
+            for name in ("x", "energy", "residual", "fixed")
+        )
+        neighbours, iterations = self.neighbours, self.iterations.index_add(-1, frames, other.iterations)
+        if neighbours and other.neighbours:
+            neighbours = neighbours.replace_frames(frames, other.neighbours)
+        count = self.cg_iterations + other.cg_iterations
+        return Solution(x, energy, residual, iterations, fixed, count, neighbours)
+
 
 @dataclass(frozen=True, eq=False)
 class State:

@@ -5,6 +5,12 @@ A shot starts with the quasi-static state of its first pose, to which the garmen
 with the velocity of linear blend skinning, so that a character that starts walking does not leave its garment behind.
 Each step is solved relative to the character's root, where single precision is finest; between steps positions are
 kept in world space, in float64.
+
+A step in which a limb moves further than it is thick takes it through the cloth, and no minimisation leads back. Such
+steps do not converge. They are taken again in shorter ones, each with the body where it is then. In these cloth is
+pushed off the limbs that were through it at the end of the last one (`collision.pierced`): which limbs are changes
+from one position to the next, and the energy jumps with it. A shorter step that takes another limb through the cloth
+is split once more.
 """
 
 from __future__ import annotations
@@ -12,6 +18,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,6 +29,7 @@ from ...events import Countdown, Message, Reporter, silent
 from ...scene.assets import Floats, Motion, Scene, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
+from ..collision.pierced import PiercedCloth
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
@@ -34,6 +42,7 @@ PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
 POSES = 8  # from the bind pose to one in which cloth comes to rest
 ON_THE_WAY = 10  # iterations for each of these but the last
+PARTS, SPLITS = 4, 2  # shorter steps for one that does not converge, and how often these are split themselves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +95,9 @@ class SimulatedFrame:
         shot, number: index of the shot, and of the frame in it.
         points: garment vertices in world space [m], float64, shape (V, 3).
         energy: the incremental potential [J], with heights relative to the character's root.
-        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame.
+        residual, iterations, fixed: see `newton.Solution`, for the last step of the frame. Where that was taken in
+            shorter ones, energy and fixed vertices are those of the last of these, the residual is the largest, and
+            iterations are all.
     """
 
     shot: int
@@ -104,11 +115,14 @@ class StepHistory:
 
     Attributes:
         last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
-            in the second step.
+            in the second step. After shorter steps it is where the last velocity leads back to in a whole one.
         root: the character's root one step ago [m], float64, shape (3, N).
         lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
         neighbours: which cloth may touch which, where that is looked at.
         friction: of what presses at the last positions, for the next step; None without.
+        matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
+            body is posed in shorter steps; None where no step is to be split.
+        pierced: the cloth that limbs were through at the last positions, which a shorter step holds on to.
     """
 
     last: Tensor
@@ -117,14 +131,20 @@ class StepHistory:
     lbs: Tensor
     neighbours: ClothNeighbours | None = None
     friction: Friction | None = None
+    matrices: Tensor | None = None
+    pierced: PiercedCloth | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
-        before = None if self.before is None else self.before[..., :count]
-        neighbours = self.neighbours and self.neighbours.first(count)
-        friction = self.friction and self.friction.select(torch.arange(count, device=self.last.device))
-        root, lbs = self.root[:, :count], self.lbs[..., :count]
-        return StepHistory(self.last[..., :count], before, root, lbs, neighbours, friction)
+        return self.select(torch.arange(count, device=self.last.device))
+
+    def select(self, shots: Tensor) -> StepHistory:
+        """Return the history of the shots with indices (M,), in ascending order."""
+        before, matrices = (v if v is None else v[..., shots] for v in (self.before, self.matrices))
+        neighbours, friction = self.neighbours and self.neighbours.select(shots), self.friction
+        friction, pierced = friction and friction.select(shots), self.pierced and self.pierced.select(shots)
+        root, lbs = self.root[:, shots], self.lbs[..., shots]
+        return StepHistory(self.last[..., shots], before, root, lbs, neighbours, friction, matrices, pierced)
 
     @property
     def local(self) -> Tensor:
@@ -155,7 +175,7 @@ class Simulator:
         self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
         self.poser = CharacterPoser(scene, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
-        self.dt = 1 / (self.options.fps * self.options.substeps)
+        self.dt, self.splits = 1 / (self.options.fps * self.options.substeps), SPLITS
 
     def sampled(self, scene: Scene, cubature: Cubature) -> Simulator:
         """Return a simulator of the same scene on the elements of a cubature, whose vertices alone it moves."""
@@ -200,14 +220,48 @@ class Simulator:
 
     def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
         """Return the states after those of the past, and their solution."""
-        solution = self.step(poses, past)
-        return self._history(solution, poses, past.last), solution
+        solution, before = self.step(poses, past), past.last
+        if self.splits and past.matrices is not None:
+            stuck = ~(solution.residual <= self.options.solver.tolerance)
+            if past.pierced and (now := self._pierced(solution.x, poses)):
+                stuck |= ((now.radius > 0) & (past.pierced.radius == 0)).any(0)
+            if len(again := stuck.nonzero()[:, 0]):
+                part, found = self._in_parts(past.select(again), poses.select(again))
+                assert part.before is not None
+                solution, before = solution.replace_frames(again, found), before.index_copy(-1, again, part.before)
+        return self._history(solution, poses, before), solution
+
+    def _in_parts(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
+        """Return what `_after` does by way of `PARTS` shorter steps."""
+        shorter = copy.copy(self)
+        shorter.dt, shorter.splits = self.dt / PARTS, self.splits - 1
+        assert past.matrices is not None
+        solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses)
+        if past.before is not None:
+            past = replace(past, before=past.last - (past.last - past.before) / PARTS)
+        at = between(0.0)
+        for share in np.arange(1, PARTS + 1) / PARTS:
+            past = replace(past, pierced=self._pierced(past.local, at))
+            at = poses if share == 1 else between(share)
+            past, found = shorter._after(past, at)
+            solutions.append(found)
+        assert past.before is not None
+        residual, iterations = (
+            torch.stack([getattr(each, name) for each in solutions]) for name in ("residual", "iterations")
+        )
+        spent = sum(each.cg_iterations for each in solutions)
+        found = replace(found, residual=residual.amax(0), iterations=iterations.sum(0), cg_iterations=spent)
+        return replace(past, before=past.last - PARTS * (past.last - past.before)), found
+
+    def _pierced(self, x: Tensor, poses: PosedCharacters) -> PiercedCloth | None:
+        return self.potential.contacts.pierced(self.potential.cloth.positions(x), poses.body)
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
         friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
         world = solution.x.double() + poses.root
-        return StepHistory(world, before, poses.root, poses.lbs, solution.neighbours, friction)
+        known = solution.neighbours, friction, poses.matrices
+        return StepHistory(world, before, poses.root, poses.lbs, *known)
 
     def _first(self, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
@@ -261,8 +315,10 @@ class Simulator:
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         friction = past.friction and past.friction.after(poses.body.points)
-        predicted = predicted.to(past.lbs.dtype)
-        return StepInputs(poses.body, gravity, predicted, past.local, self.dt, poses.lbs, friction=friction)
+        limbs = poses.body.limbs
+        pierced = past.pierced.on(limbs) if past.pierced and limbs else None
+        own = predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs
+        return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced)
 
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""

@@ -169,4 +169,5 @@ def stacked(places: Sequence[Place], back: int) -> Tensor:
 def history(simulator: Simulator, places: Sequence[Place]) -> StepHistory:
     """Return the method's own two states before each place."""
     poses = poses_of(simulator, [(window, frame - 1) for window, frame in places])
-    return StepHistory(stacked(places, 1), stacked(places, 2), poses.root, poses.lbs)
+    at = poses.root, poses.lbs
+    return StepHistory(stacked(places, 1), stacked(places, 2), *at, matrices=poses.matrices)

@@ -131,7 +131,8 @@ class ShotMethod:
         frames = (slice(frame, frame + 1) for frame in range(GIVEN - 1, motion.frame_count))
         characters = (simulator.poser.pose(motion.rotations[at], motion.translations[at]) for at in frames)
         last = next(characters)
-        past = StepHistory(states[1, ..., None], states[0, ..., None], last.root, last.lbs)
+        at = last.root, last.lbs
+        past = StepHistory(states[1, ..., None], states[0, ..., None], *at, matrices=last.matrices)
         for state in simulator.carry_on(past, characters):
             yield state.last[..., 0].cpu().numpy()
 

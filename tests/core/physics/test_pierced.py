@@ -278,6 +278,31 @@ def test_the_force_is_minus_the_gradient_of_the_energy(scene):
     assert (energy(x + step * along) - energy(x - step * along)) / (2 * step) == pytest.approx(slope, rel=1e-3)
 
 
+def test_cloth_that_is_held_as_pierced_stays_so_wherever_it_goes(scene):
+    """Where another triangle is crossed the energy jumps, and where none is any more: not where a step holds on."""
+    whole = dressed(scene, 0.7)
+    potential = IncrementalPotential(whole, Fabric("default"), device=CPU)
+    posed = CollisionBody(*_body(whole), limbs=limb_axes(whole), device=CPU).pose(still(2))
+    x = torch.tensor(whole.garment.mesh.points)[..., None] - torch.tensor([0.4, 0, 0])[:, None]
+    found = StepInputs(posed, torch.zeros(3, 1, dtype=torch.float64))
+    held = replace(found, pierced=potential.contacts.pierced(potential.cloth.positions(x), posed))
+
+    def energy(inputs: StepInputs, aside: float) -> float:
+        moved = x + torch.tensor([0.0, aside, 0.0], dtype=x.dtype)[:, None]
+        return float(potential.collision(moved, potential.body_distance(moved, inputs)).sum())
+
+    assert energy(held, 0.0) == energy(found, 0.0) > 0  # nothing else is deep
+    assert energy(held, 1.0) == pytest.approx(energy(held, 0.5), rel=1e-5) and energy(found, 1.0) == 0
+    assert energy(held.select(torch.tensor([0])), 1.0) == energy(held, 1.0)
+    turned = still(2)
+    turned[:, :, :3, 0] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # the arm points up
+    limbs = CollisionBody(*_body(whole), limbs=limb_axes(whole), device=CPU).pose(turned).limbs
+    along = held.pierced.on(limbs)
+    np.testing.assert_allclose(along.direction[0, :, 0], [0, 1, 0], atol=1e-6)
+    assert float(along.tip) == pytest.approx(LENGTH) and float(along.radius) == float(held.pierced.radius) > 0
+    assert not along.on(replace(limbs, buried=~limbs.buried)).radius.any()
+
+
 def test_crossings_are_those_that_solving_finds():
     random = np.random.default_rng(0)
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.3)

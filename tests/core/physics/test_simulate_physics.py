@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,7 +19,7 @@ from ssilk_core.physics.simulate import SimulationOptions, Simulator, quasi_stat
 from ssilk_core.physics.simulate.characters import split_into_spans
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
-from ssilk_core.physics.simulate.simulator import ON_THE_WAY, POSES
+from ssilk_core.physics.simulate.simulator import ON_THE_WAY, PARTS, POSES, SPLITS, StepHistory
 from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
@@ -35,6 +36,7 @@ from ssilk_core.scene.assets import (
 )
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import (
+    bind_pose,
     motion_transforms,
     quaternion_from_matrix,
     resample,
@@ -338,6 +340,63 @@ def test_an_arm_lifts_the_cloth_that_it_would_pierce_under_plain_skinning(toy_gr
     assert pierced[0] == pytest.approx([0.0], abs=0.02) and skinned.energy > 0.3  # what a start from it comes to
     assert pierced[1].min() > ARM - 0.08 and found.energy < 0.05
     assert found.residual < 1e-2 and found.fixed < 10
+
+
+def forward(degrees: Sequence[float]) -> np.ndarray:
+    """The rotations (F, 2, 4) that turn the arm behind a sheet forward."""
+    turned = [Rotation.from_euler("x", [[0], [-angle]], degrees=True).as_matrix() for angle in degrees]
+    return quaternion_from_matrix(np.array(turned))
+
+
+def test_an_arm_that_jumps_through_cloth_in_one_frame_comes_to_lie_under_it(toy_grid) -> None:
+    # In one step from the hanging sheet the search ended where the cloth that the arm is through changes: 244 g left.
+    scene, pose = arm_behind_a_sheet(*toy_grid(21, 17, height=0.5, width=0.4))
+    motion = Motion("/jump", 30.0, forward([0, 0, 90, 90, 90]), np.repeat(pose.translations, 5, axis=0))
+    frames = list(Simulator(scene, CLOTH).frames([motion]))
+    assert all(frame.residual <= 1e-2 and frame.fixed < 10 for frame in frames)
+    assert frames[2].iterations > 100  # of a step that was taken again
+    last = trimesh.Trimesh(frames[-1].points, scene.garment.mesh.faces, process=False)
+    crossed, *_ = last.ray.intersects_location([[0, 0, -0.08]], [[0, 0, 1]])
+    assert crossed[:, 2].min() > ARM - 0.08 and frames[-1].energy < 0.2
+
+
+def test_shorter_steps_hand_their_velocity_on(scene, toy_grid) -> None:
+    points, faces = toy_grid(3, 3)
+    cloth = dressed(scene, points - [0, 9, 0], faces, np.zeros(9, dtype=bool))
+    never = SimulationOptions(solver=SolverOptions(tolerance=1e-300, iterations=3))
+    simulator, start = Simulator(cloth, CALM, never), tensor(points) - tensor([[0, 9, 0]])
+    turned, placed = bind_pose(scene.character.skeleton)
+    poses, dt = simulator.poser.pose(turned[None], placed[None]), 1 / 30 / PARTS**SPLITS
+    velocity = torch.tensor([0.3, 2.0, -0.1], dtype=torch.float64)[:, None]
+    past = StepHistory(start, start - velocity / 30, poses.root, poses.lbs, matrices=poses.matrices)
+    for frame, state in enumerate(simulator.carry_on(past, [poses] * 3), start=1):
+        n = frame * PARTS**SPLITS
+        fall = torch.tensor([0.0, -G, 0.0], dtype=torch.float64)[:, None] * dt**2 * n * (n + 1) / 2
+        torch.testing.assert_close(state.last, start + velocity * n * dt + fall, rtol=0, atol=1e-5)
+
+
+def test_between_two_poses_joints_turn_about_their_parents(toy_grid) -> None:
+    scene, pose = arm_behind_a_sheet(*toy_grid(3, 3))
+    poser, placed = Simulator(scene, CLOTH).poser, np.repeat(pose.translations, 2, axis=0)
+    placed[1, 0] += [0.4, 0.0, 0.2]
+    first, half, last = (
+        poser.pose(forward([angle]), at[None])
+        for angle, at in zip((20, 60, 100), (placed[0], placed.mean(0), placed[1]))
+    )
+    found = poser.between(first.root, first.matrices, last, 0.5)
+    for name in ("root", "lbs", "matrices"):
+        torch.testing.assert_close(getattr(found, name), getattr(half, name), rtol=0, atol=1e-9)
+    torch.testing.assert_close(found.body.points, half.body.points, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("cloth, self_contact", [(CLOTH, False), (replace(CLOTH, friction=0.4), True)])
+def test_a_shot_that_needs_shorter_steps_leaves_the_others_as_they_are(toy_grid, cloth, self_contact) -> None:
+    scene, pose = arm_behind_a_sheet(*toy_grid(21, 17, height=0.5, width=0.4))
+    angles = [0, 0, 90, 90], [0, 2, 4, 6]
+    jumps, moves = (Motion("/arm", 30.0, forward(each), np.repeat(pose.translations, 4, axis=0)) for each in angles)
+    options = SimulationOptions(self_contact=self_contact)
+    alone, together = (simulate(scene, cloth, motions, options) for motions in ([moves], [jumps, moves]))
+    np.testing.assert_allclose(together[1], alone[0], atol=2e-5)
 
 
 def test_single_precision_stays_close(scene, toy_motion) -> None:
