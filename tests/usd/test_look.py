@@ -462,7 +462,8 @@ def test_a_rig_says_what_a_garment_from_its_own_file_loses(hero, tmp_path):
 
 def varied(stage: Usd.Stage) -> None:
     sets = stage.GetPrimAtPath("/Looks/Cape_cloth").GetVariantSets().AddVariantSet("colour")
-    sets.AddVariant("blue")
+    for each in ("blue", "red"):
+        sets.AddVariant(each)
     sets.SetVariantSelection("blue")
 
 
