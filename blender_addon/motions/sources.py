@@ -158,6 +158,8 @@ def _own_slots(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any
         found = [slot for slot in own if slot.identifier == wanted]
         if found:
             return found
+    if any(slot.identifier == last for slot in candidates):
+        return candidates  # another object plays the slot that it had, as where a character was appended twice
     return own or candidates
 
 

@@ -114,6 +114,28 @@ def test_a_strip_that_is_tweaked_is_told(bpy, cast):
         leaning(bpy, hero, action, 12)
 
 
+def test_the_action_of_a_twin_whose_other_slot_is_free_is_refused(bpy, cast, tmp_path):
+    """The twin came from the same file; what it had in this action is played by the other one alone."""
+    from blender_addon.errors import SetupError
+
+    hero, villain, action = cast
+    on_a_strip(bpy, *cast)
+    bpy.data.objects.remove(villain)
+    path = str(tmp_path / "hero.blend")
+    bpy.data.libraries.write(path, {hero})
+    with bpy.data.libraries.load(path) as (_, wanted):
+        wanted.objects = ["Hero"]
+    (twin,) = wanted.objects
+    bpy.context.collection.objects.link(twin)
+    twin.name = "Guest"
+    (own,) = {strip.action for track in twin.animation_data.nla_tracks for strip in track.strips}
+    assert own != action
+    assert leaning(bpy, twin, own, 12) == pytest.approx(HERO, abs=1e-4)
+    assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+    with pytest.raises(SetupError, match="none is told to be of 'Guest'"):
+        leaning(bpy, twin, action, 12)
+
+
 def test_a_single_strip_that_borrows_anothers_slot_leaves_the_own_motion(bpy, cast):
     from blender_addon.motions.sources import sources
 
