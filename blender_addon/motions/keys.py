@@ -6,7 +6,7 @@ Before Blender 4.4 an action animates one kind of thing; each then gets an actio
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,6 +72,18 @@ def curves_of(action: bpy.types.Action, slot: Any = None) -> Iterator[bpy.types.
                     yield from bag.fcurves
 
 
+def strips_in(tracks: Iterable[bpy.types.NlaTrack]) -> Iterator[tuple[bpy.types.NlaStrip, bool]]:
+    """Yield all strips of tracks, those inside meta strips too, and whether each is muted or in what is."""
+    for track in tracks:
+        yield from _strips_within(track.strips, track.mute)
+
+
+def _strips_within(strips: Iterable[bpy.types.NlaStrip], muted: bool) -> Iterator[tuple[bpy.types.NlaStrip, bool]]:
+    for strip in strips:
+        yield strip, muted or strip.mute
+        yield from _strips_within(strip.strips, muted or strip.mute)
+
+
 def need_tracks(things: Sequence[Any]) -> None:
     """Check that tracks can be added to the animation of objects and shape keys.
 
@@ -82,8 +94,7 @@ def need_tracks(things: Sequence[Any]) -> None:
         animation = thing.animation_data
         if animation:
             name = f"'{thing.name}'"
-            if animation.use_tweak_mode:
-                raise SetupError(f"A strip of {name} is being tweaked; leave tweak mode (Tab) first.")
+            need_no_tweaking(thing)
             off = len(animation.nla_tracks) and not animation.use_nla
             if off:
                 raise SetupError(f"The NLA tracks of {name} are switched off; switch them on in the NLA editor.")
@@ -93,6 +104,12 @@ def need_tracks(things: Sequence[Any]) -> None:
                     f"The NLA track '{solo.name}' of {name} is solo, so that baked keys would not show; "
                     "switch its star off in the NLA editor."
                 )
+
+
+def need_no_tweaking(thing: Any) -> None:
+    """Raise `SetupError` if a strip of an object or of shape keys is being tweaked: its action cannot be set then."""
+    if thing.animation_data and thing.animation_data.use_tweak_mode:
+        raise SetupError(f"A strip of '{thing.name}' is being tweaked; leave tweak mode (Tab) first.")
 
 
 def bake_keys(

@@ -6,13 +6,18 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..scene.garment import armature_of, bodies_of
+from ..scene.linked import local_copy
 from ..scene.meshes import PREFIX
-from ..scene.modifiers import unmet_modifiers
-from .keys import SLOTS, curves_of
+from ..scene.modifiers import bones_place, reshapes, unmet_modifiers
+from .evaluating import evaluating
+from .keys import SLOTS, curves_of, strips_in
 
 STEADY = 1e-6  # of a key's value: rounding
+STILL = 1e-4  # of a body's size, by which its shape may change unseen
+LOOKS = 8  # frames of the scene in which a body's shape is looked at
 
 
 def changing_shapes(thing: bpy.types.Object) -> list[str]:
@@ -21,8 +26,8 @@ def changing_shapes(thing: bpy.types.Object) -> list[str]:
     animation = keys.animation_data if keys else None
     if keys is None or animation is None or thing.show_only_shape_key:
         return []
-    tracks = [track for track in animation.nla_tracks if animation.use_nla and not track.mute]
-    players: list[Any] = [animation, *(strip for track in tracks for strip in track.strips if not strip.mute)]
+    strips = strips_in(animation.nla_tracks if animation.use_nla else ())
+    players: list[Any] = [animation, *(strip for strip, muted in strips if not muted)]
     curves: list[Any] = list(animation.drivers)
     for player in players:
         if player.action and not (SLOTS and player.action_slot is None):
@@ -41,6 +46,36 @@ def _is_constant(curve: bpy.types.FCurve) -> bool:
     return bool(values) and max(values) - min(values) < STEADY and not curve.modifiers
 
 
+def changes_by_modifiers(body: bpy.types.Object) -> bool:
+    """Return whether the shape changes over the scene's frames that modifiers give a body before its bones move it.
+
+    Blender evaluates a copy without what comes after: keys, drivers, other objects and nodes may be the cause.
+    """
+    if not reshapes(body):
+        return False
+    scene, probe = bpy.context.scene, local_copy(body)
+    try:
+        for modifier in probe.modifiers[bones_place(probe) :] if bones_place(probe) is not None else ():
+            probe.modifiers.remove(modifier)
+        looks = np.unique(np.linspace(scene.frame_start, scene.frame_end, LOOKS).round().astype(int))
+        first = None
+        with evaluating(probe) as frames:
+            for frame in looks.tolist():
+                shown = _points(probe.evaluated_get(frames(frame)))
+                first = shown if first is None else first
+                if len(shown) != len(first) or np.abs(shown - first).max(initial=0) > STILL * max(body.dimensions):
+                    return True
+    finally:
+        bpy.data.objects.remove(probe)
+    return False
+
+
+def _points(shown: bpy.types.Object) -> np.ndarray:
+    points = np.empty(len(shown.data.vertices) * 3, dtype=np.float32)
+    shown.data.vertices.foreach_get("co", points)
+    return points
+
+
 def tell_changing_shapes(operator: bpy.types.Operator, garment: bpy.types.Object) -> None:
     """Report which shapes of a garment and its bodies change, or come after bones, and are not followed."""
     bodies = bodies_of(garment, armature_of(garment))
@@ -49,9 +84,13 @@ def tell_changing_shapes(operator: bpy.types.Operator, garment: bpy.types.Object
         for name in unmet_modifiers(body):
             text = f"The modifier '{name}' of '{body.name}' comes after its bones; cloth meets the body without it"
             operator.report({"WARNING"}, f"{text}. Move it above the Armature modifier, or apply it.")
+    frame = bpy.context.scene.frame_current
+    for body in bodies:
+        if not changing_shapes(body) and changes_by_modifiers(body):
+            text = f"Modifiers change the shape of '{body.name}' over time, which is not followed"
+            operator.report({"WARNING"}, f"{text}; the shape of frame {frame} is met throughout.")
     names = [f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing)]
     if names:
         more = f" and {len(names) - 1} more change" if len(names) > 1 else " changes"
-        frame = bpy.context.scene.frame_current
         text = f"The shape key {names[0]}{more} over time, which is not followed; the shape of frame {frame} is met"
         operator.report({"WARNING"}, f"{text} throughout.")

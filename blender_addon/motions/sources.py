@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from ..errors import SetupError
-from .keys import SLOTS, curves_of, is_baked
+from .keys import SLOTS, curves_of, is_baked, need_no_tweaking, strips_in
 
 TIMELINE, ACTION, STRIP, FILE = "TIMELINE", "ACTION", "STRIP", "FILE"
 KINDS = [
@@ -96,13 +96,14 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
     """Play one motion of an armature temporarily, and restore everything afterwards.
 
     Raises:
-        SetupError: it is gone.
+        SetupError: it is gone, or a strip is being tweaked.
     """
     if source.kind == TIMELINE:
         yield
         return
     bare = armature.animation_data is None
     animation = armature.animation_data_create()
+    need_no_tweaking(armature)
     names = ("action", "action_slot", "use_nla") if SLOTS else ("action", "use_nla")
     mutes = [(item, "mute") for track in animation.nla_tracks for item in (track, *track.strips)]
     kept = [(item, name, getattr(item, name)) for item, name in [*((animation, name) for name in names), *mutes]]
@@ -157,14 +158,16 @@ def _own_slots(armature: bpy.types.Object, action: bpy.types.Action) -> list[Any
         found = [slot for slot in own if slot.identifier == wanted]
         if found:
             return found
+    if any(slot.identifier == last for slot in candidates):
+        return candidates  # another object plays the slot that it had, as where a character was appended twice
     return own or candidates
 
 
 def _slots_of_strips(animation: bpy.types.AnimData, action: bpy.types.Action, candidates: list[Any]) -> list[Any]:
     """Return those of some slots that strips play; of muted strips where no other plays any."""
-    strips = [(track.mute or strip.mute, strip) for track in animation.nla_tracks for strip in track.strips]
+    strips = list(strips_in(animation.nla_tracks))
     for is_muted in (False, True):
-        played = [strip.action_slot for muted, strip in strips if muted == is_muted and strip.action == action]
+        played = [strip.action_slot for strip, muted in strips if muted == is_muted and strip.action == action]
         if found := [slot for slot in candidates if slot in played]:
             return found
     return []

@@ -35,10 +35,11 @@ from ..playback.overrides import told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
 from ..scene.classes import current_classes
-from ..scene.garment import armature_of, unplayable_here
+from ..scene.garment import armature_of, bodies_of, unplayable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.linked import is_override
+from ..scene.look import lost_looks
 from ..scene.objects import Pair, scene_rate
 from ..scene.weights import has_trained_weights
 from ..settings.training import RELATIVE
@@ -170,6 +171,10 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         tell_changing_shapes(self, garment)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
+        lost = lost_looks([garment, *bodies_of(garment, armature)]) if self.to_usd else []
+        if lost:
+            text = f"{'; '.join(lost)}. Bake to the timeline and use Blender's own export to keep these"
+            self.report({"WARNING"}, f"In USD {text}.")
         self.python = interpreter(preferences(context))
         self.bones, self.character = joints.bones, joints.character
         self.inputs = inputs_folder(garment, self.model)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
+from ..motions.shapes import tell_changing_shapes
 from ..playback import playing
 from ..playback.models import model_of, no_model
 from ..scene.garment import unplayable, unplayable_here
@@ -28,6 +29,7 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
         return no_model(context.object)
 
     def apply(self, context: bpy.types.Context) -> str:
+        tell_changing_shapes(self, context.object)
         playing.play(context.object)
         if not playing.live(context.object):
             raise SetupError(playing.reason(context.object))

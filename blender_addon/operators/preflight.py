@@ -19,7 +19,7 @@ from ..motions.shapes import tell_changing_shapes
 from ..outside.wording import reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
-from ..quality.checks import SCALE, look_again, scene_findings
+from ..quality.checks import SCALE, body_findings, look_again, scene_findings
 from ..quality.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of, unusable
@@ -107,6 +107,7 @@ class Inspect(InspectOperator, bpy.types.Operator):
         clips = dict(zip((str(work.folder / MOTIONS / name) for name in self.chosen.names), taken))
         clips |= {str(path): Clip(path.name) for path in self.chosen.files}
         findings = read_findings(self.in_words(work.result["findings"]), self.handover.name, self.scene.meshes, clips)
+        findings = [*body_findings(self.pair.objects()[0]), *findings]
         keep_findings(context, self.handover.name, findings)
         bad = sum(finding.severity != "info" for finding in findings)
         return (

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays.joints import Joints, identifiers
 from ..scene.garment import armature_of, bodies_of, rest_world
-from ..scene.gather import SKELETON
+from ..scene.gather import SKELETON, read_body
 from ..scene.modifiers import reshapes
 from ..scene.objects import scene_units
 from ..scene.shapes import mixed_points
@@ -21,7 +21,7 @@ SAME = 1e-3  # [m] that nobody sees
 def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
     """Return in words which body has another shape now than in the stage that was trained; empty if none has.
 
-    Bodies that modifiers shape, and those that the stage lacks, are not compared. In a Blender that has read USD.
+    Bodies that the stage lacks are not compared. In a Blender that has read USD.
 
     Args:
         joints: the character's, by the paths that the garment knows.
@@ -36,13 +36,19 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
         return ""
     back = trained.skeleton.bind_transforms[order[joints.paths[shared]]] @ np.linalg.inv(joints.binds[shared])
     meshes = {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}
-    things = [garment, *bodies_of(garment, armature_of(garment))]
+    armature = armature_of(garment)
+    things = [garment, *bodies_of(garment, armature)]
     for thing, name in list(zip(things, identifiers((each.name for each in things), taken=(SKELETON,))))[1:]:
         mesh = meshes.get(name)
-        if mesh is None or reshapes(thing) or mesh.vertex_count != len(thing.data.vertices):
+        if mesh is None:
             continue
-        world = np.array(rest_world(thing))
-        points = scene_units().points_to_core(mixed_points(thing, baked=False) @ world[:3, :3].T + world[:3, 3])
+        if reshapes(thing):
+            points = read_body(thing, armature, joints, thing.name).mesh.points
+        else:
+            world = np.array(rest_world(thing))
+            points = scene_units().points_to_core(mixed_points(thing, baked=False) @ world[:3, :3].T + world[:3, 3])
+        if len(points) != mesh.vertex_count:
+            continue
         away = np.linalg.norm(points @ back[:3, :3].T + back[:3, 3] - mesh.points, axis=1).max()
         if away > SAME:
             return f" ('{thing.name}' is up to {1000 * away:.0f} mm off its shape in training, which the cloth met)"

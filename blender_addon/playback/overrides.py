@@ -19,7 +19,7 @@ from ssilk_core.scene.kinematics import local_transforms, matrix_from_quaternion
 
 from ..arrays.joints import Joints, joint_order
 from ..motions.evaluating import evaluating
-from ..motions.keys import SLOTS, curves_of, is_baked
+from ..motions.keys import SLOTS, curves_of, is_baked, strips_in
 from ..motions.sampling import worlds
 from ..scene.armature import proxy_names
 from ..scene.linked import local_copy
@@ -106,13 +106,14 @@ def _animation(thing: Any, garment: bpy.types.Object, kind: str, names: set[str]
         yield f"drivers on {_listed(driven, what)}"
     solo = [track for track in animation.nla_tracks if track.is_solo]
     for track in animation.nla_tracks:
-        own = any(strip.action and is_baked(strip.action, garment) for strip in track.strips)
+        strips = list(strips_in([track]))
+        own = any(strip.action and is_baked(strip.action, garment) for strip, _ in strips)
         if own and track.mute:
             yield f"the track '{track.name}' is muted"
         if own and solo and not track.is_solo:
             yield f"the track '{solo[0].name}' is solo (the star in the NLA editor)"
-        for strip in track.strips:
-            if track.mute or strip.mute or own or not strip.action or is_baked(strip.action):
+        for strip, muted in strips:
+            if muted or own or not strip.action or is_baked(strip.action):
                 continue
             if hit := _hit(_slot_curves(strip), kind, names):
                 yield f"the strip '{strip.name}' of the track '{track.name}' on {_listed(hit, what)}"

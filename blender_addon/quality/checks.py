@@ -21,12 +21,12 @@ from ssilk_core.scene.assets import Mesh
 
 from ..arrays.findings import HOLES, on_polygons, open_edges
 from ..scene.armature import is_evenly_scaled
-from ..scene.garment import armature_of
+from ..scene.garment import armature_of, bodies_of
 from ..scene.gather import read_mesh
-from ..scene.modifiers import objections
+from ..scene.modifiers import objections, unmet_modifiers
 from ..scene.shapes import mixed_points, shape_bytes
 
-SCALE, MODIFIER = "unequal-scale", "shaping-modifier"
+SCALE, MODIFIER, UNMET = "unequal-scale", "shaping-modifier", "unmet-modifier"
 
 
 def scene_findings(garment: bpy.types.Object) -> list[Finding]:
@@ -50,6 +50,22 @@ def scene_findings(garment: bpy.types.Object) -> list[Finding]:
         for objection in objections(garment)
     ]  # fmt: skip
     return found
+
+
+def body_findings(garment: bpy.types.Object) -> list[Finding]:
+    """Return what of a garment's bodies cloth does not meet, with names of objects in place of prims.
+
+    Raises:
+        SetupError: it has no armature, or several; or no body.
+    """
+    return [
+        Finding(
+            severity="warning", code=UNMET, prim=body.name, found=f"its modifier '{name}' comes after its bones",
+            why="cloth meets the body without it", fix="move it above the Armature modifier, or apply it",
+        )
+        for body in bodies_of(garment, armature_of(garment))
+        for name in unmet_modifiers(body)
+    ]  # fmt: skip
 
 
 def _holes(mesh: Mesh) -> Iterator[Finding]:
@@ -115,10 +131,11 @@ def look_again(preflight: bpy.types.PropertyGroup) -> bool:
 
 def _mended(item: bpy.types.PropertyGroup, garment: bpy.types.Object, left_out: set[str], mark: str) -> bool:
     """Return whether a finding holds no more; where it still does, bring it up to date if that takes a moment."""
-    if item.code in {SCALE, MODIFIER}:
+    if item.code in {SCALE, MODIFIER, UNMET}:
         try:
-            return (item.target, item.found) not in {(each.prim, each.found) for each in scene_findings(garment)}
-        except SsilkError:  # it has no armature any more
+            found = body_findings(garment) if item.code == UNMET else scene_findings(garment)
+            return (item.target, item.found) not in {(each.prim, each.found) for each in found}
+        except SsilkError:  # it has no armature any more, or no body
             return True
     if item.target in left_out and item.target not in bpy.data.objects:
         return True

@@ -24,7 +24,7 @@ from ..scene.linked import give_own_mesh, is_override, need_local
 from ..scene.masks import need_unmasked
 from ..scene.meshes import rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
-from ..scene.shapes import mixed_points
+from ..scene.shapes import mixed_points, worn_points
 from .intersections import crossing_triangles
 from .repairs import displacements
 
@@ -116,7 +116,7 @@ def measuring(
     points = cage_points(garment, depsgraph)
     if kind == STRETCH:
         world = np.array(garment.matrix_world)[:3, :3]
-        rest = rest_points(garment) @ world.T
+        rest = worn_points(garment) @ world.T
         return HeatMap(kind, heat.elongations(rest, points, triangles_of(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
     bodies = bodies_of(garment, armature_of(garment))

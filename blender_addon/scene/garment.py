@@ -129,7 +129,8 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
 
 
 def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:
-    return next((modifier.object for modifier in thing.modifiers if modifier.type == "ARMATURE"), None)
+    bound = (modifier.object for modifier in thing.modifiers if modifier.type == "ARMATURE")
+    return next(filter(None, bound), None)
 
 
 Carrier = tuple[bpy.types.Object, bpy.types.Bone]

@@ -66,6 +66,7 @@ def gather(
     Raises:
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
+    bpy.context.view_layer.update()  # drivers of shape keys of what was just linked have not run yet
     armature = armature_of(garment)
     need_plain_modifiers(garment, simulated=simulated)
     joints = joints or read_joints(armature, garment)
@@ -74,7 +75,7 @@ def gather(
     lbs = own_weights(armature, garment, joints)
     mesh = read_mesh(garment, garment.data, paths[0], worn_points(garment))
     rig = _proxy_rig(armature, garment, joints, paths[0]) if proxies and joints.proxy_count else None
-    bodies = [_read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
+    bodies = [read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
     return GatheredScene(
         units=scene_units(),
         joints=joints if rig else joints.character,
@@ -135,7 +136,7 @@ def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Jo
     return ProxyRig(path, joints.paths[proxies], joints.parents[proxies], joints.binds[proxies], skin)
 
 
-def _read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
+def read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joints, path: str) -> Body:
     """Return a body at rest; evaluated where modifiers shape it before its armature does.
 
     Raises:

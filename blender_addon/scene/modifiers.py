@@ -109,17 +109,21 @@ def need_plain_modifiers(garment: bpy.types.Object, *, simulated: bool = False) 
 
 def reshapes(thing: bpy.types.Object) -> bool:
     """Return whether modifiers shape a body before its armature deforms it; it is then taken as they shape it."""
-    kinds = [modifier.type for modifier in thing.modifiers]
-    bound = "ARMATURE" in kinds
-    before = thing.modifiers[: kinds.index("ARMATURE")] if bound else thing.modifiers[:]
-    passed = HARMLESS if bound else HARMLESS | REFINING
-    return any(modifier.show_viewport and modifier.type not in passed for modifier in before)
+    place = bones_place(thing)
+    passed = HARMLESS | {"ARMATURE"} | (REFINING if place is None else set())
+    return any(modifier.show_viewport and modifier.type not in passed for modifier in thing.modifiers[:place])
+
+
+def bones_place(thing: bpy.types.Object) -> int | None:
+    """Return the place of the modifier by which bones move an object; None without one that has an armature."""
+    places = (place for place, each in enumerate(thing.modifiers) if each.type == "ARMATURE" and each.object)
+    return next(places, None)
 
 
 def unmet_modifiers(body: bpy.types.Object) -> list[str]:
     """Return the names of modifiers that shape a body after bones, or add parts to it: cloth does not meet that."""
-    kinds = [modifier.type for modifier in body.modifiers]
-    after = body.modifiers[kinds.index("ARMATURE") + 1 :] if "ARMATURE" in kinds else []
+    place = bones_place(body)
+    after = [] if place is None else body.modifiers[place + 1 :]
     passed = HARMLESS | REFINING | {"ARMATURE"}  # a second Armature is refused
     return [modifier.name for modifier in after if modifier.show_viewport and modifier.type not in passed]
 

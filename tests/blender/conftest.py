@@ -160,6 +160,22 @@ def activate(bpy: ModuleType, thing: Any) -> None:
     bpy.context.view_layer.objects.active = thing
 
 
+def make_meta(bpy: ModuleType, owner: Any, animation: Any) -> None:
+    """Join all strips of an object or of its shape keys into a meta strip, as Shift G does in the NLA editor."""
+    activate(bpy, owner)
+    for track in animation.nla_tracks:
+        track.select = True
+        for strip in track.strips:
+            strip.select = True
+    window = bpy.context.window_manager.windows[0]
+    area = window.screen.areas[0]
+    before, area.ui_type = area.ui_type, "NLA_EDITOR"
+    with bpy.context.temp_override(window=window, area=area, region=area.regions[-1]):
+        assert bpy.ops.nla.meta_add() == {"FINISHED"}
+    area.ui_type = before
+    assert [strip.type for track in animation.nla_tracks for strip in track.strips] == ["META"]
+
+
 def tube(columns: int, rows: int, heights: tuple[float, ...], radii: tuple[float, ...]) -> tuple[Any, Any]:
     """Quads around the z axis, normals outward, with radii interpolated between heights [m]."""
     angle, z = np.arange(columns) * 2 * np.pi / columns, np.linspace(heights[0], heights[-1], rows)

@@ -303,6 +303,24 @@ def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
     assert model_of(trained).parent.joinpath("bake", "motion.usdc").exists()
 
 
+def test_what_usd_does_not_get_of_a_look_is_named(ready, trained, capfd):
+    pillar = ready.data.objects["Pillar"]
+    for name in ("UVMap", "Light"):
+        trained.data.uv_layers.new(name=name)
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    assert "In USD 'Skirt' loses the UV map 'Light'. Bake to the timeline" in capfd.readouterr().out
+    for thing, name in ((trained, "Linen"), (trained, "Hem"), (pillar, "Skin")):
+        thing.data.materials.append(ready.data.materials.new(name))
+    pillar.data.color_attributes.new("Dye", "BYTE_COLOR", "CORNER")
+    bake(ready, trained, to_timeline=True, to_usd=False)
+    assert "In USD" not in capfd.readouterr().out
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    assert (
+        "In USD 'Skirt' loses the material 'Linen', the material 'Hem', the UV map 'Light'; "
+        "'Pillar' loses the material 'Skin', the colours 'Dye'. Bake"
+    ) in capfd.readouterr().out
+
+
 def test_a_single_frame_is_baked(ready, trained, tmp_path, ssilk_python):
     scene = ready.context.scene
     scene.frame_start = scene.frame_end = 7

@@ -42,6 +42,12 @@ def test_every_frame_shows_what_a_bake_would(ready, trained, wanted):
     assert not playing().live(trained).stale
 
 
+def test_what_live_playback_does_not_follow_is_told(ready, trained, capfd):
+    ready.data.objects["Pillar"].modifiers.new("Late", "SMOOTH")
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    assert "The modifier 'Late' of 'Pillar' comes after its bones" in capfd.readouterr().out
+
+
 def test_the_panel_says_what_live_playback_is_at(ready, trained):
     from blender_addon.panels.playback import NOT_LIVE, PlaybackPanel
 

@@ -256,6 +256,19 @@ def test_a_modifier_before_the_armature_is_listed(ready, skirt):
         ready.ops.ssilk.fix_finding()
 
 
+def test_a_modifier_of_a_body_after_its_bones_is_listed(ready, skirt):
+    from blender_addon.quality.checks import look_again
+
+    modifiers = ready.data.objects["Pillar"].modifiers
+    modifiers.new("Late", "SMOOTH")
+    assert ready.ops.ssilk.inspect() == {"FINISHED"}
+    found = findings(ready)["unmet-modifier"]
+    assert (found.target, found.found) == ("Pillar", "its modifier 'Late' comes after its bones")
+    modifiers.move(1, 0)
+    assert look_again(ready.context.window_manager.ssilk_preflight)
+    assert "unmet-modifier" not in findings(ready)
+
+
 def test_joints_are_selected_as_bones(ready, skirt):
     from blender_addon.settings.preflight import keep_findings
     from ssilk_core.authoring.preflight.finding import Finding

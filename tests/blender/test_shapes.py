@@ -12,6 +12,8 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
+from .conftest import add_mesh, make_meta, tube
+
 
 def fuller(thing: Any, value: float = 0.0, name: str = "Full", amount: float = 0.2) -> Any:
     """Give an object a shape key that makes it wider, at some value."""
@@ -184,6 +186,91 @@ def test_shapes_whose_animation_is_off_are_not_told(ready, trained, change):
     assert len(values) == 1 and not said_of(trained)
 
 
+@pytest.mark.parametrize("muted", [False, True])
+def test_a_key_that_a_meta_strip_moves_is_told(ready, trained, muted):
+    pillar = ready.data.objects["Pillar"]
+    keyed(pillar)
+    animation = pillar.data.shape_keys.animation_data
+    animation.nla_tracks.new().strips.new("Full", 1, animation.action)
+    animation.action = None
+    make_meta(ready, pillar, animation)
+    animation.nla_tracks[0].strips[0].mute = muted
+    assert bool(said_of(trained)) is not muted
+
+
+def displaced(bpy: Any, pillar: Any) -> None:
+    early = pillar.modifiers.new("Early", "DISPLACE")
+    for frame, early.strength in ((1, 0.0), (20, 0.1)):
+        early.keyframe_insert("strength", frame=frame)
+
+
+def waving(bpy: Any, pillar: Any) -> None:
+    pillar.modifiers.new("Early", "WAVE")
+
+
+def hooked(bpy: Any, pillar: Any) -> None:
+    hook = bpy.data.objects.new("Hook", None)
+    bpy.context.collection.objects.link(hook)
+    early = pillar.modifiers.new("Early", "HOOK")
+    early.object = hook
+    early.vertex_indices_set(list(range(20)))
+    for frame, hook.location.x in ((1, 0.0), (20, 0.2)):
+        hook.keyframe_insert("location", frame=frame)
+
+
+def timed_by_nodes(bpy: Any, pillar: Any) -> None:
+    tree = bpy.data.node_groups.new("Breathing", "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    begin, move, clock, end = map(
+        tree.nodes.new,
+        ("NodeGroupInput", "GeometryNodeSetPosition", "GeometryNodeInputSceneTime", "NodeGroupOutput"),
+    )
+    tree.links.new(begin.outputs[0], move.inputs["Geometry"])
+    tree.links.new(clock.outputs["Seconds"], move.inputs["Offset"])
+    tree.links.new(move.outputs[0], end.inputs[0])
+    pillar.modifiers.new("Early", "NODES").node_group = tree
+
+
+@pytest.mark.parametrize("change", [displaced, waving, hooked, timed_by_nodes])
+def test_a_body_whose_modifiers_change_its_shape_is_told(ready, trained, change):
+    pillar, scene = ready.data.objects["Pillar"], ready.context.scene
+    count = len(ready.data.objects)
+    change(ready, pillar)
+    others = len(ready.data.objects) - count
+    pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
+    scene.frame_set(7)
+    (told,) = said_of(trained)
+    assert told == (
+        "Modifiers change the shape of 'Pillar' over time, which is not followed; the shape of frame 7 is met "
+        "throughout."
+    )
+    assert scene.frame_current == 7 and len(ready.data.objects) == count + others  # nothing is left behind
+
+
+def test_a_body_whose_modifiers_keep_its_shape_is_not_told(ready, trained):
+    pillar = ready.data.objects["Pillar"]
+    pillar.modifiers.new("Early", "DISPLACE").strength = 0.05
+    pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
+    assert not said_of(trained)  # though its bones move, which come after
+
+
+def test_an_armature_modifier_without_armature_is_passed_over(ready, skirt):
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.modifiers import unmet_modifiers
+
+    pillar = ready.data.objects["Pillar"]
+    pillar.modifiers.new("Empty", "ARMATURE")
+    pillar.modifiers.new("Early", "DISPLACE").strength = 0.05
+    for _ in range(2):
+        pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
+    pillar.modifiers.move(pillar.modifiers.find("Empty"), 0)
+    assert [each.name for each in pillar.modifiers] == ["Empty", "Early", "Armature"]
+    mesh = gather(skirt, classes=False, proxies=False).character.bodies[0].mesh
+    np.testing.assert_allclose(mesh.points, shown_at_rest(ready, pillar), atol=1e-6)
+    assert unmet_modifiers(pillar) == []
+
+
 @pytest.mark.parametrize("kind", ["MIRROR", "SMOOTH", "DISPLACE"])
 def test_what_shapes_a_body_after_its_bones_is_told(ready, trained, kind):
     pillar = ready.data.objects["Pillar"]
@@ -295,6 +382,11 @@ def test_a_body_in_another_shape_than_in_training_is_told(ready, trained, folder
     ready.context.view_layer.update()
     joints = read_joints(rig, trained).character
     assert reshaped(trained, joints, folder / "given" / STAGE) == ""
+    swollen = pillar.modifiers.new("Early", "DISPLACE")
+    swollen.strength, swollen.mid_level = 0.02, 0.0
+    pillar.modifiers.move(len(pillar.modifiers) - 1, 0)
+    assert "'Pillar' is up to 20 mm off" in reshaped(trained, joints, folder / "given" / STAGE)
+    pillar.modifiers.remove(swollen)
     fuller(pillar, 1.0)
     found = reshaped(trained, joints, folder / "given" / STAGE)
     assert found == " ('Pillar' is up to 30 mm off its shape in training, which the cloth met)"
@@ -316,3 +408,24 @@ def test_the_bake_of_a_body_is_no_other_shape_of_it(ready, trained, folder):
     assert reshaped(trained, joints, folder / "renamed" / STAGE) == ""
     fuller(pillar, 1.0)
     assert "'Pillar' is up to 30 mm off" in reshaped(trained, joints, folder / "renamed" / STAGE)
+
+
+def test_a_driven_key_of_a_character_that_was_just_linked_counts(ready, skirt, tmp_path):
+    from blender_addon.scene.gather import gather
+
+    rig, pillar, path = ready.data.objects["Rig"], ready.data.objects["Pillar"], str(tmp_path / "char.blend")
+    rig["fat"] = 0.7
+    driver = fuller(pillar).driver_add("value").driver
+    variable = driver.variables.new()
+    variable.targets[0].id, variable.targets[0].data_path, driver.expression = rig, '["fat"]', variable.name
+    ready.data.libraries.write(path, {rig, pillar})
+    ready.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+    with ready.data.libraries.load(path, link=True) as (_, wanted):
+        wanted.objects = ["Rig", "Pillar"]
+    for thing in wanted.objects:
+        ready.context.collection.objects.link(thing)
+    garment = add_mesh(ready, "Skirt", *tube(24, 13, (0.6, 1.0, 1.3), (0.5, 0.165, 0.165)))
+    garment.ssilk.armature = wanted.objects[0]
+    mesh = gather(garment, classes=False, proxies=False).character.bodies[0].mesh
+    np.testing.assert_allclose(mesh.points, shown_at_rest(ready, wanted.objects[1]), atol=1e-6)
+    assert np.hypot(*mesh.points[:, [0, 2]].T).max() > 0.15 * 1.1  # it is on

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .conftest import add_armature
+from .conftest import add_armature, make_meta
 
 HERO, VILLAIN = 0.9, 0.2  # how far they lean [rad]
 
@@ -92,6 +92,48 @@ def test_a_strip_of_another_characters_slot_does_not_make_that_slot_its_own(bpy,
     if muted:
         hero.name = "Renamed"
     assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+
+
+def test_strips_in_a_meta_strip_tell_the_own_slot(bpy, cast):
+    hero, villain, action = cast
+    after_another_action(bpy, *cast)
+    make_meta(bpy, hero, hero.animation_data)
+    villain.animation_data_clear()
+    hero.name, villain.name = "Villain", "Hero"
+    assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+
+
+def test_a_strip_that_is_tweaked_is_told(bpy, cast):
+    from blender_addon.errors import SetupError
+
+    hero, _villain, action = cast
+    on_a_strip(bpy, *cast)
+    hero.animation_data.nla_tracks[0].select = hero.animation_data.nla_tracks[0].strips[0].select = True
+    hero.animation_data.use_tweak_mode = True
+    with pytest.raises(SetupError, match="A strip of 'Hero' is being tweaked; leave tweak mode"):
+        leaning(bpy, hero, action, 12)
+
+
+def test_the_action_of_a_twin_whose_other_slot_is_free_is_refused(bpy, cast, tmp_path):
+    """The twin came from the same file; what it had in this action is played by the other one alone."""
+    from blender_addon.errors import SetupError
+
+    hero, villain, action = cast
+    on_a_strip(bpy, *cast)
+    bpy.data.objects.remove(villain)
+    path = str(tmp_path / "hero.blend")
+    bpy.data.libraries.write(path, {hero})
+    with bpy.data.libraries.load(path) as (_, wanted):
+        wanted.objects = ["Hero"]
+    (twin,) = wanted.objects
+    bpy.context.collection.objects.link(twin)
+    twin.name = "Guest"
+    (own,) = {strip.action for track in twin.animation_data.nla_tracks for strip in track.strips}
+    assert own != action
+    assert leaning(bpy, twin, own, 12) == pytest.approx(HERO, abs=1e-4)
+    assert leaning(bpy, hero, action, 12) == pytest.approx(HERO, abs=1e-4)
+    with pytest.raises(SetupError, match="none is told to be of 'Guest'"):
+        leaning(bpy, twin, action, 12)
 
 
 def test_a_single_strip_that_borrows_anothers_slot_leaves_the_own_motion(bpy, cast):

@@ -462,7 +462,8 @@ def test_a_rig_says_what_a_garment_from_its_own_file_loses(hero, tmp_path):
 
 def varied(stage: Usd.Stage) -> None:
     sets = stage.GetPrimAtPath("/Looks/Cape_cloth").GetVariantSets().AddVariantSet("colour")
-    sets.AddVariant("blue")
+    for each in ("blue", "red"):
+        sets.AddVariant(each)
     sets.SetVariantSelection("blue")
 
 
@@ -569,6 +570,35 @@ def test_tiles_that_are_named_without_a_dot_are_found_from_a_shot(hero, tmp_path
     shot = Usd.Stage.Open(str(tmp_path / "shots" / "shot.usda"))
     written = shot.GetPrimAtPath("/Hero/Looks/Cape_cloth/Texture").GetAttribute("inputs:file").Get()
     assert UsdShade.UdimUtils.ResolveUdimPath(written.path, shot.GetRootLayer())
+
+
+def test_a_rig_in_another_folder_finds_textures_and_tiles_by_relative_paths(hero, tmp_path):
+    (hero.parent / "textures" / "linen.1001.png").write_bytes(b"linen")
+    stage = Usd.Stage.Open(str(hero))
+    texture = UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Texture")).GetInput("file")
+    texture.Set(Sdf.AssetPath("textures/linen.<UDIM>.png"))
+    stage.Save()
+    rigged = tmp_path / "rigs" / "rigged.usda"
+    rigged.parent.mkdir()
+    write_rigged_stage(hero, worn(hero).scene, rigged)
+    after = Usd.Stage.Open(str(rigged))
+    tiles, plain = (
+        after.GetPrimAtPath(f"/Looks/{name}/Texture").GetAttribute("inputs:file").Get()
+        for name in ("Cape_cloth", "Body_cloth")
+    )
+    assert UsdShade.UdimUtils.ResolveUdimPath(tiles.path, after.GetRootLayer())
+    assert plain.resolvedPath and Path(plain.resolvedPath).samefile(hero.parent / "textures" / "linen.png")
+    assert not Path(tiles.path).is_absolute() and not Path(plain.path).is_absolute()
+
+
+def test_a_set_of_one_variant_that_is_selected_loses_nothing(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    only = stage.GetPrimAtPath("/Hero/Cape").GetVariantSets().AddVariantSet("model")
+    only.AddVariant("base")
+    only.SetVariantSelection("base")
+    stage.Save()
+    assert not write_rigged_stage(hero, worn(hero).scene, tmp_path / "rigged.usda")
+    assert not shoot(worn(hero), tmp_path / "shot.usda").left_out
 
 
 def test_a_rig_says_what_a_garment_without_a_material_takes_on(hero, tmp_path):

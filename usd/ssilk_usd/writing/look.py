@@ -133,15 +133,27 @@ def copy_looks(
         for prim in Usd.PrimRange(stage.GetPrimAtPath(path)):
             shader = opened.GetPrimAtPath(prim.GetPath().ReplacePrefix(path, material))
             _keep_targets(shader, prim.GetAuthoredRelationships(), path.name, written, left)
-    folder = os.path.abspath(os.path.dirname(output))
-    UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
+    name_files_from(layer, output)
     return left
 
 
+def name_files_from(layer: Sdf.Layer, output: str | Path) -> None:
+    """Make absolute paths of files in a layer relative to where it will lie, so that a folder can be moved."""
+    folder = os.path.abspath(os.path.dirname(output))
+    UsdUtils.ModifyAssetPaths(layer, lambda name: os.path.relpath(name, folder) if os.path.isabs(name) else name)
+
+
 def variants_of(prim: Usd.Prim) -> list[str]:
-    """Return in words which variant sets of a prim a copy of what is selected in them lacks."""
+    """Return in words which variant sets of a prim a copy of what is selected in them lacks.
+
+    A set whose only variant is selected has nothing to lose.
+    """
     sets = prim.GetVariantSets()
-    names = sets.GetNames()
+    names = [
+        name
+        for name in sets.GetNames()
+        if sets.GetVariantSet(name).GetVariantNames() != [sets.GetVariantSelection(name)]
+    ]
     kept = {name: sets.GetVariantSelection(name) for name in names}
     return [
         f"the variant set {name}, of which {repr(kept[name]) if kept[name] else 'none'} is kept" for name in names
@@ -213,11 +225,11 @@ def _flattened(stage: Usd.Stage, prims: Sequence[Usd.Prim], rate: float) -> Sdf.
             if prim and prim.IsInstance():
                 prim.SetInstanceable(False)
     flat = part.Flatten()
-    _anchor_tiles(part, flat)
+    anchor_tiles(part, flat)
     return flat
 
 
-def _anchor_tiles(part: Usd.Stage, flat: Sdf.Layer) -> None:
+def anchor_tiles(part: Usd.Stage, flat: Sdf.Layer) -> None:
     """Make paths of tiled textures absolute where USD finds tiles by the layer that names them.
 
     USD flattens those that begin with a dot alone.

@@ -37,7 +37,7 @@ from ..reading.surface import bound_material
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, free_name, keep_lbs_skin, mark_garment, matrix_array, prim_names
 from .export import export, need_layer_suffix
-from .look import copy_looks, variants_of
+from .look import anchor_tiles, copy_looks, name_files_from, variants_of
 from .look_above import LookFromAbove
 from .repair_mesh import offset_points
 from .surface import reads_as, shield_surface, write_surface
@@ -84,6 +84,7 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         _shape_garment(mesh, skel, wanted)
     if look:
         left_out = look.keep(mesh.GetPrim())
+    name_files_from(layer, out)
     export(layer, out)
     return "; ".join(filter(None, [*variants, left_out]))
 
@@ -104,7 +105,9 @@ def _flattened(source: str | Path, scene: Scene) -> tuple[Sdf.Layer, list[str]]:
         for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
         if (variants := variants_of(prim))
     ]
-    return stage.Flatten(), lost
+    flat = stage.Flatten()
+    anchor_tiles(stage, flat)
+    return flat, lost
 
 
 def _expand(prim: Usd.Prim) -> None:
