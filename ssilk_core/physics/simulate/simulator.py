@@ -232,9 +232,7 @@ class Simulator:
         world = solution.x.double() + poses.root
         return StepHistory(world, before, poses.root, poses.lbs, solution.neighbours, friction)
 
-    def _first(
-        self, spans: Sequence[MotionSpan], surroundings: Surroundings | None
-    ) -> tuple[StepHistory, Solution]:
+    def _first(self, spans: Sequence[MotionSpan], surroundings: Surroundings | None) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
         most = self.options.quasi_static_solver.iterations + (POSES - 1) * ON_THE_WAY
         self.report(Message(f"cloth comes to rest in the first pose, in {most} iterations at most"))

@@ -115,7 +115,9 @@ class PosedWorld:
     def points(self, like: Tensor) -> Tensor:
         """Return the points of all colliders, shape (B, 3, N), padded with zeros; `like` gives type and device."""
         if not self._points:
-            frames = [np.concatenate([each.points for each in own]) if own else np.zeros((0, 3)) for own in self.colliders]
+            frames = [
+                np.concatenate([each.points for each in own]) if own else np.zeros((0, 3)) for own in self.colliders
+            ]
             padded = np.zeros((max(map(len, frames), default=0), 3, len(frames)))
             for frame, own in enumerate(frames):
                 padded[: len(own), :, frame] = own

@@ -76,7 +76,7 @@ class Air:
         velocity, gusts = frozen(self.velocity, np.float64), frozen(self.gusts, np.float64)
         if not (np.isfinite(velocity).all() and np.linalg.norm(velocity, axis=-1).max() <= FASTEST):
             fail("wind", f"{velocity[0].tolist()} m/s", f"finite speeds of at most {FASTEST:g} m/s are allowed")
-        if not (np.isfinite(gusts).all() and 0 <= gusts.min() and gusts.max() <= FASTEST):
+        if not (np.isfinite(gusts).all() and gusts.min() >= 0 and gusts.max() <= FASTEST):
             fail("gusts", f"{gusts[0]:g} m/s", f"0 to {FASTEST:g} m/s are allowed")
         if not 0 < self.length < np.inf:
             fail("gusts", f"a length of {self.length:g} m", "it must be positive")
