@@ -301,8 +301,8 @@ class Simulator:
         friction = past.friction and past.friction.after(poses.body.points)
         predicted = predicted.to(past.lbs.dtype)
         advected = past.local if world is None else self._advected(world, past, poses)
-        held = {"friction": friction, "world": met}
-        return StepInputs(poses.body, gravity, predicted, advected, self.dt, poses.lbs, **held)
+        inputs = StepInputs(poses.body, gravity, predicted, advected, self.dt, poses.lbs, friction=friction)
+        return inputs if met is None else replace(inputs, world=met)
 
     def _advected(self, world: PosedWorld, past: StepHistory, poses: PosedCharacters) -> Tensor:
         """Return the last positions moved with the air, relative to the roots, shape (V, 3, N)."""

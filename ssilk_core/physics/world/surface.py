@@ -49,8 +49,9 @@ class SurfaceDistance:
 
     def only(self, kept: NDArray[np.bool_], turn: Floats) -> SurfaceDistance:
         """Return those that are kept (M,), with their gradients turned (3, 3)."""
-        rest = (each[kept] for each in (self.part, self.on_border, self.behind, self.corners, self.weights))
-        return SurfaceDistance(self.distance[kept], self.normal[kept] @ turn.T, *rest)
+        normal, part, on_border = self.normal[kept] @ turn.T, self.part[kept], self.on_border[kept]
+        where = self.corners[kept], self.weights[kept]
+        return SurfaceDistance(self.distance[kept], normal, part, on_border, self.behind[kept], *where)
 
 
 class Surface:

@@ -104,8 +104,8 @@ class PosedWorld:
     def select(self, frames: Tensor) -> PosedWorld:
         """Return that of the frames with indices (M,)."""
         chosen = frames.tolist()
-        each = (tuple(values[index] for index in chosen) for values in (self.colliders, self.air, self.seconds))
-        colliders, air, seconds = each
+        colliders = tuple(self.colliders[index] for index in chosen)
+        air, seconds = tuple(self.air[index] for index in chosen), tuple(self.seconds[index] for index in chosen)
         return PosedWorld(colliders, self.gravity[:, frames], air, seconds, self.roots[chosen])
 
     @property
@@ -170,7 +170,7 @@ class Surroundings:
     def __init__(self, worlds: Sequence[World | None], gravity: Floats) -> None:
         self._worlds = [world or World(1.0) for world in worlds]
         self._gravity = gravity
-        self._air = [world.air and MovingAir(world.air, world.fps) for world in self._worlds]
+        self._air = [MovingAir(world.air, world.fps) if world.air else None for world in self._worlds]
         self._surfaces: dict[int, Surface] = {}
         self._still: dict[int, PosedSurface] = {}
 
@@ -225,5 +225,5 @@ def _placed(placements: Floats, world: World, seconds: float) -> Floats:
     if part < 1e-9:
         return placements[low]
     turns = quaternion_from_matrix(placements[low : low + 2, :3, :3])
-    turn = matrix_from_quaternion(slerp(turns[0], turns[1], part))
+    turn = matrix_from_quaternion(slerp(turns[0], turns[1], np.array(part)))
     return rigid(turn, world.between(placements, seconds)[:3, 3])
