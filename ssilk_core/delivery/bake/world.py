@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf
+from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 from ...errors import fail
@@ -76,7 +76,7 @@ def _numbers(text: str) -> list[float]:
 
 def _vector(option: str, text: str) -> tuple[float, float, float]:
     numbers = _numbers(text)
-    if len(numbers) != 3:
+    if len(numbers) != 3 or not all(map(isfinite, numbers)):
         fail(option, f"'{text}'", "X,Y,Z is needed, such as 0,0,5; write --wind=-5,0,0 where X is negative")
     x, y, z = numbers
     return x, y, z
