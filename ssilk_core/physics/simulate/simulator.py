@@ -192,6 +192,8 @@ class Simulator:
                 name = self.potential.fabric.name
                 found, allowed = f"wind, and the fabric '{name}' has no drag", "air moves cloth by its drag"
                 fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
+        if self.potential.fabric.friction and any(world and world.colliders for world in worlds):
+            self.report(Message("friction is that of body and cloth; on floors and props cloth slides", "warning"))
         return Surroundings(worlds, np.array(self.options.gravity))
 
     def _simulate_spans(
