@@ -10,7 +10,7 @@ from ssilk_usd.reading.posed import SkinnedMesh, skinning_of
 from ssilk_usd.reading.world import AskedWorld, read_world
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.scene.assets import Body, Character, Mesh, Motion, Skeleton, SkinWeights, World
+from ssilk_core.scene.assets import Body, Character, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
 
 FPS, FRAMES, FIRST = 25.0, 5, 10
 TO_CORE = {"Y": np.eye(3), "Z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
@@ -49,7 +49,7 @@ def codes() -> np.ndarray:
     return 2.0 * (FIRST + np.arange(FRAMES))
 
 
-def read(stage: Usd.Stage, *, garment: str | None = None, report=lambda event: None, **asked) -> World | None:
+def read(stage: Usd.Stage, *, garment: str | None = None, report=lambda event: None, **asked) -> ShotWorld | None:
     stage.GetRootLayer().Save()
     path = stage.GetRootLayer().realPath
     return read_world(path, path, character(), motion(), AskedWorld(**asked), garment=garment, report=report)
@@ -67,7 +67,7 @@ def colliding(prim: Usd.Prim) -> UsdPhysics.CollisionAPI:
     return UsdPhysics.CollisionAPI.Apply(prim)
 
 
-def placed(world: World, frame: int, index: int = 0) -> np.ndarray:
+def placed(world: ShotWorld, frame: int, index: int = 0) -> np.ndarray:
     """Points of a collider in the core's world [m] at a frame."""
     own = world.colliders[index]
     points, place = (each[min(frame, len(each) - 1)] for each in (own.points, own.placements))

@@ -13,7 +13,7 @@ import numpy as np
 from ...devices import select_device
 from ...errors import SsilkError, VerificationError
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, World
+from ...scene.assets import Floats, ShotWorld
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 from .world import asked_world, unseen, world_of
@@ -96,7 +96,7 @@ def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool
     return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
 
 
-def _world(rollout: BakeRollout, report: Reporter) -> World | None:
+def _world(rollout: BakeRollout, report: Reporter) -> ShotWorld | None:
     """Return what surrounds the character from the first frame of a rollout's motion on."""
     request = rollout.request
     asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)

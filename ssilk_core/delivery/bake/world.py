@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from ...errors import fail
 from ...events import Reporter, silent
 from ...files import split_location
-from ...scene.assets import Motion, Scene, World
+from ...scene.assets import Motion, Scene, ShotWorld
 
 if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
@@ -47,7 +47,7 @@ def check_world(wind: str | None, gusts: str | None, gravity: str | None) -> Non
 
 def world_of(
     source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter = silent
-) -> World | None:
+) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
     from ssilk_usd.reading.world import read_world
 
@@ -55,7 +55,7 @@ def world_of(
     return read_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
 
 
-def unseen(world: World | None) -> str:
+def unseen(world: ShotWorld | None) -> str:
     """Return the sentence that says what of a world the network does not see; empty where there is nothing."""
     if world is None:
         return ""

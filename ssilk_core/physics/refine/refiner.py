@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
-from ...scene.assets import Floats, Motion, Scene, World
+from ...scene.assets import Floats, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
@@ -148,7 +148,9 @@ class Refiner:
         self.potential = self.simulator.potential
         self.clearing = SkinClearing(scene, self.potential)
 
-    def frames(self, motion: Motion, network: Iterable[Floats], world: World | None = None) -> Iterator[RefinedFrame]:
+    def frames(
+        self, motion: Motion, network: Iterable[Floats], world: ShotWorld | None = None
+    ) -> Iterator[RefinedFrame]:
         """Yield the refined frames of a shot.
 
         Args:
@@ -162,7 +164,7 @@ class Refiner:
         yield from self._spans(motion, iter(network), None, world)
 
     def changes(
-        self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats], world: World | None = None
+        self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats], world: ShotWorld | None = None
     ) -> Iterator[FrameChange]:
         """Yield the changes of a shot that has been refined; arguments as for `frames`."""
         for frame in self._spans(motion, iter(network), iter(refined), world):
@@ -174,7 +176,7 @@ class Refiner:
         motion: Motion,
         network: Iterator[Floats],
         refined_points: Iterator[Floats] | None,
-        world: World | None,
+        world: ShotWorld | None,
     ) -> Iterator[RefinedFrame]:
         fps = self.simulator.options.fps
         if not abs(motion.fps - fps) < 1e-6:

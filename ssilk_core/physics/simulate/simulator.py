@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, Motion, Scene, Skeleton, World
+from ...scene.assets import Floats, Motion, Scene, ShotWorld, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
 from ..constants import GRAVITY
@@ -166,7 +166,7 @@ class Simulator:
         return part
 
     def frames(
-        self, motions: Sequence[Motion], worlds: Sequence[World | None] | None = None
+        self, motions: Sequence[Motion], worlds: Sequence[ShotWorld | None] | None = None
     ) -> Iterator[SimulatedFrame]:
         """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel.
 
@@ -183,7 +183,7 @@ class Simulator:
         for start in range(0, len(spans), options.batch):
             yield from self._simulate_spans(spans[start : start + options.batch], surroundings)
 
-    def surroundings(self, worlds: Sequence[World | None] | None) -> Surroundings | None:
+    def surroundings(self, worlds: Sequence[ShotWorld | None] | None) -> Surroundings | None:
         """Return the worlds of shots, prepared; None where nothing surrounds any character."""
         if worlds is None or all(world is None or world.is_usual for world in worlds):
             return None
@@ -384,7 +384,7 @@ def simulate(
     motions: Sequence[Motion],
     options: SimulationOptions | None = None,
     *,
-    worlds: Sequence[World | None] | None = None,
+    worlds: Sequence[ShotWorld | None] | None = None,
     device: torch.device | str = "cpu",
     report: Reporter = silent,
 ) -> list[Floats]:

@@ -54,7 +54,7 @@ class SurfaceDistance:
         return SurfaceDistance(self.distance[kept], normal, part, on_border, self.behind[kept], *where)
 
 
-class Surface:
+class CollisionSurface:
     """The triangles of a mesh, all wound the same way; a closed part is wound counter-clockwise from outside.
 
     Attributes:
@@ -110,7 +110,7 @@ class Surface:
 class PosedSurface:
     """A surface at given points; built in time in proportion to its triangles, and queried often."""
 
-    def __init__(self, surface: Surface, points: Floats) -> None:
+    def __init__(self, surface: CollisionSurface, points: Floats) -> None:
         import igl
 
         self.surface, self.points = surface, np.ascontiguousarray(points)

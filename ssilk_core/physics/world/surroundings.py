@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import Collider, Floats, Ints, World
+from ...scene.assets import Collider, Floats, Ints, ShotWorld
 from ...scene.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid, slerp
 from .air import MovingAir
-from .surface import PosedSurface, Surface, SurfaceDistance
+from .surface import CollisionSurface, PosedSurface, SurfaceDistance
 
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
 
@@ -167,11 +167,11 @@ class Surroundings:
         gravity: where a world says none [m/s2], shape (3,).
     """
 
-    def __init__(self, worlds: Sequence[World | None], gravity: Floats) -> None:
-        self._worlds = [world or World(1.0) for world in worlds]
+    def __init__(self, worlds: Sequence[ShotWorld | None], gravity: Floats) -> None:
+        self._worlds = [world or ShotWorld(1.0) for world in worlds]
         self._gravity = gravity
         self._air = [MovingAir(world.air, world.fps) if world.air else None for world in self._worlds]
-        self._surfaces: dict[int, Surface] = {}
+        self._surfaces: dict[int, CollisionSurface] = {}
         self._still: dict[int, PosedSurface] = {}
 
     def around(self, places: Sequence[tuple[int, float]], root: Tensor, carried: Tensor) -> PosedWorld:
@@ -198,7 +198,7 @@ class Surroundings:
         return PosedWorld(tuple(colliders), down, air, tuple(seconds for _, seconds in places), roots)
 
     def _posed(
-        self, collider: Collider, world: World, seconds: float, root: Floats, carried: Floats
+        self, collider: Collider, world: ShotWorld, seconds: float, root: Floats, carried: Floats
     ) -> PosedCollider | None:
         """Return a collider at a time; None where cloth does not meet it then."""
         frame = min(max(int(seconds * world.fps + 1e-6), 0), len(collider.present) - 1)
@@ -206,7 +206,7 @@ class Surroundings:
             return None
         key = id(collider)
         if key not in self._surfaces:
-            self._surfaces[key] = Surface(collider.path, collider.points[0], collider.faces)
+            self._surfaces[key] = CollisionSurface(collider.path, collider.points[0], collider.faces)
         if len(collider.points) > 1:
             surface = self._surfaces[key].at(world.between(collider.points, seconds))
         else:
@@ -217,7 +217,7 @@ class Surroundings:
         return PosedCollider(surface, place[:3, :3], place[:3, 3] - root, carried)
 
 
-def _placed(placements: Floats, world: World, seconds: float) -> Floats:
+def _placed(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
     """Return the placement (4, 4) at a time; between frames it turns at a constant rate."""
     at = min(max(seconds * world.fps, 0.0), len(placements) - 1.0)
     low = int(at)

@@ -84,7 +84,7 @@ class Air:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class ShotWorld:
     """What surrounds a character in a shot; time runs from the first frame of its motion.
 
     Attributes:

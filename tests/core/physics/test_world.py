@@ -18,9 +18,20 @@ from ssilk_core.physics.simulate.incremental_potential import IncrementalPotenti
 from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
-from ssilk_core.physics.world.surface import Surface
+from ssilk_core.physics.world.surface import CollisionSurface
 from ssilk_core.physics.world.surroundings import Surroundings
-from ssilk_core.scene.assets import LOOSE, PINNED, Air, Collider, Garment, Mesh, Motion, ProxyRig, SkinWeights, World
+from ssilk_core.scene.assets import (
+    LOOSE,
+    PINNED,
+    Air,
+    Collider,
+    Garment,
+    Mesh,
+    Motion,
+    ProxyRig,
+    ShotWorld,
+    SkinWeights,
+)
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import bind_pose
 
@@ -82,7 +93,7 @@ SOLIDS = {
 }
 
 
-def path(cloth, fabric: Fabric, world: World, frames: int, precise: float = 1e-6) -> np.ndarray:
+def path(cloth, fabric: Fabric, world: ShotWorld, frames: int, precise: float = 1e-6) -> np.ndarray:
     """Positions (frames, V, 3) of cloth that is let go where it was made."""
     simulator = Simulator(cloth, fabric, SimulationOptions(fps=FPS, solver=SolverOptions(tolerance=precise)))
     motion = still(cloth, 1)
@@ -108,7 +119,7 @@ def test_distances_are_those_of_all_triangles_however_a_mesh_is_wound_and_split(
     faces[wrong] = faces[wrong][:, ::-1]
     points, split = solid.vertices[faces.reshape(-1)], np.arange(faces.size).reshape(-1, 3)
     queries = rng.uniform(-1.5, 1.5, (300, 3))
-    surface = Surface(name, points, split).at(points)
+    surface = CollisionSurface(name, points, split).at(points)
     found = surface.distance(queries)
     np.testing.assert_allclose(np.abs(found.distance), brute_force(points, split, queries), atol=1e-12)
     inside = np.asarray(solid.contains(queries))
@@ -127,12 +138,14 @@ def test_distances_are_those_of_all_triangles_however_a_mesh_is_wound_and_split(
 
 def test_a_query_that_was_far_is_not_searched_for_again_and_none_is_missed() -> None:
     solid, rng = SOLIDS["ring"], np.random.default_rng(2)
-    world = Surroundings([World(FPS, (collider(solid.vertices, solid.faces),))], np.zeros(3))
+    world = Surroundings([ShotWorld(FPS, (collider(solid.vertices, solid.faces),))], np.zeros(3))
     x = torch.as_tensor(rng.uniform(-1.5, 1.5, (400, 3, 1)))
     around = world.around([(0, 0.0)], torch.zeros(3, 1), x)
     for _ in range(5):
         found = around.touched(x, 0.05)
-        expected = Surface("ring", solid.vertices, solid.faces).at(solid.vertices).distance(x[..., 0].numpy())
+        expected = (
+            CollisionSurface("ring", solid.vertices, solid.faces).at(solid.vertices).distance(x[..., 0].numpy())
+        )
         near = np.flatnonzero(expected.distance <= 0.05)
         np.testing.assert_array_equal(found.row, near)
         np.testing.assert_allclose(found.distance, expected.distance[near], atol=1e-12)
@@ -142,7 +155,7 @@ def test_a_query_that_was_far_is_not_searched_for_again_and_none_is_missed() -> 
 def test_a_floor_has_its_outside_where_the_garment_is_and_nothing_lies_below_beyond_its_border() -> None:
     for up in (True, False):
         own = floor(0.0, up)
-        surface = Surface("/floor", own.points[0], own.faces).at(own.points[0])
+        surface = CollisionSurface("/floor", own.points[0], own.faces).at(own.points[0])
         above = np.array([[0.1, 0.5, 0.2], [1.0, 0.2, 0.0], [0.0, -0.1, 0.0]])
         for mirror in (1.0, -1.0):
             sides = surface.outside(above * [1, mirror, 1])
@@ -154,7 +167,7 @@ def test_a_floor_has_its_outside_where_the_garment_is_and_nothing_lies_below_bey
 
 def test_a_room_is_hollow_and_a_box_that_holds_some_of_the_garment_is_not() -> None:
     box = trimesh.creation.box((2.0, 2.0, 2.0))
-    surface = Surface("/box", box.vertices, box.faces).at(box.vertices)
+    surface = CollisionSurface("/box", box.vertices, box.faces).at(box.vertices)
     assert surface.outside(np.array([[0.1, 0.2, 0.3], [0.5, 0.5, 0.5]])) == -1
     assert surface.outside(np.array([[0.1, 0.2, 0.3], [0.5, 0.5, 1.5]])) == 1
 
@@ -167,7 +180,7 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy(scene, shape: str) -
     prop = floor(0.998) if shape == "floor" else collider(ball.vertices + AWAY - [0, 0.499, 0], ball.faces)
     x = torch.as_tensor(np.array(cloth.garment.mesh.points))[..., None]
     x = x + 1e-3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(1), dtype=x.dtype)
-    world = Surroundings([World(FPS, (prop,))], np.zeros(3)).around([(0, 0.0)], torch.zeros(3, 1), x)
+    world = Surroundings([ShotWorld(FPS, (prop,))], np.zeros(3)).around([(0, 0.0)], torch.zeros(3, 1), x)
     without = StepInputs(None, torch.zeros(3, 1, dtype=x.dtype))
     inputs = replace(without, world=world)
     direction = torch.randn(x.shape, generator=torch.Generator().manual_seed(2), dtype=x.dtype)
@@ -189,7 +202,7 @@ def test_forces_and_stiffness_are_derivatives_of_the_energy(scene, shape: str) -
 
 def test_a_sheet_that_falls_on_a_floor_rests_where_pressure_bears_its_weight(scene) -> None:
     cloth = flat_sheet(scene, 0.4, 9)
-    world = World(FPS, (floor(0.7),))
+    world = ShotWorld(FPS, (floor(0.7),))
     *_, last = path(cloth, CLOTH, world, 60)
     law = replace(ContactLaw.of(CLOTH), stiffness=CLOTH.loose_contact)
     rest = brentq(lambda d: float(law.pressure(torch.tensor(d))) - CLOTH.density * G, 0, law.start)
@@ -202,7 +215,7 @@ def test_a_sheet_over_a_ball_hangs_around_it_and_none_of_it_is_inside(scene) -> 
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.15)
     centre = AWAY - [0, 0.17, 0]
     prop = collider(ball.vertices, ball.faces, np.eye(4)[None] + np.pad(centre[:, None], ((0, 1), (3, 0)))[None])
-    points = path(cloth, CLOTH, World(FPS, (prop,)), 15, 1e-2)
+    points = path(cloth, CLOTH, ShotWorld(FPS, (prop,)), 15, 1e-2)
     away = np.linalg.norm(points - centre, axis=2)
     assert away.min() > 0.15
     assert away[-1].min() < 0.15 + CLOTH.contact_distance
@@ -217,9 +230,9 @@ def test_a_box_that_moves_takes_the_sheet_before_it_along(scene, toy_grid) -> No
     places[:, :3, 3] = AWAY - [0, 0.35, 0]
     places[:, 2, 3] = -0.2 + 0.02 * np.arange(frames)  # its front comes to z = 0.15
     prop = collider(box.vertices, box.faces, places)
-    found = simulate(cloth, CLOTH, [still(cloth, frames)], SimulationOptions(fps=FPS), worlds=[World(FPS, (prop,))])[
-        0
-    ]
+    found = simulate(
+        cloth, CLOTH, [still(cloth, frames)], SimulationOptions(fps=FPS), worlds=[ShotWorld(FPS, (prop,))]
+    )[0]
     front = places[:, 2, 3] + 0.05
     across = (found[:, :, 1] < AWAY[1] - 0.3) & (found[:, :, 1] > AWAY[1] - 0.4)
     for frame in range(frames):
@@ -229,7 +242,7 @@ def test_a_box_that_moves_takes_the_sheet_before_it_along(scene, toy_grid) -> No
 
 def test_free_cloth_in_wind_falls_at_its_terminal_velocity(scene) -> None:
     wind, fabric = np.array([2.0, 0.5, -1.0]), replace(CLOTH, drag=0.9)
-    world = World(FPS, air=Air(wind[None], np.zeros(1)))
+    world = ShotWorld(FPS, air=Air(wind[None], np.zeros(1)))
     *_, before, after = path(flat_sheet(scene, 0.2, 3), fabric, world, 120)
     fall = np.array([0, -G, 0]) * fabric.density / fabric.drag
     np.testing.assert_allclose((after - before) * FPS, np.broadcast_to(wind + fall, after.shape), atol=1e-4)
@@ -239,7 +252,7 @@ def test_a_sheet_that_hangs_in_wind_tilts_by_the_ratio_of_drag_and_weight(scene,
     points, faces = toy_grid(9, 3, height=0.4, width=0.1)
     cloth = dressed(scene, points + AWAY, faces, points[:, 1] > -1e-9)
     fabric, speed = replace(CLOTH, drag=0.5), 4.0
-    world = World(FPS, air=Air(np.array([[0, 0, speed]]), np.zeros(1)))
+    world = ShotWorld(FPS, air=Air(np.array([[0, 0, speed]]), np.zeros(1)))
     found = simulate(
         cloth,
         fabric,
@@ -259,7 +272,7 @@ def test_a_sheet_that_hangs_in_wind_tilts_by_the_ratio_of_drag_and_weight(scene,
 def test_gravity_that_turns_and_grows_in_a_shot_moves_free_cloth_as_implicit_euler_does(scene) -> None:
     frames = 10
     pull = np.linspace([0, -9.81, 0], [5.0, 2.0, -1.0], frames + 1)
-    *_, before, after = path(flat_sheet(scene, 0.2, 3), CLOTH, World(FPS, gravity=pull), frames)
+    *_, before, after = path(flat_sheet(scene, 0.2, 3), CLOTH, ShotWorld(FPS, gravity=pull), frames)
     start = flat_sheet(scene, 0.2, 3).garment.mesh.points
     speeds = np.cumsum(pull[1:] / FPS, axis=0)
     np.testing.assert_allclose(after - start, np.broadcast_to(speeds.sum(axis=0) / FPS, after.shape), atol=1e-6)
@@ -291,9 +304,9 @@ def test_gusts_are_as_strong_as_they_say_solenoidal_continuous_and_the_same_agai
 def test_nothing_around_a_character_leaves_every_bit_as_it_is(scene, toy_motion) -> None:
     motion, options = toy_motion(scene, 6), SimulationOptions(fps=FPS)
     plain = simulate(scene, CLOTH, [motion], options)[0]
-    empty = simulate(scene, CLOTH, [motion], options, worlds=[World(FPS)])[0]
+    empty = simulate(scene, CLOTH, [motion], options, worlds=[ShotWorld(FPS)])[0]
     np.testing.assert_array_equal(plain, empty)
-    far = World(FPS, (floor(-50.0),))
+    far = ShotWorld(FPS, (floor(-50.0),))
     np.testing.assert_array_equal(plain, simulate(scene, CLOTH, [motion], options, worlds=[far])[0])
 
 
@@ -301,7 +314,7 @@ def test_a_collider_that_is_absent_is_not_met(scene) -> None:
     cloth = flat_sheet(scene, 0.2, 3)
     own = floor(0.9)
     gone = Collider("/floor", own.faces, own.points, own.placements, np.array([True, True, False]))
-    around = Surroundings([World(FPS, (gone,))], np.zeros(3))
+    around = Surroundings([ShotWorld(FPS, (gone,))], np.zeros(3))
     counts = [
         len(around.around([(0, t / FPS)], torch.zeros(3, 1), torch.zeros(4, 3, 1)).colliders[0]) for t in range(4)
     ]
@@ -309,13 +322,13 @@ def test_a_collider_that_is_absent_is_not_met(scene) -> None:
 
 
 def test_wind_on_cloth_without_drag_is_refused(scene) -> None:
-    world = World(FPS, air=Air(np.ones((1, 3)), np.zeros(1)))
+    world = ShotWorld(FPS, air=Air(np.ones((1, 3)), np.zeros(1)))
     with pytest.raises(SsilkError, match="has no drag"):
         simulate(scene, CLOTH, [still(scene, 2)], worlds=[world])
 
 
 def test_a_collider_without_area_or_with_a_placement_that_scales_is_refused() -> None:
     with pytest.raises(SsilkError, match="no triangle of it has an area"):
-        Surface("/line", np.zeros((3, 3)), np.array([[0, 1, 2]]))
+        CollisionSurface("/line", np.zeros((3, 3)), np.array([[0, 1, 2]]))
     with pytest.raises(SsilkError, match="scales or shears"):
         collider(np.eye(3), np.array([[0, 1, 2]]), 2 * np.eye(4)[None])

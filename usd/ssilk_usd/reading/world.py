@@ -17,7 +17,7 @@ from pxr import Usd, UsdPhysics
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import UP, Air, Character, Collider, Floats, Motion, World
+from ssilk_core.scene.assets import UP, Air, Character, Collider, Floats, Motion, ShotWorld
 
 from ..names import GUST_LENGTH, GUST_SEED, GUSTS, WIND
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, open_stage, stage_name, value
@@ -58,7 +58,7 @@ def read_world(
     *,
     garment: str | None = None,
     report: Reporter = silent,
-) -> World | None:
+) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion; None where nothing does.
 
     Colliders are those of the shot, or of the character's stage where the shot has none; so is the PhysicsScene.
@@ -87,7 +87,7 @@ def read_world(
     if gravity is not None and np.abs(gravity + EARTH * UP).max() <= SAME * EARTH:
         gravity = None
     air = _air(scene, seconds, asked, units)
-    world = World(motion.fps, tuple(colliders), gravity, air)
+    world = ShotWorld(motion.fps, tuple(colliders), gravity, air)
     return None if world.is_usual else world
 
 
