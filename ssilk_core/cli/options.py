@@ -20,6 +20,7 @@ from ..delivery.bake.request import (
     MAX_SAMPLES_PER_FRAME,
     REFINED_OUTPUTS,
 )
+from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
@@ -73,6 +74,23 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"change a property of the fabric (repeatable): {', '.join(setting_names(Fabric))}",
     )
+
+
+def add_world(verb: argparse.ArgumentParser, of: str) -> None:
+    """Add what surrounds the character; `of` says in which work cloth meets it."""
+    about = (
+        f"Cloth meets it {of}. A shot's prims with UsdPhysics.CollisionAPI, and its PhysicsScene's gravity and "
+        "ssilk:wind, count without these options. Vectors are in the axes of the shot's stage."
+    )
+    world = verb.add_argument_group("what surrounds the character", about)
+    world.add_argument("--collider", action="append", default=[], metavar="PRIM",
+                       help="a mesh or solid that cloth meets, or a prim above some, by path or name "
+                            "(repeatable)")  # fmt: skip
+    world.add_argument("--wind", metavar="X,Y,Z", help="velocity of the air in the world [m/s] (default: the air "
+                       "moves along with the character's root)")  # fmt: skip
+    world.add_argument("--gusts", metavar=GUSTS, help="RMS speed of the wind's turbulence [m/s], size of its largest "
+                       "eddies [m] (default 2) and seed (default 0)")  # fmt: skip
+    world.add_argument("--gravity", metavar="X,Y,Z", help="acceleration [m/s2] (default: 9.81 down)")
 
 
 def asked_fabric(options: argparse.Namespace) -> Fabric:
@@ -163,6 +181,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
+    add_world(verb, "with --refine and --quality hero, and the network does not see it")
     _add_names(verb)
     _add_output(verb)
 
@@ -288,6 +307,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             latent_elements=options.latent_elements,
             refined_output=options.refined_output,
             hide_covered=options.hide_covered,
+            colliders=tuple(options.collider),
+            wind=options.wind,
+            gusts=options.gusts,
+            gravity=options.gravity,
             device=options.device,
             garment=garment,
             shot=name,

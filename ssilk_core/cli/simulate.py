@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 from ..delivery.bake import naming
 from ..delivery.bake.request import parse_range
+from ..delivery.bake.world import asked_world, world_of
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
 from ..files import replacing
@@ -32,6 +33,7 @@ from . import options as shared
 
 if TYPE_CHECKING:
     import torch
+    from ssilk_usd.reading.world import AskedWorld
     from ssilk_usd.shots.points import PointCache
 
     from ..delivery.bake.result import ShotShapes
@@ -57,6 +59,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                            f"and the prim's where one is named); {naming.FIELDS}")  # fmt: skip
     shared.add_range(verb, "frames to simulate", "all")
     shared.add_fabric(verb)
+    shared.add_world(verb, "in the simulation")
     verb.add_argument(
         "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
     )
@@ -91,6 +94,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..physics.simulate.newton import SolverOptions
 
     frames = parse_range(options.range or "all")
+    asked = asked_world(options.collider, options.wind, options.gusts, options.gravity)
     outputs = _outputs(options.output, list(map(str, options.motion)), options.shot_name)
     for output in outputs:
         shared.check_output(output, options.stage, *motion_files(options.motion))
@@ -109,7 +113,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
     shared.tell_shapes(options, motions, report)
     shots = [
-        _Shot(output, motion, _provenance(options, path, fabric))
+        _Shot(output, motion, _provenance(options, path, fabric), str(path), asked)
         for output, motion, path in zip(outputs, motions, options.motion)
     ]
     missing = [shot for shot in shots if outputs == [options.output] or not shot.is_done]
@@ -121,11 +125,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Shot:
-    """A shot to simulate: its file, the character's motion, and the provenance that the file states."""
+    """A shot to simulate: its file, the character's motion, the provenance that the file states, where the motion
+    was read, and what was asked for around the character."""
 
     output: Path
     motion: Motion
     provenance: dict[str, str | float]
+    source: str
+    asked: AskedWorld | None
 
     @property
     def is_done(self) -> bool:
@@ -182,6 +189,8 @@ def _written(
 
     simulator = Simulator(scene, fabric, settings, device=device, report=report)
     motions = [shot.motion for shot in shots]
+    stage = str(options.stage)
+    worlds = [world_of(shot.source, stage, scene, shot.motion, shot.asked, report) for shot in shots]
     played = shots_of(motions, scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
@@ -189,7 +198,7 @@ def _written(
     with ExitStack() as stack:
         caches = _Caches(stack, options, shots, scene, played, report)
         told = Countdown(total, report)
-        for frame in simulator.frames(motions):
+        for frame in simulator.frames(motions, worlds):
             caches.write(frame.shot, frame.number, frame.points)
             figures.add(frame)
             told()
@@ -332,6 +341,8 @@ def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> di
         "fabric": fabric.name,
         **({"range": options.range} if options.range not in (None, "all") else {}),
         **({"self_contact": "on"} if options.self_contact else {}),
+        **{name: asked for name in ("wind", "gusts", "gravity") if (asked := getattr(options, name)) is not None},
+        **({"collider": ", ".join(options.collider)} if options.collider else {}),
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip

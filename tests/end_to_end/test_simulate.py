@@ -111,8 +111,8 @@ def test_shots_are_named_as_those_of_a_bake(stage):
 def test_an_interruption_leaves_nothing_half_written(stage, monkeypatch):
     advanced = Simulator.frames
 
-    def interrupted(self, motions):
-        for frame in advanced(self, motions):
+    def interrupted(self, motions, worlds):
+        for frame in advanced(self, motions, worlds):
             if frame.number == 1:
                 raise KeyboardInterrupt
             yield frame
@@ -127,9 +127,9 @@ def test_what_an_interrupted_simulation_finished_is_not_done_again(stage, monkey
     words = [*SIMULATE, "brief.usda", "short.usda", "--batch", "1", "-o", "caches"]
     advanced, asked = Simulator.frames, []
 
-    def interrupted(self, motions):
+    def interrupted(self, motions, worlds):
         asked.append(len(motions))
-        for frame in advanced(self, motions):
+        for frame in advanced(self, motions, worlds):
             if len(asked) == 1 and frame.shot == 1:  # the longer one is through
                 raise KeyboardInterrupt
             yield frame

@@ -13,6 +13,8 @@ JOINTS = "skel:joints"
 SKEL = ("primvars:skel:jointIndices", "primvars:skel:jointWeights", JOINTS)
 GEOM_BIND = "primvars:skel:geomBindTransform"
 LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
+# Of a PhysicsScene, in the stage's units of length and its axes: wind and the RMS speed of gusts [1/s], size, seed.
+WIND, GUSTS, GUST_LENGTH, GUST_SEED = "ssilk:wind", "ssilk:gusts", "ssilk:gustLength", "ssilk:gustSeed"
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 
 

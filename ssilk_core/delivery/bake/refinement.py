@@ -13,9 +13,10 @@ import numpy as np
 from ...devices import select_device
 from ...errors import SsilkError, VerificationError
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats
+from ...scene.assets import Floats, ShotWorld
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
+from .world import asked_world, unseen, world_of
 
 if TYPE_CHECKING:
     from ...physics.refine import RefinedFrame, Refiner
@@ -39,7 +40,11 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     Raises:
         SsilkError: a number of iterations that is not allowed.
     """
-    if not rollout.request.refine or rollout.refinement is not None:
+    if rollout.refinement is not None:
+        return rollout
+    if not rollout.request.refine:
+        if not rollout.request.lbs and (missed := unseen(_world(rollout, report))):
+            report(Message(f"{rollout.request.motion}: {missed}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
 
@@ -73,8 +78,8 @@ def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedF
     if rollout.request.feedback:  # the cloth is on its way when the shot begins
         left_out, played = rollout.lead, rollout.with_lead()
         report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
-    told = Countdown(played.motion.frame_count, report)
-    for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices())):
+    told, world = Countdown(played.motion.frame_count, report), _world(played, report)
+    for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices(), world)):
         told()
         if number >= left_out:
             yield frame
@@ -89,6 +94,13 @@ def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool
         deformer = replace(deformer, shapes=deformer.shapes[:0])
     poses = list(rollout.network_poses())
     return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
+
+
+def _world(rollout: BakeRollout, report: Reporter) -> ShotWorld | None:
+    """Return what surrounds the character from the first frame of a rollout's motion on."""
+    request = rollout.request
+    asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
+    return world_of(request.motion, request.stage, rollout.deformer.scene, rollout.motion, asked, report)
 
 
 def _refiner(rollout: BakeRollout) -> Refiner:
@@ -123,7 +135,8 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """
     energies, (judged, measured) = [], tee(points)
     told = Countdown(rollout.motion.frame_count, report)
-    changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged)
+    world = _world(rollout, silent)
+    changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged, world)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()
         rounding = ROUNDING_ENERGY + len(vertices) * ROUNDING_STIFFNESS * spacing**2

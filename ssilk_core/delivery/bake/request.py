@@ -14,6 +14,7 @@ from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MIN_FPS
 from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
+from .world import check_world
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
@@ -56,6 +57,8 @@ class BakeRequest:
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
+        colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
+            numbers as text (`delivery.bake.world`). Refinement alone meets it.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.
@@ -84,6 +87,10 @@ class BakeRequest:
     latent_elements: str = ALL_ELEMENTS
     refined_output: str = "joints"
     hide_covered: bool = False
+    colliders: tuple[str, ...] = ()
+    wind: str | None = None
+    gusts: str | None = None
+    gravity: str | None = None
     keep: ModelSize | None = None
     device: str = "cpu"
     garment: str | None = None
@@ -123,6 +130,7 @@ class BakeRequest:
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail_unknown("--refined-output", f"'{self.refined_output}'", self.refined_output, REFINED_OUTPUTS)
+        check_world(self.wind, self.gusts, self.gravity)
         for name, text in (("--asset-version", self.asset_version), ("--asset-identifier", self.asset_identifier)):
             if text is not None and not (text.isprintable() and 0 < len(text) <= LONGEST_TEXT):
                 fail(name, f"{text[:40]!r}", f"1 to {LONGEST_TEXT} printable characters are allowed")
@@ -167,6 +175,7 @@ class BakeRequest:
     def to_metadata(self) -> dict[str, object]:
         """Return what differs from the defaults, as a shot stores it."""
         changed = {name: value for name, value in vars(self).items() if value != getattr(BakeRequest, name, None)}
+        changed |= {"colliders": " ".join(self.colliders)} if self.colliders else {}
         return {**changed, "keep": str(self.keep)} if self.keep else changed
 
     @classmethod
@@ -179,6 +188,8 @@ class BakeRequest:
         """
         if isinstance(document, Mapping) and isinstance(document.get("keep"), str):
             document = {**document, "keep": vars(ModelSize.of(document["keep"]))}
+        if isinstance(document, Mapping) and isinstance(document.get("colliders"), str):
+            document = {**document, "colliders": tuple(document["colliders"].split())}
         return from_plain(cls, document)
 
 

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
-from ...scene.assets import Floats, Motion, Scene
+from ...scene.assets import Floats, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
@@ -37,6 +37,7 @@ from ..simulate.characters import PosedCharacters
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from, need_finite
 from ..simulate.simulator import StepHistory
+from ..world.surroundings import Surroundings
 from .clearing import SkinClearing
 
 QUASI_STATIC_ITERATIONS = SimulationOptions().quasi_static_solver.iterations
@@ -147,41 +148,60 @@ class Refiner:
         self.potential = self.simulator.potential
         self.clearing = SkinClearing(scene, self.potential)
 
-    def frames(self, motion: Motion, network: Iterable[Floats]) -> Iterator[RefinedFrame]:
+    def frames(
+        self, motion: Motion, network: Iterable[Floats], world: ShotWorld | None = None
+    ) -> Iterator[RefinedFrame]:
         """Yield the refined frames of a shot.
 
         Args:
             motion: the character's, at the shot's frames.
             network: garment vertices of each frame in world space [m], shape (V, 3).
+            world: what surrounds the character, from the motion's first frame on.
 
         Raises:
             SsilkError: the motion is at another rate, or a frame is not finite.
         """
-        yield from self._spans(motion, iter(network), None)
+        yield from self._spans(motion, iter(network), None, world)
 
-    def changes(self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats]) -> Iterator[FrameChange]:
+    def changes(
+        self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats], world: ShotWorld | None = None
+    ) -> Iterator[FrameChange]:
         """Yield the changes of a shot that has been refined; arguments as for `frames`."""
-        for frame in self._spans(motion, iter(network), iter(refined)):
+        for frame in self._spans(motion, iter(network), iter(refined), world):
             yield frame.change
 
     @torch.no_grad()
     def _spans(
-        self, motion: Motion, network: Iterator[Floats], refined_points: Iterator[Floats] | None
+        self,
+        motion: Motion,
+        network: Iterator[Floats],
+        refined_points: Iterator[Floats] | None,
+        world: ShotWorld | None,
     ) -> Iterator[RefinedFrame]:
         fps = self.simulator.options.fps
         if not abs(motion.fps - fps) < 1e-6:
             fail(motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
+        surroundings, first = self.simulator.surroundings([world]), 0
         for span in split_at_cuts(motion, self.simulator.poser.skeleton):
-            yield from self._span(span, network, refined_points)
+            yield from self._span(span, network, refined_points, surroundings, first)
+            first += span.frame_count
 
     def _span(
-        self, span: Motion, network: Iterator[Floats], refined_points: Iterator[Floats] | None
+        self,
+        span: Motion,
+        network: Iterator[Floats],
+        refined_points: Iterator[Floats] | None,
+        surroundings: Surroundings | None,
+        first: int,
     ) -> Iterator[RefinedFrame]:
-        """Yield the frames of a motion without cuts."""
+        """Yield the frames of a motion without cuts, whose first is one of the shot's."""
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._next_frames(network, stop - start)
             poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
+            if surroundings is not None:
+                places = [(0, (first + frame) / span.fps) for frame in range(start, stop)]
+                poses = replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
             given = None if refined_points is None else self._next_frames(refined_points, stop - start)
             frames, tail = self._refined(tail, world, poses, given)
             yield from frames

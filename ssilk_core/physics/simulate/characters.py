@@ -26,6 +26,7 @@ from ...scene.kinematics import (
 )
 from ..collision import CollisionBody, PosedBody, limb_axes
 from ..skinning import blend_matrices, transform_points
+from ..world.surroundings import PosedWorld
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +38,14 @@ class MotionSpan:
         first: its first frame in the shot.
         substeps: steps for each frame of the shot.
         motion: its poses, one for each step.
+        seconds: of each step since the first frame of the shot, shape (steps,).
     """
 
     shot: int
     first: int
     substeps: int
     motion: Motion
+    seconds: Floats
 
     @property
     def frame_count(self) -> int:
@@ -61,8 +64,10 @@ def split_into_spans(
         for start in range(first, stop, most):
             count = (min(most, stop - start) - 1) * substeps + 1
             position = (start + np.arange(count) / substeps) * motion.fps / fps - source
-            poses = sample_motion(part, position.clip(0, part.frame_count - 1))
-            spans.append(MotionSpan(shot, start, substeps, Motion(motion.path, fps * substeps, *poses)))
+            position = position.clip(0, part.frame_count - 1)
+            poses = sample_motion(part, position)
+            seconds = (source + position) / motion.fps
+            spans.append(MotionSpan(shot, start, substeps, Motion(motion.path, fps * substeps, *poses), seconds))
         first, source = stop, source + part.frame_count
     return spans
 
@@ -85,18 +90,19 @@ class PosedCharacters:
         body: relative to the root.
         lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
         matrices: skinning matrices of the character's joints, relative to the root, shape (J, 3, 4, N).
+        world: what surrounds them, or None where nothing does.
     """
 
     root: Tensor
     body: PosedBody
     lbs: Tensor
     matrices: Tensor
+    world: PosedWorld | None = None
 
     def select(self, frames: Tensor) -> PosedCharacters:
         """Return the poses of the frames with indices (M,)."""
-        return PosedCharacters(
-            self.root[:, frames], self.body.select(frames), self.lbs[..., frames], self.matrices[..., frames]
-        )
+        body, world = self.body.select(frames), self.world and self.world.select(frames)
+        return PosedCharacters(self.root[:, frames], body, self.lbs[..., frames], self.matrices[..., frames], world)
 
 
 class CharacterPoser:

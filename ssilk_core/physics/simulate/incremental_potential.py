@@ -31,6 +31,7 @@ from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
 from ..self_contact import ClothContacts, ClothNeighbours, SelfContact
 from ..self_contact.contacts import Slopes
+from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
 from .contact_stiffness import ContactStiffness
 from .friction import CREEP, Friction
@@ -57,6 +58,7 @@ class StepInputs:
         contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
         friction: of what pressed in the step before; None without.
         pierced: the cloth that limbs are through, wherever it goes; None where that is found at each position.
+        world: what cloth meets besides the body; None without.
     """
 
     body: PosedBody | None
@@ -69,6 +71,7 @@ class StepInputs:
     contacts: ClothContacts | None = None
     friction: Friction | None = None
     pierced: PiercedCloth | None = None
+    world: PosedWorld | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
         """Return the inputs of the frames with indices (M,)."""
@@ -81,9 +84,9 @@ class StepInputs:
             self.contacts and self.contacts.select(frames),
             self.friction and self.friction.select(frames),
         )
-        gravity, pierced = self.gravity[..., frames], self.pierced and self.pierced.select(frames)
-        known = neighbours, contacts, friction, pierced
-        return StepInputs(body, gravity, predicted, advected, self.dt, skinned, *known)
+        pierced, world = (known and known.select(frames) for known in (self.pierced, self.world))
+        met = neighbours, contacts, friction, pierced, world
+        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned, *met)
 
 
 class IncrementalPotential:
@@ -237,6 +240,8 @@ class IncrementalPotential:
         for part in (inputs.contacts, inputs.friction):
             if part is not None:
                 total = total + part.energy(x)
+        if inputs.world is not None:
+            total = total + self._world_energy(x, inputs.world)
         if loops.supports(x) and not x.requires_grad:
             return total + self._points(x, inputs, body_distance, False)[0]
         total = total - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
@@ -273,6 +278,8 @@ class IncrementalPotential:
         for part in (inputs.contacts, inputs.friction):
             if part is not None:
                 total += part.gradient(x)
+        if inputs.world is not None:
+            total += self._world_gradient(x, inputs.world)
         if loops.supports(x):
             _, slopes, pushes = self._points(x, inputs, body_distance, True)
             total += slopes
@@ -308,10 +315,40 @@ class IncrementalPotential:
                 self.cloth.area * part for part in (self.law.pressure(distance), self.law.curvature(distance))
             )
             contact = stiffness[:, None, None] * outer(normal, normal) + push[:, None, None] * body_distance.curvature
+        if inputs.world is not None:
+            contact = self._with_world(contact, x, inputs.world)
         fixed = None if fixed is None else fixed[self.free]
         found = self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
         parts = [part.slopes(x) for part in (inputs.contacts, inputs.friction) if part is not None]
         return replace(found, contacts=self._stiffness(x, Slopes.joined(*parts))) if parts else found
+
+    def _world_energy(self, x: Tensor, world: PosedWorld) -> Tensor:
+        """Return the energy of contact with what surrounds the character [J], shape (N,)."""
+        near = world.touched(self.cloth.positions(x), self.law.start)
+        each = self.cloth.area[near.row, 0] * self.law.energy(near.distance)
+        return x.new_zeros(x.shape[-1]).index_put_((near.frame,), each, accumulate=True)
+
+    def _world_gradient(self, x: Tensor, world: PosedWorld) -> Tensor:
+        """Return its gradient [N], shape (V, 3, N)."""
+        samples = self.cloth.positions(x)
+        near = world.touched(samples, self.law.start)
+        push = -self.cloth.area[near.row, 0] * self.law.pressure(near.distance) * near.normal
+        pushes = samples.new_zeros(len(samples), x.shape[-1], 3)
+        pushes.index_put_((near.row, near.frame), push.T, accumulate=True)
+        return self.cloth.to_vertices(pushes.transpose(1, 2).contiguous())
+
+    def _with_world(self, contact: Tensor | None, x: Tensor, world: PosedWorld) -> Tensor:
+        """Return blocks of contact (S, 3, 3, N) with those of what surrounds the character.
+
+        How its normal turns is left out: outside of edges and corners that would make a block indefinite.
+        """
+        samples = self.cloth.positions(x)
+        near = world.touched(samples, self.law.start)
+        stiffness = self.cloth.area[near.row, 0] * self.law.curvature(near.distance)
+        blocks = samples.new_zeros(len(samples), x.shape[-1], 3, 3)
+        each = (stiffness * near.normal[:, None] * near.normal).permute(2, 0, 1)
+        blocks = blocks.index_put_((near.row, near.frame), each, accumulate=True).permute(0, 2, 3, 1)
+        return blocks if contact is None else contact + blocks
 
     def _stiffness(self, x: Tensor, slopes: Slopes) -> ContactStiffness:
         """Return the Hessian that slopes add up to."""

@@ -26,12 +26,13 @@ from torch import Tensor
 
 from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, Motion, Scene, Skeleton
+from ...scene.assets import Floats, Motion, Scene, ShotWorld, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
 from ..collision.pierced import PiercedCloth
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
+from ..world.surroundings import PosedWorld, Surroundings
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
 from .friction import Friction
@@ -184,9 +185,15 @@ class Simulator:
         part.poser = self.poser.only(cubature.vertices)
         return part
 
-    def frames(self, motions: Sequence[Motion]) -> Iterator[SimulatedFrame]:
-        """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel."""
-        options = self.options
+    def frames(
+        self, motions: Sequence[Motion], worlds: Sequence[ShotWorld | None] | None = None
+    ) -> Iterator[SimulatedFrame]:
+        """Yield all frames of all shots, in order within a shot; a batch of shots advances in parallel.
+
+        Args:
+            worlds: what surrounds the character in each shot; nothing by default.
+        """
+        options, surroundings = self.options, self.surroundings(worlds)
         cut = (options.fps, options.substeps, options.sequence)
         skeleton = self.poser.skeleton
         spans = [
@@ -194,16 +201,34 @@ class Simulator:
         ]
         spans.sort(key=lambda span: -span.motion.frame_count)
         for start in range(0, len(spans), options.batch):
-            yield from self._simulate_spans(spans[start : start + options.batch])
+            yield from self._simulate_spans(spans[start : start + options.batch], surroundings)
 
-    def _simulate_spans(self, spans: Sequence[MotionSpan]) -> Iterator[SimulatedFrame]:
+    def surroundings(self, worlds: Sequence[ShotWorld | None] | None) -> Surroundings | None:
+        """Return the worlds of shots, prepared; None where nothing surrounds any character."""
+        if worlds is None or all(world is None or world.is_usual for world in worlds):
+            return None
+        for world in worlds:
+            if world and world.air and not self.potential.fabric.drag:
+                name = self.potential.fabric.name
+                found, allowed = f"wind, and the fabric '{name}' has no drag", "air moves cloth by its drag"
+                fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
+        if self.potential.fabric.friction and any(world and world.colliders for world in worlds):
+            self.report(Message("friction is that of body and cloth; on floors and props cloth slides", "warning"))
+        return Surroundings(worlds, np.array(self.options.gravity))
+
+    def _simulate_spans(
+        self, spans: Sequence[MotionSpan], surroundings: Surroundings | None
+    ) -> Iterator[SimulatedFrame]:
         """Yield the frames of spans, which are sorted by decreasing length."""
         past: StepHistory | None = None
         for step in range(spans[0].motion.frame_count):
             running = [span for span in spans if span.motion.frame_count > step]
-            poses = self.poser.poses_at(running, step)
             past = past and past.first(len(running))
-            past, solution = self._after(past, poses) if past else self._first(running)
+            if past:
+                poses = _surrounded(self.poser.poses_at(running, step), surroundings, running, step)
+                past, solution = self._after(past, poses)
+            else:
+                past, solution = self._first(running, surroundings)
             if step % self.options.substeps == 0:
                 yield from _frames(running, step // self.options.substeps, past.last, solution)
 
@@ -221,7 +246,7 @@ class Simulator:
     def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
         """Return the states after those of the past, and their solution."""
         solution, before = self.step(poses, past), past.last
-        if self.splits and past.matrices is not None:
+        if self.splits and past.matrices is not None and poses.world is None:  # no world is posed in between
             stuck = ~(solution.residual <= self.options.solver.tolerance)
             if past.pierced and (now := self._pierced(solution.x, poses)):
                 stuck |= ((now.radius > 0) & (past.pierced.radius == 0)).any(0)
@@ -263,18 +288,27 @@ class Simulator:
         known = solution.neighbours, friction, poses.matrices
         return StepHistory(world, before, poses.root, poses.lbs, *known)
 
-    def _first(self, spans: Sequence[MotionSpan]) -> tuple[StepHistory, Solution]:
+    def _first(self, spans: Sequence[MotionSpan], surroundings: Surroundings | None) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
         most = self.options.quasi_static_solver.iterations + (POSES - 1) * ON_THE_WAY
         self.report(Message(f"cloth comes to rest in the first pose, in {most} iterations at most"))
         rotations, translations = (
             np.stack([getattr(span.motion, name)[0] for span in spans]) for name in ("rotations", "translations")
         )
-        poses, solution = self.at_rest(rotations, translations, Countdown(most, self.report))
+        poses, solution = self.at_rest(
+            rotations,
+            translations,
+            Countdown(most, self.report),
+            lambda poses: _surrounded(poses, surroundings, spans, 0),
+        )
         return self._history(solution, poses, None), solution
 
     def at_rest(
-        self, rotations: Floats, translations: Floats, advanced: Callable[[], object] = lambda: None
+        self,
+        rotations: Floats,
+        translations: Floats,
+        advanced: Callable[[], object] = lambda: None,
+        surrounded: Callable[[PosedCharacters], PosedCharacters] = lambda poses: poses,
     ) -> tuple[PosedCharacters, Solution]:
         """Return poses with their quasi-static states, to which the garment is carried from the bind pose.
 
@@ -283,6 +317,7 @@ class Simulator:
         Args:
             rotations, translations: of the joints, local, shapes (N, J, 4) and (N, J, 3).
             advanced: called after each iteration.
+            surrounded: puts what surrounds the characters around the last poses; on the way there nothing does.
         """
         turned, placed = bind_pose(self.poser.skeleton)
         poses = self.poser.pose(np.broadcast_to(turned, rotations.shape), np.broadcast_to(placed, translations.shape))
@@ -291,6 +326,7 @@ class Simulator:
         for share in np.arange(1, POSES + 1) / POSES:
             lbs = poses.lbs
             poses = self.poser.pose(slerp(turned, rotations, share), (1 - share) * placed + share * translations)
+            poses = surrounded(poses) if share == 1 else poses
             x, inputs = self._carried(x, x + poses.lbs - lbs, self.inputs(poses, None), known)
             solver = last if share == 1 else replace(last, iterations=min(ON_THE_WAY, last.iterations))
             solution = minimise_from(self.potential, self.apply_pins(x, poses), inputs, solver, advanced)
@@ -309,16 +345,42 @@ class Simulator:
 
     def inputs(self, poses: PosedCharacters, past: StepHistory | None) -> StepInputs:
         """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
-        gravity = self.gravity.expand(3, poses.root.shape[-1])
+        world = poses.world
+        gravity = self.gravity.expand(3, poses.root.shape[-1]) if world is None else world.gravity
+        met = world if world and world.has_colliders else None
         if past is None:
-            return StepInputs(poses.body, gravity, skinned=poses.lbs)
+            if world is not None:
+                gravity = gravity + self._pushed_by_wind(world, poses.lbs)
+            return StepInputs(poses.body, gravity, skinned=poses.lbs, world=met)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         friction = past.friction and past.friction.after(poses.body.points)
         limbs = poses.body.limbs
         pierced = past.pierced.on(limbs) if past.pierced and limbs else None
-        own = predicted.to(past.lbs.dtype), past.local, self.dt, poses.lbs
-        return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced)
+        advected = past.local if world is None else self._advected(world, past, poses)
+        own = predicted.to(past.lbs.dtype), advected, self.dt, poses.lbs
+        return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced, world=met)
+
+    def _advected(self, world: PosedWorld, past: StepHistory, poses: PosedCharacters) -> Tensor:
+        """Return the last positions moved with the air, relative to the roots, shape (V, 3, N)."""
+        carried = past.local.clone()
+        for frame, (air, seconds) in enumerate(zip(world.air, world.seconds, strict=True)):
+            if air is not None:
+                moved = past.last[..., frame]
+                blown = torch.as_tensor(air.velocity(moved.cpu().numpy(), seconds).copy()).to(moved)
+                carried[..., frame] = (moved + self.dt * blown - poses.root[:, frame]).to(carried.dtype)
+        return carried
+
+    def _pushed_by_wind(self, world: PosedWorld, lbs: Tensor) -> Tensor:
+        """Return the mean acceleration by which wind pushes resting cloth [m/s2], shape (3, N)."""
+        pushed = torch.zeros_like(world.gravity)
+        points = lbs.double().cpu().numpy()
+        for frame, (air, seconds) in enumerate(zip(world.air, world.seconds, strict=True)):
+            if air is not None:
+                blown = air.velocity(points[..., frame] + world.roots[frame], seconds).mean(axis=0)
+                pushed[:, frame] = torch.as_tensor(blown).to(pushed)
+        fabric = self.potential.fabric
+        return fabric.drag / fabric.density * pushed
 
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
@@ -352,6 +414,16 @@ class Simulator:
         return best
 
 
+def _surrounded(
+    poses: PosedCharacters, surroundings: Surroundings | None, spans: Sequence[MotionSpan], step: int
+) -> PosedCharacters:
+    """Return the poses of spans at a step with what surrounds them."""
+    if surroundings is None:
+        return poses
+    places = [(span.shot, float(span.seconds[step])) for span in spans]
+    return replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
+
+
 def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
     points = world.permute(2, 0, 1).cpu().numpy()
     figures = [
@@ -367,6 +439,7 @@ def simulate(
     motions: Sequence[Motion],
     options: SimulationOptions | None = None,
     *,
+    worlds: Sequence[ShotWorld | None] | None = None,
     device: torch.device | str = "cpu",
     report: Reporter = silent,
 ) -> list[Floats]:
@@ -381,7 +454,7 @@ def simulate(
     counts = [shot.frame_count for shot in shots_of(motions, scene.character.skeleton, simulator.options)]
     points = [np.zeros((count, scene.garment.mesh.vertex_count, 3)) for count in counts]
     told = Countdown(sum(counts), report)
-    for frame in simulator.frames(motions):
+    for frame in simulator.frames(motions, worlds):
         points[frame.shot][frame.number] = frame.points
         told()
     return points

@@ -17,9 +17,34 @@ from .scene import Scene
 from .skeleton import Skeleton, carrying_joint, check_rigid, moved_by_joints
 from .skin import SkinWeights
 from .surface import PLATE_THICKNESS, SurfaceMaterial
+from .world import Air, Collider, ShotWorld
 
 __all__ = [
-    "CLASS_NAMES", "LOOSE", "PINNED", "PLATE_THICKNESS", "TIGHT", "UP", "Body", "Character", "Deformer", "Floats",
-    "Garment", "GarmentPose", "Ints", "Mesh", "Motion", "ProxyRig", "Scene", "Skeleton", "SkinWeights",
-    "SurfaceMaterial", "carrying_joint", "check_rigid", "classes_at", "moved_by_joints",
+    "CLASS_NAMES",
+    "LOOSE",
+    "PINNED",
+    "PLATE_THICKNESS",
+    "TIGHT",
+    "UP",
+    "Air",
+    "Body",
+    "Character",
+    "Collider",
+    "Deformer",
+    "Floats",
+    "Garment",
+    "GarmentPose",
+    "Ints",
+    "Mesh",
+    "Motion",
+    "ProxyRig",
+    "Scene",
+    "ShotWorld",
+    "Skeleton",
+    "SkinWeights",
+    "SurfaceMaterial",
+    "carrying_joint",
+    "check_rigid",
+    "classes_at",
+    "moved_by_joints",
 ]  # fmt: skip

@@ -6,14 +6,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, column_matrix, open_stage, stage_name
+from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, open_stage, stage_name
 from ..opening.times import change_times
 from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
+from ..reading.posed import PlainMesh, SkinnedMesh, skinning_of
 from ..units import StageUnits
 
 
@@ -56,16 +57,14 @@ class Shot:
         self.name = stage_name(self.stage)
         self.units = StageUnits.of(self.stage)
         self.fps = float(self.stage.GetTimeCodesPerSecond())
-        skinned = _skinning_of(self.stage)
+        skinned = skinning_of(self.stage)
         everything = Usd.PrimRange(self.stage.GetPseudoRoot(), PRIMS)
         prims = [prim for prim in everything if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
         sides = [rendered([prim for prim in prims if is_garment(prim) == side]) for side in (False, True)]
         prims = [prim for prim in prims if any(prim in side for side in sides)]
         if not prims:
             fail(self.name, "no visible mesh", "a shot has at least one", "check that this is the right file")
-        self._players = [
-            _SkinnedMesh(prim, *skinned[prim]) if prim in skinned else _PlainMesh(prim) for prim in prims
-        ]
+        self._players = [SkinnedMesh(prim, *skinned[prim]) if prim in skinned else PlainMesh(prim) for prim in prims]
         self.meshes = tuple(_describe(prim) for prim in prims)
         self.frame_times = frame_times(self.stage)
 
@@ -92,7 +91,7 @@ class Shot:
     def is_skinned(self) -> bool:
         """Return whether joints move the garment; otherwise its points are stored."""
         garment = self._garment()
-        return isinstance(garment, _SkinnedMesh) and bool(garment.skinning.HasJointInfluences())
+        return isinstance(garment, SkinnedMesh) and bool(garment.skinning.HasJointInfluences())
 
     def garment_points(self, time: float) -> Floats:
         """Return the points of the one garment [m], shape (V, 3).
@@ -103,71 +102,11 @@ class Shot:
         code = Usd.TimeCode(float(time))
         return apply(self.units.matrix, self._garment().points(code, UsdGeom.XformCache(code)))
 
-    def _garment(self) -> _SkinnedMesh | _PlainMesh:
+    def _garment(self) -> SkinnedMesh | PlainMesh:
         garments = [player for player, mesh in zip(self._players, self.meshes) if mesh.is_garment]
         if len(garments) != 1:
             fail(self.name, f"{len(garments)} meshes are marked as garments", "one is needed")
         return garments[0]
-
-
-def _skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
-    """Return the Skeleton, its query and the skinning query of each skinned prim."""
-    cache, found = UsdSkel.Cache(), {}
-    for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
-        root = UsdSkel.Root(prim)
-        if not root:
-            continue
-        cache.Populate(root, PRIMS)
-        for binding in cache.ComputeSkelBindings(root, PRIMS):
-            skeleton = binding.GetSkeleton()
-            for query in binding.GetSkinningTargets():
-                found[query.GetPrim()] = (skeleton.GetPrim(), cache.GetSkelQuery(skeleton), query)
-    return found
-
-
-class _SkinnedMesh:
-    """A mesh that UsdSkel deforms: blendshapes in rest space, then linear blend skinning."""
-
-    def __init__(
-        self, prim: Usd.Prim, rig: Usd.Prim, skeleton: UsdSkel.SkeletonQuery, skinning: UsdSkel.SkinningQuery
-    ) -> None:
-        # The query's own prim may be that of a prototype, which stands at no place in the world.
-        self.prim, self.rig, self.skeleton, self.skinning = prim, rig, skeleton, skinning
-        self.rest = UsdGeom.Mesh(prim).GetPointsAttr()
-        self.shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if self._has_shapes() else None
-        if self.shapes:
-            self.rows = self.shapes.ComputeBlendShapePointIndices()
-            self.offsets = self.shapes.ComputeSubShapePointOffsets()
-
-    def _has_shapes(self) -> bool:
-        return bool(self.skinning.HasBlendShapes() and self.skeleton.GetAnimQuery())
-
-    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
-        """Return the posed points in stage units, shape (V, 3)."""
-        points = self.rest.Get(time)
-        if self.shapes:
-            weights = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
-            own = self.skinning.GetBlendShapeMapper().Remap(weights)
-            self.shapes.ComputeDeformedPoints(
-                *self.shapes.ComputeSubShapeWeights(own), self.rows, self.offsets, points
-            )
-        space = self.prim
-        if self.skinning.HasJointInfluences():
-            self.skinning.ComputeSkinnedPoints(self.skeleton.ComputeSkinningTransforms(time), points, time)
-            space = self.rig
-        return apply(column_matrix(xforms.GetLocalToWorldTransform(space)), np.array(points, dtype=np.float64))
-
-
-class _PlainMesh:
-    """A mesh with stored points, static or time-sampled."""
-
-    def __init__(self, prim: Usd.Prim) -> None:
-        self.prim, self.samples = prim, UsdGeom.Mesh(prim).GetPointsAttr()
-
-    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
-        """Return the points in stage units, shape (V, 3)."""
-        points = np.array(self.samples.Get(time), dtype=np.float64)
-        return apply(column_matrix(xforms.GetLocalToWorldTransform(self.prim)), points)
 
 
 def _describe(prim: Usd.Prim) -> ShotMesh:

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What surrounds a character in its shot: as its stages say, or as it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, isfinite
+from typing import TYPE_CHECKING
+
+from ...errors import fail
+from ...events import Reporter, silent
+from ...files import split_location
+from ...scene.assets import Motion, Scene, ShotWorld
+
+if TYPE_CHECKING:
+    from ssilk_usd.reading.world import AskedWorld
+
+GUSTS = "RMS[,SIZE[,SEED]]"
+UNSEEN = "the network does not see {}: it plays as in empty, still air; --refine N or --quality hero solve for it"
+
+
+def asked_world(
+    colliders: Sequence[str], wind: str | None, gusts: str | None, gravity: str | None
+) -> AskedWorld | None:
+    """Return what options ask for; None where they ask for nothing.
+
+    Raises:
+        SsilkError: as `check_world`.
+    """
+    from ssilk_usd.reading.world import AskedWorld
+
+    if not colliders and wind is gusts is gravity is None:
+        return None
+    air = None if gusts is None else _gusts(gusts)
+    blown, pull = (None if text is None else _vector(name, text) for name, text in _named(wind, gravity))
+    return AskedWorld(tuple(colliders), blown, air, pull)
+
+
+def check_world(wind: str | None, gusts: str | None, gravity: str | None) -> None:
+    """Raise `SsilkError` where an option is no vector, or gusts are not as `GUSTS`."""
+    for name, text in _named(wind, gravity):
+        if text is not None:
+            _vector(name, text)
+    if gusts is not None:
+        _gusts(gusts)
+
+
+def world_of(
+    source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter = silent
+) -> ShotWorld | None:
+    """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
+    from ssilk_usd.reading.world import read_world
+
+    garment = split_location(scene.garment.mesh.path)[1]
+    return read_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
+
+
+def unseen(world: ShotWorld | None) -> str:
+    """Return the sentence that says what of a world the network does not see; empty where there is nothing."""
+    if world is None:
+        return ""
+    parts = ("colliders", world.colliders), ("wind", world.air), ("its gravity", world.gravity is not None)
+    return UNSEEN.format(" and ".join(name for name, there in parts if there))
+
+
+def _named(wind: str | None, gravity: str | None) -> tuple[tuple[str, str | None], ...]:
+    return ("--wind", wind), ("--gravity", gravity)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+
+
+def _vector(option: str, text: str) -> tuple[float, float, float]:
+    numbers = _numbers(text)
+    if len(numbers) != 3 or not all(map(isfinite, numbers)):
+        fail(option, f"'{text}'", "X,Y,Z is needed, such as 0,0,5; write --wind=-5,0,0 where X is negative")
+    x, y, z = numbers
+    return x, y, z
+
+
+def _gusts(text: str) -> tuple[float, float, int]:
+    numbers = _numbers(text)
+    speed, size, seed = (numbers + [0.0, 2.0, 0.0][len(numbers) :])[:3]
+    if not 1 <= len(numbers) <= 3 or not (speed >= 0 and 0 < size < inf and seed in range(2**32)):
+        allowed = f"{GUSTS} is needed: m/s, metres and a whole number, such as 3 or 3,1.5,7"
+        fail("--gusts", f"'{text}'", allowed)
+    return speed, size, int(seed)

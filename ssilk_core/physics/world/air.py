@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Wind and its turbulence: a velocity at each place and time, the same for the same seed.
+
+Turbulence is a sum of `MODES` random Fourier modes (Kraichnan, Phys. Fluids 13, 1970), each across its wave vector,
+so that none of the air is compressed. Wave numbers run over eddies from the largest size down to a sixteenth of it,
+with the energy of Kolmogorov's spectrum, k^(-5/3). The wind carries the eddies along (Taylor's hypothesis), and they
+turn over in the time that gusts take through them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...scene.assets import Air, Floats
+
+MODES = 48
+SMALLEST = 1 / 16  # of the largest eddy
+
+
+class MovingAir:
+    """The air of a shot; times are seconds since its first frame.
+
+    Args:
+        fps: frames per second of what changes [1/s].
+    """
+
+    def __init__(self, air: Air, fps: float) -> None:
+        self._air, self._fps = air, fps
+        steps = 0.5 * (air.velocity[1:] + air.velocity[:-1]) / fps
+        self._travelled = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        rng = np.random.default_rng(air.seed)
+        number = 2 * np.pi / air.length * SMALLEST ** -np.linspace(0, 1, MODES)  # equal steps of the logarithm
+        along = rng.normal(size=(MODES, 3))
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        across = np.cross(along, rng.normal(size=(MODES, 3)))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        share = number ** (-2 / 3)  # k E(k), the energy in equal steps of log k
+        self._waves, self._phase = along * number[:, None], rng.uniform(0, 2 * np.pi, MODES)
+        self._across = across * np.sqrt(2 * share / share.sum())[:, None]
+        self._turning = number * air.gusts.max()
+
+    def velocity(self, points: Floats, seconds: float) -> Floats:
+        """Return the velocity of the air [m/s] at points (V, 3) in the world [m], shape (V, 3)."""
+        wind, gusts = self._at(self._air.velocity, seconds), self._at(self._air.gusts, seconds)
+        found = np.broadcast_to(wind, points.shape)
+        if not gusts > 0:
+            return found
+        phase = (points - self._carried(seconds)) @ self._waves.T + self._turning * seconds + self._phase
+        return found + gusts * (np.cos(phase) @ self._across)
+
+    def _at(self, values: Floats, seconds: float) -> Floats:
+        at = min(max(seconds * self._fps, 0.0), len(values) - 1.0)
+        low = min(int(at), len(values) - 1)
+        high = min(low + 1, len(values) - 1)
+        return values[low] + (at - low) * (values[high] - values[low])
+
+    def _carried(self, seconds: float) -> Floats:
+        """Return how far the wind has carried the air since the first frame [m], shape (3,)."""
+        last = len(self._air.velocity) - 1
+        at = min(max(seconds * self._fps, 0.0), float(last))
+        low = int(at)
+        part = (at - low) / self._fps
+        inside = self._travelled[low] + 0.5 * part * (self._air.velocity[low] + self._at(self._air.velocity, seconds))
+        return inside + (seconds - at / self._fps) * self._at(self._air.velocity, seconds)

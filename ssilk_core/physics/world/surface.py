@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The signed distance to a mesh that cloth meets besides the body.
+
+The nearest point is found with libigl's tree of boxes. The side is that of the angle-weighted pseudonormal there
+(Baerentzen and Aanaes, IEEE TVCG 11, 2005), which is exact for closed meshes. Corners that lie on one another are
+one: exporters split them along seams of normals and textures, and a box of six quads is still closed.
+
+A part of a mesh that has a border, such as a floor, has two sides. The outside is that on which most of the garment
+is, as the body carries it. A query whose nearest point is on the border is outside: beyond its border a floor has no
+below. A closed part is solid, but for one that the whole garment is inside of, such as a room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import fail
+from ...scene.assets import Floats, Ints
+from ...scene.mesh import topology
+
+ON_EDGE = 1e-7  # barycentric coordinate up to which a point is on the edge opposite
+TOUCHING = 1e-9  # [m] from the surface, up to which its normal is the direction away from it
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceDistance:
+    """Distances of M queries to a surface.
+
+    Attributes:
+        distance: negative inside [m], shape (M,).
+        normal: its gradient, unit vectors, shape (M, 3).
+        part: of the surface, shape (M,).
+        on_border: whether the nearest point is on the border of its part, shape (M,).
+        behind: whether it is, and the query lies on the inner side of the surface there, shape (M,).
+        corners, weights: of the nearest point, vertices of the mesh and barycentric coordinates, shape (M, 3).
+    """
+
+    distance: Floats
+    normal: Floats
+    part: Ints
+    on_border: NDArray[np.bool_]
+    behind: NDArray[np.bool_]
+    corners: Ints
+    weights: Floats
+
+    def only(self, kept: NDArray[np.bool_], turn: Floats) -> SurfaceDistance:
+        """Return those that are kept (M,), with their gradients turned (3, 3)."""
+        normal, part, on_border = self.normal[kept] @ turn.T, self.part[kept], self.on_border[kept]
+        where = self.corners[kept], self.weights[kept]
+        return SurfaceDistance(self.distance[kept], normal, part, on_border, self.behind[kept], *where)
+
+
+class CollisionSurface:
+    """The triangles of a mesh, all wound the same way; a closed part is wound counter-clockwise from outside.
+
+    Attributes:
+        faces: the mesh's vertices at the corners, shape (T, 3).
+        part: of each triangle, shape (T,).
+        closed: whether each part has no border, shape (C,).
+
+    Args:
+        path: of the mesh, for messages.
+        points: of the mesh in its first frame, shape (P, 3).
+
+    Raises:
+        SsilkError: no triangle has an area.
+    """
+
+    def __init__(self, path: str, points: Floats, faces: Ints) -> None:
+        import igl
+
+        place = topology.merged_places(points)
+        welded = place[faces]
+        kept = (welded != np.roll(welded, 1, axis=1)).all(axis=1)
+        if not (kept.any() and topology.face_areas(points, faces)[kept].max() > 0):
+            fail(path, "no triangle of it has an area", "cloth meets surfaces", "leave it out of the colliders")
+        turned, part = igl.bfs_orient(np.ascontiguousarray(welded[kept]))
+        self.part = np.unique(np.asarray(part).reshape(-1), return_inverse=True)[1]
+        swapped = _is_odd(welded[kept], turned)
+        own = np.where(swapped[:, None], faces[kept][:, ::-1], faces[kept])
+        sides = np.sort(np.stack([place[own], np.roll(place[own], -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
+        _, edge, used = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+        self._edge = edge.reshape(-1, 3)  # of corners (0, 1), (1, 2) and (2, 0)
+        border = used == 1
+        self.closed = np.ones(self.part.max() + 1, dtype=bool)
+        self.closed[self.part[border[self._edge].any(axis=1)]] = False
+        inward = np.bincount(self.part, _volumes(points[own])) < 0
+        inward &= self.closed
+        # The winding of an open part is the mesh's own, where it is consistent: of most of its area.
+        area = topology.face_areas(points, own)
+        inward |= ~self.closed & (np.bincount(self.part, np.where(swapped, area, -area)) > 0)
+        flipped = inward[self.part]
+        own[flipped] = own[flipped][:, ::-1]
+        self._edge[flipped] = self._edge[flipped][:, [1, 0, 2]]
+        self.faces, self._welded = own, place[own]
+        self._border_edge = border
+        self._border_vertex = np.zeros(len(points), dtype=bool)
+        self._border_vertex[sides[border[edge.reshape(-1)]]] = True
+        self._edge_count = len(used)
+
+    def at(self, points: Floats) -> PosedSurface:
+        """Return the surface with its mesh's points (P, 3) [m]."""
+        return PosedSurface(self, points)
+
+
+class PosedSurface:
+    """A surface at given points; built in time in proportion to its triangles, and queried often."""
+
+    def __init__(self, surface: CollisionSurface, points: Floats) -> None:
+        import igl
+
+        self.surface, self.points = surface, np.ascontiguousarray(points)
+        self._tree = igl.AABB()
+        self._tree.init(self.points, np.ascontiguousarray(surface.faces))
+        self.low, self.high = points[surface.faces].min(axis=(0, 1)), points[surface.faces].max(axis=(0, 1))
+
+    @cached_property
+    def _normals(self) -> tuple[Floats, Floats, Floats]:
+        """Pseudonormals of faces (T, 3), edges (E, 3) and vertices (P, 3)."""
+        surface, corners = self.surface, self.points[self.surface.faces]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), np.finfo(float).tiny)
+        edge = np.zeros((surface._edge_count, 3))
+        np.add.at(edge, surface._edge, face[:, None])
+        vertex = np.zeros_like(self.points)
+        ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+        sine = np.linalg.norm(np.cross(ahead, behind), axis=2)
+        angle = np.arctan2(sine, (ahead * behind).sum(axis=2))
+        np.add.at(vertex, surface._welded, angle[..., None] * face[:, None])
+        return face, edge, vertex
+
+    def distance(self, queries: Floats, sides: Floats | None = None) -> SurfaceDistance:
+        """Return the distances of queries (M, 3), where each part's outside is turned by `sides` (C,), 1 or -1."""
+        surface = self.surface
+        squares, face, nearest = self._tree.squared_distance(
+            self.points, np.ascontiguousarray(surface.faces), np.ascontiguousarray(queries)
+        )
+        face, nearest = np.asarray(face).reshape(-1), np.asarray(nearest).reshape(-1, 3)
+        weights = _barycentric(self.points[surface.faces[face]], nearest)
+        away = queries - nearest
+        length = np.sqrt(np.maximum(np.asarray(squares).reshape(-1), 0.0))
+        normal, on_border = self._at(face, weights)
+        turned = np.ones(len(face)) if sides is None else sides[surface.part[face]]
+        side = np.where((away * normal).sum(axis=1) * turned < 0, -1.0, 1.0)
+        behind = on_border & (side < 0)
+        side[on_border] = 1.0
+        normal = normal * (turned / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny))[:, None]
+        direct = away * (side / np.maximum(length, TOUCHING))[:, None]
+        direction = np.where((length > TOUCHING)[:, None], direct, normal)
+        where = surface.part[face], on_border, behind, surface.faces[face], weights
+        return SurfaceDistance(side * length, direction, *where)
+
+    def outside(self, carried: Floats) -> Floats:
+        """Return on which side each part's outside is, 1 or -1 (C,), for a garment (V, 3) as the body carries it."""
+        surface = self.surface
+        found = self.distance(carried)
+        count = len(surface.closed)
+        votes = np.bincount(found.part, np.where(found.on_border, 0.0, np.sign(found.distance)), count)
+        near = np.bincount(found.part, minlength=count)
+        around = surface.closed & (near == len(carried)) & (votes == -len(carried))
+        return np.where(around | (~surface.closed & (votes < 0)), -1.0, 1.0)
+
+    def _at(self, face: Ints, weights: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the pseudonormals at points of faces (M, 3), and whether they are on a border (M,)."""
+        faces, edges, vertices = self._normals
+        surface = self.surface
+        none = weights <= ON_EDGE
+        count = none.sum(axis=1)
+        edge = surface._edge[face, (none.argmax(axis=1) + 1) % 3]
+        vertex = surface._welded[face, weights.argmax(axis=1)]
+        normal = np.where((count == 1)[:, None], edges[edge], faces[face])
+        normal = np.where((count == 2)[:, None], vertices[vertex], normal)
+        border = np.where(count == 1, surface._border_edge[edge], (count == 2) & surface._border_vertex[vertex])
+        return normal, border
+
+
+def _barycentric(corners: Floats, points: Floats) -> Floats:
+    """Return the barycentric coordinates (M, 3), none negative, of points (M, 3) on triangles (M, 3, 3)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    normal = np.cross(b - a, c - a)
+    whole = np.maximum((normal * normal).sum(axis=1), np.finfo(float).tiny)
+    u = (np.cross(c - b, points - b) * normal).sum(axis=1) / whole
+    v = (np.cross(a - c, points - c) * normal).sum(axis=1) / whole
+    found = np.clip(np.stack([u, v, 1 - u - v], axis=1), 0.0, 1.0)
+    return found / found.sum(axis=1, keepdims=True)
+
+
+def _volumes(corners: Floats) -> Floats:
+    """Return six times the signed volumes (T,) that triangles (T, 3, 3) span with their first corner of all."""
+    a, b, c = (corners - corners[0, 0]).transpose(1, 0, 2)
+    return (a * np.cross(b, c)).sum(axis=1)
+
+
+def _is_odd(first: Ints, second: Ints) -> NDArray[np.bool_]:
+    """Return whether triangles (T, 3) of the same vertices are wound the other way."""
+    after = np.roll(second, -1, axis=1)[second == first[:, :1]]
+    return after != first[:, 1]

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Floors, wind and gravity in `ssilk simulate` and `ssilk bake`: who solves for them, and who says that not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.shots.play import Shot
+
+from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRequest, bake
+
+FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
+
+
+def with_floor(path, height: float = FLOOR) -> None:
+    """Add a floor of one large quad, which USD's physics says collides, to a clip."""
+    stage = Usd.Stage.Open(str(path))
+    UsdGeom.Xform.Define(stage, "/Set")
+    mesh = UsdGeom.Mesh.Define(stage, "/Set/Floor")
+    mesh.CreatePointsAttr([(-5, height, -5), (5, height, -5), (5, height, 5), (-5, height, 5)])
+    mesh.CreateFaceVertexCountsAttr([4])
+    mesh.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    stage.GetRootLayer().Save()
+
+
+@pytest.fixture
+def stage(toy, tmp_path, monkeypatch):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    toy.write_clip(tmp_path / "plain.usda", frames=5)
+    with_floor(toy.write_clip(tmp_path / "floored.usda", frames=5))
+    return tmp_path
+
+
+def points_of(path) -> np.ndarray:
+    shot = Shot(path)
+    return np.stack([shot.garment_points(time) for time in shot.frame_times])
+
+
+SIMULATE = ["simulate", "rigged.usda", "--no-body", "--points", "--tolerance", "0.5", "--motion"]
+BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--refined-output", "points", "--motion"]
+
+
+def below(points: np.ndarray) -> float:
+    return float((points[..., 1] < FLOOR - 5e-3).mean())
+
+
+def test_a_simulated_skirt_stays_above_the_floor_of_its_shot(stage, capsys):
+    assert main([*SIMULATE, "plain.usda", "-o", "plain_sim.usdc"]) == 0
+    assert main([*SIMULATE, "floored.usda", "-o", "floored_sim.usdc"]) == 0
+    assert "floored.usda: cloth meets /Set/Floor" in capsys.readouterr().err
+    assert below(points_of("plain_sim.usdc")) > 0.1
+    assert below(points_of("floored_sim.usdc")) == 0
+
+
+def test_wind_and_gravity_move_a_simulated_skirt_to_where_they_point(stage):
+    for name, more in (
+        ("still", []),
+        ("wind", ["--wind", "6,0,0"]),
+        ("gusty", ["--gusts", "3"]),
+        ("side", ["--gravity", "9.81,0,0"]),
+    ):
+        assert main([*SIMULATE, "plain.usda", "-o", f"{name}.usdc", *more]) == 0
+    still, wind, gusty, side = (points_of(f"{name}.usdc")[-1] for name in ("still", "wind", "gusty", "side"))
+    assert wind[:, 0].mean() > still[:, 0].mean() + 0.02
+    assert side[:, 0].mean() > still[:, 0].mean() + 0.02
+    assert np.abs(gusty - still).max() > 1e-3
+
+
+def test_a_file_is_simulated_again_where_the_wind_is_another(stage, capsys):
+    for more, is_current in ([], False), (["--wind", "3,0,0"], False), (["--wind", "3,0,0"], True):
+        assert main([*SIMULATE, "plain.usda", "-o", "shots", *more]) == 0
+        assert ("current: 1" in capsys.readouterr().err) is is_current
+
+
+def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc", "--wind", "1,0,0"]) == 0
+    told = capsys.readouterr().err
+    assert "the network does not see colliders and wind: it plays as in empty, still air; --refine N or" in told
+    assert main([*BAKE, "plain.usda", "-o", "plain_network.usdc"]) == 0
+    assert "does not see" not in capsys.readouterr().err
+    np.testing.assert_array_equal(points_of("network.usdc"), points_of("plain_network.usdc"))
+    assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
+    assert "does not see" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("more", [["--refine", "30"], ["--refine", "30", "--feedback"]], ids=["refine", "feedback"])
+def test_a_refined_skirt_stays_above_the_floor_and_verifies(stage, capsys, more):
+    assert main([*BAKE, "plain.usda", "-o", "plain_refined.usdc", *more]) == 0
+    assert main([*BAKE, "floored.usda", "-o", "refined.usdc", *more]) == 0
+    assert "does not see" not in capsys.readouterr().err
+    assert below(points_of("plain_refined.usdc")) > 0.1
+    assert below(points_of("refined.usdc")) < 0.01
+    assert main(["verify", "refined.usdc"]) == 0
+
+
+def test_a_refined_shot_remembers_what_was_asked_for(stage):
+    request = BakeRequest(
+        model="model.safetensors", stage="rigged.usda", motion="plain.usda", refine=2, wind="4,0,0", gusts="1,2,3",
+        gravity="0,-5,0", colliders=("/Set/Floor", "Floor"), refined_output="points",
+    )  # fmt: skip
+    assert BakeRequest.from_metadata(request.to_metadata()) == request
+    with_floor("plain.usda")
+    bake(request, "asked.usdc")
+    assert read_provenance("asked.usdc")["request"]["colliders"] == "/Set/Floor Floor"
+    assert main(["verify", "asked.usdc"]) == 0
+
+
+def test_a_floor_that_rises_lifts_the_hem(stage):
+    clip = Usd.Stage.Open("floored.usda")
+    lift = UsdGeom.Xformable(clip.GetPrimAtPath("/Set")).AddTranslateOp()
+    for frame in range(5):
+        lift.Set(Gf.Vec3d(0, 0.02 * frame, 0), frame)
+    clip.GetRootLayer().Save()
+    assert main([*SIMULATE, "floored.usda", "-o", "rising.usdc"]) == 0
+    found = points_of("rising.usdc")
+    lowest = found[..., 1].min(axis=1)
+    assert (lowest > FLOOR + 0.02 * np.arange(5)).all() and lowest[-1] < FLOOR + 0.08 + 0.02
+
+
+def test_gravity_of_the_physics_scene_is_simulated(stage):
+    clip = Usd.Stage.Open("plain.usda")
+    scene = UsdPhysics.Scene.Define(clip, "/Physics")
+    scene.CreateGravityDirectionAttr(Gf.Vec3f(1, 0, 0))
+    clip.GetRootLayer().Save()
+    assert main([*SIMULATE, "plain.usda", "-o", "said.usdc"]) == 0
+    scene.GetPrim().GetAttribute("physics:gravityDirection").Clear()
+    clip.GetRootLayer().Save()
+    assert main([*SIMULATE, "plain.usda", "-o", "asked.usdc", "--gravity", "9.81,0,0"]) == 0
+    np.testing.assert_allclose(points_of("said.usdc"), points_of("asked.usdc"), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--wind", "5"], "--wind: '5'; X,Y,Z is needed"),
+        (["--wind", "north,0,0"], "--wind: 'north,0,0'; X,Y,Z is needed"),
+        (["--wind", "0,0,1000"], "at most 100 m/s"),
+        (["--gusts", "3,0"], "--gusts: '3,0'; RMS[,SIZE[,SEED]] is needed"),
+        (["--gravity", "0,nan,0"], "--gravity: '0,nan,0'; X,Y,Z is needed"),
+        (["--collider", "Chair"], "--collider Chair: "),
+        (["--collider", "Skirt"], "is a garment"),
+        (["--wind", "1,0,0", "--material", "drag=0"], "has no drag"),
+    ],
+)
+def test_what_cannot_surround_a_character_is_refused_in_one_sentence(stage, capsys, words, complaint):
+    before = sorted(stage.iterdir())
+    assert main([*SIMULATE, "plain.usda", "-o", "refused.usdc", *words]) == 2
+    assert complaint in capsys.readouterr().err
+    assert sorted(stage.iterdir()) == before
+
+
+def test_types_of_attributes_that_are_not_the_wind_are_refused_by_a_bake(stage, capsys):
+    clip = Usd.Stage.Open("plain.usda")
+    prim = UsdPhysics.Scene.Define(clip, "/Physics").GetPrim()
+    prim.CreateAttribute("ssilk:wind", Sdf.ValueTypeNames.Float).Set(3.0)
+    clip.GetRootLayer().Save()
+    assert main([*BAKE, "plain.usda", "-o", "refused.usdc"]) == 2
+    assert "ssilk:wind is 3.0; a vector of three numbers is needed" in capsys.readouterr().err

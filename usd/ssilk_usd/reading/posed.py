@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of meshes at a time: deformed by UsdSkel's own functions, or by their samples."""
+
+from __future__ import annotations
+
+import numpy as np
+from pxr import Usd, UsdGeom, UsdSkel
+
+from ssilk_core.scene.assets import Floats
+
+from ..opening.stage import PRIMS, apply, column_matrix
+
+
+def skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
+    """Return the Skeleton, its query and the skinning query of each skinned prim."""
+    cache, found = UsdSkel.Cache(), {}
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
+        root = UsdSkel.Root(prim)
+        if not root:
+            continue
+        cache.Populate(root, PRIMS)
+        for binding in cache.ComputeSkelBindings(root, PRIMS):
+            skeleton = binding.GetSkeleton()
+            for query in binding.GetSkinningTargets():
+                found[query.GetPrim()] = (skeleton.GetPrim(), cache.GetSkelQuery(skeleton), query)
+    return found
+
+
+class SkinnedMesh:
+    """A mesh that UsdSkel deforms: blendshapes in rest space, then linear blend skinning."""
+
+    def __init__(
+        self, prim: Usd.Prim, rig: Usd.Prim, skeleton: UsdSkel.SkeletonQuery, skinning: UsdSkel.SkinningQuery
+    ) -> None:
+        # The query's own prim may be that of a prototype, which stands at no place in the world.
+        self.prim, self.rig, self.skeleton, self.skinning = prim, rig, skeleton, skinning
+        self.rest = UsdGeom.Mesh(prim).GetPointsAttr()
+        self.shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim)) if self._has_shapes() else None
+        if self.shapes:
+            self.rows = self.shapes.ComputeBlendShapePointIndices()
+            self.offsets = self.shapes.ComputeSubShapePointOffsets()
+
+    def _has_shapes(self) -> bool:
+        return bool(self.skinning.HasBlendShapes() and self.skeleton.GetAnimQuery())
+
+    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
+        """Return the posed points in stage units, shape (V, 3)."""
+        points = self.rest.Get(time)
+        if self.shapes:
+            weights = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
+            own = self.skinning.GetBlendShapeMapper().Remap(weights)
+            self.shapes.ComputeDeformedPoints(
+                *self.shapes.ComputeSubShapeWeights(own), self.rows, self.offsets, points
+            )
+        space = self.prim
+        if self.skinning.HasJointInfluences():
+            self.skinning.ComputeSkinnedPoints(self.skeleton.ComputeSkinningTransforms(time), points, time)
+            space = self.rig
+        return apply(column_matrix(xforms.GetLocalToWorldTransform(space)), np.array(points, dtype=np.float64))
+
+
+class PlainMesh:
+    """A mesh with stored points, static or time-sampled."""
+
+    def __init__(self, prim: Usd.Prim) -> None:
+        self.prim, self.samples = prim, UsdGeom.Mesh(prim).GetPointsAttr()
+
+    def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
+        """Return the points in stage units, shape (V, 3)."""
+        points = np.array(self.samples.Get(time), dtype=np.float64)
+        return apply(column_matrix(xforms.GetLocalToWorldTransform(self.prim)), points)
