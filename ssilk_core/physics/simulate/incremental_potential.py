@@ -84,7 +84,7 @@ class StepInputs:
             self.contacts and self.contacts.select(frames),
             self.friction and self.friction.select(frames),
         )
-        pierced, world = (known and known.select(frames) for known in (self.pierced, self.world))
+        pierced, world = self.pierced and self.pierced.select(frames), self.world and self.world.select(frames)
         met = neighbours, contacts, friction, pierced, world
         return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned, *met)
 
