@@ -36,7 +36,7 @@ class Collider:
     faces: Ints
     points: Floats
     placements: Floats
-    present: NDArray[np.bool_]
+    present: NDArray
 
     def __post_init__(self) -> None:
         points, placements = frozen(self.points, np.float64), frozen(self.placements, np.float64)

@@ -73,6 +73,7 @@ def read_world(
     """
     asked = asked or AskedWorld()
     file, prim = split_location(source)
+    prim = prim or split_location(motion.path)[1]  # of a crowd's animations this character's
     shot, home = open_stage(file), open_stage(stage)
     _, placed = find_animation(shot, prim, None)
     stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
