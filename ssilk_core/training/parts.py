@@ -128,7 +128,8 @@ def build_parts(
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, skeleton, fps)
     contours = None
-    if tension := job.train.intersection_weight * GRAVITY * float(energy.mass.sum()):
+    tension = job.train.intersection_weight * GRAVITY * float(energy.mass.sum())
+    if tension and job.has_loose:  # cloth that follows skin alone does not count
         contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -13,7 +14,9 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import model_file
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import ModelConfig
+from ssilk_core.scene.assets import TIGHT
 from ssilk_core.scene.fabrics import FABRICS
+from ssilk_core.scene.mesh import topology
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import FIRST_WEIGHT, _take_over, build_parts
 from ssilk_core.training.settings import TrainConfig
@@ -87,3 +90,21 @@ def test_a_whole_model_goes_on_as_it_is_and_all_of_it_learns(scene, toy_model, t
         assert parameter.requires_grad
         assert torch.equal(parameter, torch.from_numpy(base.parameters[name]))
     assert parts.smoothing
+
+
+@pytest.mark.parametrize(
+    ("weight", "loose", "searched"), [(0.02, True, True), (0.0, True, False), (0.02, False, False)]
+)
+def test_contours_are_searched_for_where_cloth_is_loose(scene, toy_motion, weight, loose, searched):
+    pytest.importorskip("igl")
+    classes = scene.classes if loose else np.minimum(scene.classes, TIGHT)
+    worn = replace(scene, garment=replace(scene.garment, classes=classes))
+    asked = job(worn, None, toy_motion(scene, 9), latent=8, widths=(8,), shapes=2)
+    train = replace(asked.train, recombinations=0, perturbations=0, intersection_weight=weight)
+    contours = build_parts(replace(asked, train=train), CPU).validator.contours
+    assert (contours is not None) == searched
+    if contours:
+        mass = (
+            FABRICS["silk"].density * topology.vertex_areas(worn.garment.mesh.points, worn.garment.mesh.faces)
+        ).sum()
+        assert contours.tension == pytest.approx(weight * 9.81 * mass, rel=1e-3)
