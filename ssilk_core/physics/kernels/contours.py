@@ -85,9 +85,8 @@ def _plane(points, a, b, c, inside):
 
 
 @triton.jit
-def _crosses(points, a, b, c, plane, others):
-    """Whether corners a, b, c lie on both sides of planes."""
-    ox, oy, oz, nx, ny, nz = plane
+def _crosses(points, a, b, c, ox, oy, oz, nx, ny, nz, others):
+    """Whether corners a, b, c lie on both sides of planes through o."""
     first = _side(points, a, others, ox, oy, oz, nx, ny, nz)
     second = _side(points, b, others, ox, oy, oz, nx, ny, nz)
     third = _side(points, c, others, ox, oy, oz, nx, ny, nz)
@@ -138,8 +137,10 @@ def _search(points, low, high, tile_low, tile_high, faces, places, moves, pairs,
                 jb = tl.load(faces + 3 * j + 1, mask=there, other=0)[None, :]
                 jc = tl.load(faces + 3 * j + 2, mask=there, other=0)[None, :]
                 us, them = here[:, None], there[None, :]
-                near &= _crosses(points, ja, jb, jc, _plane(points, ia[:, None], ib[:, None], ic[:, None], us), them)
-                near &= _crosses(points, ia[:, None], ib[:, None], ic[:, None], _plane(points, ja, jb, jc, them), us)
+                ox, oy, oz, nx, ny, nz = _plane(points, ia[:, None], ib[:, None], ic[:, None], us)
+                near &= _crosses(points, ja, jb, jc, ox, oy, oz, nx, ny, nz, them)
+                px, py, pz, mx, my, mz = _plane(points, ja, jb, jc, them)
+                near &= _crosses(points, ia[:, None], ib[:, None], ic[:, None], px, py, pz, mx, my, mz, us)
                 flat = tl.reshape(near, (tile * tile,)).to(tl.int32)
                 at = total + tl.cumsum(flat, 0) - 1
                 name = i[:, None].to(tl.int64) * count + j[None, :]
@@ -226,8 +227,7 @@ def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, 
     sx, sy, sz, lx, ly, lz = zero, zero, zero, zero, zero, zero
     for edge in range(6):
         start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
-        edge_hit = _edge(points, start, end, fa, fb, fc, counts)
-        inside, rx, ry, rz = edge_hit[0], edge_hit[7], edge_hit[8], edge_hit[9]
+        inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
         first = inside & (hits == 0)
         sx, sy, sz = tl.where(first, rx, sx), tl.where(first, ry, sy), tl.where(first, rz, sz)
         lx, ly, lz = tl.where(inside, rx, lx), tl.where(inside, ry, ly), tl.where(inside, rz, lz)
