@@ -109,7 +109,7 @@ def build_parts(
     joints = job.base.joints if job.base else model_joints(scene, reach.joints)
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed)
-    if job.base and not job.stepper_alone:
+    if job.base and job.whole:
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in job.base.parameters.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)

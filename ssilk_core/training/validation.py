@@ -106,7 +106,7 @@ class Validator:
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
-        self.cloth = ClothIntersections.of(scene) if can_find() else None
+        self.cloth = contours.cloth if contours else ClothIntersections.of(scene) if can_find() else None
         self.contours = contours
         self.rest, self.scene = rest, scene
         self.clips = [

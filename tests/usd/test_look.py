@@ -559,13 +559,18 @@ def test_words_of_hidden_faces_are_hidden_with_them(hero, tmp_path, variants):
     assert list(found.GetPrimvar("panel").Get()) == [f"panel {face}" for face in range(COLUMNS * ROWS) if face != 3]
 
 
-def test_tiles_that_are_named_without_a_dot_are_found_from_a_shot(hero, tmp_path):
-    """USD looks up `<UDIM>` beside the layer that names it, as it does the other textures."""
+def name_tiles(hero: Path) -> None:
+    """Give the cape of a stage a texture of one tile, named without a dot."""
     (hero.parent / "textures" / "linen.1001.png").write_bytes(b"linen")
     stage = Usd.Stage.Open(str(hero))
     texture = UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Texture")).GetInput("file")
     texture.Set(Sdf.AssetPath("textures/linen.<UDIM>.png"))
     stage.Save()
+
+
+def test_tiles_that_are_named_without_a_dot_are_found_from_a_shot(hero, tmp_path):
+    """USD looks up `<UDIM>` beside the layer that names it, as it does the other textures."""
+    name_tiles(hero)
     shoot(worn(hero), tmp_path / "shots" / "shot.usda")
     shot = Usd.Stage.Open(str(tmp_path / "shots" / "shot.usda"))
     written = shot.GetPrimAtPath("/Hero/Looks/Cape_cloth/Texture").GetAttribute("inputs:file").Get()
@@ -573,11 +578,7 @@ def test_tiles_that_are_named_without_a_dot_are_found_from_a_shot(hero, tmp_path
 
 
 def test_a_rig_in_another_folder_finds_textures_and_tiles_by_relative_paths(hero, tmp_path):
-    (hero.parent / "textures" / "linen.1001.png").write_bytes(b"linen")
-    stage = Usd.Stage.Open(str(hero))
-    texture = UsdShade.Shader(stage.GetPrimAtPath("/Looks/Cape_cloth/Texture")).GetInput("file")
-    texture.Set(Sdf.AssetPath("textures/linen.<UDIM>.png"))
-    stage.Save()
+    name_tiles(hero)
     rigged = tmp_path / "rigs" / "rigged.usda"
     rigged.parent.mkdir()
     write_rigged_stage(hero, worn(hero).scene, rigged)

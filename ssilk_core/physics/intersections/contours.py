@@ -42,12 +42,12 @@ class IntersectionContours:
 
     def __init__(self, cloth: ClothIntersections, classes: Ints, tension: float, device: torch.device) -> None:
         mesh = cloth.mesh
-        self._cloth, self.tension = cloth, tension
+        self.cloth, self.tension = cloth, tension
         # Near triangles are neighbours in the order of a curve that fills space.
         order = _spatial_order(mesh.points[mesh.faces].mean(axis=1))
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        first, second = np.divmod(self._cloth.allowed, len(order))
+        first, second = np.divmod(cloth.allowed, len(order))
         renamed = np.sort(place[np.column_stack([first, second])], axis=1)
         allowed = np.unique(renamed[:, 0] * len(order) + renamed[:, 1])
         faces = mesh.faces[order]
@@ -58,7 +58,7 @@ class IntersectionContours:
         self._faces, self._places = tensor(faces), tensor(merged_places(mesh.points)[faces])
         self._moves = tensor((classes[faces] == LOOSE).any(axis=1))
         self._allowed = tensor(allowed if len(allowed) else np.array([-1]), torch.int64)
-        self._order = order
+        self._place = place
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy of the contours [J], shape (N,), whose mean is that of one frame in `EVERY`.
@@ -83,11 +83,10 @@ class IntersectionContours:
     def _found(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the frames (P,) and corners (P, 2, 3) of the pairs that count."""
         faces, moves, places = (values.cpu().numpy() for values in (self._faces, self._moves, self._places))
-        back = np.argsort(self._order)
         frames, pairs = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)]
         for number, points in enumerate(x.detach().permute(2, 0, 1).double().cpu().numpy()):
             if np.isfinite(points).all():
-                own = back[self._cloth.pairs(points)]
+                own = self._place[self.cloth.pairs(points)]
                 apart = (places[own[:, 0], :, None] != places[own[:, 1], None]).all(axis=(1, 2))
                 own = own[apart & moves[own].any(axis=1).astype(bool)]
                 frames.append(np.full(len(own), number))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...scene.assets import Air, Floats
+from ...scene.assets.world import frame_at, interpolated
 
 MODES = 48
 SMALLEST = 1 / 16  # of the largest eddy
@@ -41,24 +42,16 @@ class MovingAir:
 
     def velocity(self, points: Floats, seconds: float) -> Floats:
         """Return the velocity of the air [m/s] at points (V, 3) in the world [m], shape (V, 3)."""
-        wind, gusts = self._at(self._air.velocity, seconds), self._at(self._air.gusts, seconds)
+        wind, gusts = (interpolated(values, seconds, self._fps) for values in (self._air.velocity, self._air.gusts))
         found = np.broadcast_to(wind, points.shape)
         if not gusts > 0:
             return found
         phase = (points - self._carried(seconds)) @ self._waves.T + self._turning * seconds + self._phase
         return found + gusts * (np.cos(phase) @ self._across)
 
-    def _at(self, values: Floats, seconds: float) -> Floats:
-        at = min(max(seconds * self._fps, 0.0), len(values) - 1.0)
-        low = min(int(at), len(values) - 1)
-        high = min(low + 1, len(values) - 1)
-        return values[low] + (at - low) * (values[high] - values[low])
-
     def _carried(self, seconds: float) -> Floats:
         """Return how far the wind has carried the air since the first frame [m], shape (3,)."""
-        last = len(self._air.velocity) - 1
-        at = min(max(seconds * self._fps, 0.0), float(last))
-        low = int(at)
-        part = (at - low) / self._fps
-        inside = self._travelled[low] + 0.5 * part * (self._air.velocity[low] + self._at(self._air.velocity, seconds))
-        return inside + (seconds - at / self._fps) * self._at(self._air.velocity, seconds)
+        velocity, now = self._air.velocity, interpolated(self._air.velocity, seconds, self._fps)
+        low, part = frame_at(seconds, self._fps, len(velocity))
+        inside = self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
+        return inside + (seconds - (low + part) / self._fps) * now

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ...scene.assets import Collider, Floats, Ints, ShotWorld
+from ...scene.assets.world import frame_at
 from ...scene.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid, slerp
 from .air import MovingAir
 from .surface import CollisionSurface, PosedSurface, SurfaceDistance
@@ -219,10 +220,8 @@ class Surroundings:
 
 def _placed(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
     """Return the placement (4, 4) at a time; between frames it turns at a constant rate."""
-    at = min(max(seconds * world.fps, 0.0), len(placements) - 1.0)
-    low = int(at)
-    part = at - low
-    if part < 1e-9:
+    low, part = frame_at(seconds, world.fps, len(placements))
+    if part == 0:
         return placements[low]
     turns = quaternion_from_matrix(placements[low : low + 2, :3, :3])
     turn = matrix_from_quaternion(slerp(turns[0], turns[1], np.array(part)))

@@ -113,7 +113,18 @@ class ShotWorld:
 
     def between(self, values: np.ndarray, seconds: float) -> np.ndarray:
         """Return values (F or 1, ...) at a time, linear between frames and constant beyond them."""
-        at = min(max(seconds * self.fps, 0.0), len(values) - 1.0)
-        low = int(at)
-        part = at - low
-        return values[low] if part < 1e-9 else (1 - part) * values[low] + part * values[low + 1]
+        return interpolated(values, seconds, self.fps)
+
+
+def interpolated(values: np.ndarray, seconds: float, fps: float) -> np.ndarray:
+    """Return values (F or 1, ...) of frames at a time, linear between frames and constant beyond them."""
+    low, part = frame_at(seconds, fps, len(values))
+    return values[low] if part == 0 else (1 - part) * values[low] + part * values[low + 1]
+
+
+def frame_at(seconds: float, fps: float, count: int) -> tuple[int, float]:
+    """Return the frame before a time, of so many, and the share of the way to the next; 0 beyond the ends."""
+    at = min(max(seconds * fps, 0.0), count - 1.0)
+    low = int(at)
+    part = at - low
+    return low, part if part >= 1e-9 else 0.0

@@ -23,7 +23,7 @@ from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
 from .mesh import is_drawn, is_garment, kept_faces, polygons, rendered
 from .polygons import triangulate
-from .posed import PlainMesh, SkinnedMesh, skinning_of
+from .posed import PlainMesh, Skinned, SkinnedMesh, posed_mesh, skinning_of
 from .skeleton import bound_skeleton
 from .solids import SIZES, solid
 
@@ -82,26 +82,25 @@ def has_surface(prim: Usd.Prim) -> bool:
 
 
 def read_colliders(prims: Sequence[Usd.Prim], codes: Floats, report: Reporter) -> list[Collider]:
-    """Return prims as colliders, in the core's world [m], at time codes (F,) of their stage.
+    """Return prims of one stage as colliders, in the core's world [m], at its time codes (F,).
 
     Raises:
         SsilkError: the topology of a mesh changes, or its data is malformed.
     """
     found = []
-    skinned: dict[Usd.Stage, dict] = {}
+    skinned = skinning_of(prims[0].GetStage()) if prims else {}
     for prim in prims:
         if not has_surface(prim):
             text = f"{location(prim)}: cloth does not meet a {prim.GetTypeName()}; colliders are meshes and solids"
             report(Message(text, "warning"))
             continue
-        players = skinned.setdefault(prim.GetStage(), skinning_of(prim.GetStage()))
         present = _present(prim, codes)
         if present.any():
-            found.append(_read(prim, codes, present, players))
+            found.append(_read(prim, codes, present, skinned))
     return found
 
 
-def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: dict) -> Collider:
+def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: Skinned) -> Collider:
     to_core, where = StageUnits.of(prim.GetStage()).matrix, location(prim)
     if not prim.IsA(UsdGeom.Mesh):
         points, faces = solid(prim)
@@ -109,7 +108,7 @@ def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: dict) -> 
         points, faces = _mesh(prim, codes, where)
         deforms = UsdGeom.Mesh(prim).GetPointsAttr().ValueMightBeTimeVarying()
         if prim in skinned or deforms:
-            player = SkinnedMesh(prim, *skinned[prim]) if prim in skinned else PlainMesh(prim)
+            player = posed_mesh(prim, skinned)
             if len(points) * len(codes) > MOST_POINTS:
                 what = f"{len(points)} points in {len(codes)} frames"
                 fail(where, what, f"at most {MOST_POINTS} in all deform", "name a simpler mesh, or fewer frames")

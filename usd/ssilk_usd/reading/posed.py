@@ -10,8 +10,10 @@ from ssilk_core.scene.assets import Floats
 
 from ..opening.stage import PRIMS, apply, column_matrix
 
+Skinned = dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]
 
-def skinning_of(stage: Usd.Stage) -> dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]:
+
+def skinning_of(stage: Usd.Stage) -> Skinned:
     """Return the Skeleton, its query and the skinning query of each skinned prim."""
     cache, found = UsdSkel.Cache(), {}
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
@@ -69,3 +71,8 @@ class PlainMesh:
         """Return the points in stage units, shape (V, 3)."""
         points = np.array(self.samples.Get(time), dtype=np.float64)
         return apply(column_matrix(xforms.GetLocalToWorldTransform(self.prim)), points)
+
+
+def posed_mesh(prim: Usd.Prim, skinned: Skinned) -> SkinnedMesh | PlainMesh:
+    """Return what gives the points of a mesh, as its stage's `skinning_of` says."""
+    return SkinnedMesh(prim, *skinned[prim]) if prim in skinned else PlainMesh(prim)

@@ -14,7 +14,7 @@ from ssilk_core.scene.assets import Floats, Ints
 from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, open_stage, stage_name
 from ..opening.times import change_times
 from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
-from ..reading.posed import PlainMesh, SkinnedMesh, skinning_of
+from ..reading.posed import PlainMesh, SkinnedMesh, posed_mesh, skinning_of
 from ..units import StageUnits
 
 
@@ -64,7 +64,7 @@ class Shot:
         prims = [prim for prim in prims if any(prim in side for side in sides)]
         if not prims:
             fail(self.name, "no visible mesh", "a shot has at least one", "check that this is the right file")
-        self._players = [SkinnedMesh(prim, *skinned[prim]) if prim in skinned else PlainMesh(prim) for prim in prims]
+        self._players = [posed_mesh(prim, skinned) for prim in prims]
         self.meshes = tuple(_describe(prim) for prim in prims)
         self.frame_times = frame_times(self.stage)
 
