@@ -84,6 +84,13 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     assert main([*BAKE, "plain.usda", "-o", "plain_network.usdc"]) == 0
     assert "does not see" not in capsys.readouterr().err
     np.testing.assert_array_equal(points_of("network.usdc"), points_of("plain_network.usdc"))
+    clip = Usd.Stage.Open("floored.usda")
+    clip.GetPrimAtPath("/Set/Floor").GetAttribute("faceVertexCounts").Set([4], 3)  # what the solver cannot meet
+    clip.GetRootLayer().Save()
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
+    assert "cloth meets" not in (told := capsys.readouterr().err) and "does not see colliders:" in told
+    assert main([*BAKE, "floored.usda", "-o", "refined.usdc", "--refine", "1"]) == 2
+    assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
     assert "does not see" not in capsys.readouterr().err
 

@@ -6,8 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel, Vt
+from ssilk_usd.reading import colliders
 from ssilk_usd.reading.posed import SkinnedMesh, skinning_of
-from ssilk_usd.reading.world import AskedWorld, read_world
+from ssilk_usd.reading.world import AskedWorld, find_world, read_world
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Body, Character, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
@@ -233,7 +234,7 @@ def test_solids_have_the_extents_and_the_volume_that_usd_says(stage, axis):
     UsdGeom.Points.Define(stage, "/Dust")
     colliding(stage.GetPrimAtPath("/Dust"))
     read(stage, report=told.append)
-    assert any("cloth does not meet a Points" in str(event) for event in told)
+    assert any("cloth does not meet it: it is a Points" in str(event) for event in told)
     with pytest.raises(SsilkError, match="/Dust is a Points; colliders are of the types Mesh, Plane, Cube"):
         read(stage, colliders=("Dust",))
 
@@ -331,3 +332,76 @@ def broken(stage: Usd.Stage, what: str) -> dict:
 def test_what_cannot_surround_a_character_is_refused_in_one_sentence(stage, what, complaint):
     with pytest.raises(SsilkError, match=complaint):
         read(stage, **broken(stage, what))
+
+
+def test_what_an_instancer_scatters_is_not_met_where_its_prototype_lies(stage):
+    stone = quad(stage, "/Set/Stones/Prototypes/Stone", 10)
+    colliding(stone.GetPrim())
+    stones = UsdGeom.PointInstancer.Define(stage, "/Set/Stones")
+    stones.CreatePrototypesRel().SetTargets([stone.GetPath()])
+    stones.CreateProtoIndicesAttr([0, 0])
+    stones.CreatePositionsAttr([(500, 0, 0), (0, 500, 0)])
+    told = []
+    assert read(stage, report=lambda event: told.append(event.text)) is None
+    assert "it is scattered by the PointInstancer /Set/Stones" in told[0] and len(told) == 1
+    with pytest.raises(SsilkError, match="/Stone is scattered by the PointInstancer /Set/Stones"):
+        read(stage, colliders=("Stone",))
+
+
+def test_the_body_of_another_character_of_a_crowd_is_met_by_each(stage, tmp_path):
+    """Also of the one that is at the path which the character has in its own stage."""
+    home = Usd.Stage.CreateNew(str(tmp_path / "hero.usda"))
+    UsdSkel.Root.Define(home, "/Hero")
+    rig = UsdSkel.Skeleton.Define(home, "/Hero/Rig")
+    rig.CreateJointsAttr(["Hips"])
+    for attribute in (rig.CreateBindTransformsAttr(), rig.CreateRestTransformsAttr()):
+        attribute.Set([Gf.Matrix4d(1)])
+    animation = UsdSkel.Animation.Define(home, "/Hero/Walk")
+    UsdSkel.BindingAPI.Apply(rig.GetPrim()).CreateAnimationSourceRel().SetTargets([animation.GetPath()])
+    body = quad(home, "/Hero/Body").GetPrim()
+    binding = UsdSkel.BindingAPI.Apply(body)
+    binding.CreateSkeletonRel().SetTargets([rig.GetPath()])
+    binding.CreateJointIndicesPrimvar(False, 1).Set([0] * 4)
+    binding.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 4)
+    colliding(body)
+    home.GetRootLayer().Save()
+    for name in ("Hero", "Twin"):
+        stage.DefinePrim(f"/{name}").GetReferences().AddReference("./hero.usda", "/Hero")
+    stage.GetRootLayer().Save()
+    shot, own = stage.GetRootLayer().realPath, home.GetRootLayer().realPath
+    for name, other in ("Hero", "Twin"), ("Twin", "Hero"):
+        world = read_world(f"{shot}:/{name}/Walk", own, character(), motion())
+        assert [each.path for each in world.colliders] == [f"{shot}:/{other}/Body"]
+
+
+def test_all_colliders_together_have_room_for_so_many_points(stage, monkeypatch):
+    monkeypatch.setattr(colliders, "MOST_POINTS", 4 * FRAMES + 1)
+    for name in "AB":
+        points = quad(stage, f"/{name}").GetPointsAttr()
+        for code in (0, 100):
+            points.Set(Vt.Vec3fArray.FromNumpy(np.array(points.Get(0.0)) + [0, 0, 1]), code)
+    colliding(stage.GetPrimAtPath("/A"))
+    assert len(read(stage).colliders) == 1
+    colliding(stage.GetPrimAtPath("/B"))
+    with pytest.raises(SsilkError, match="4 points in 5 frames; at most 21 of all colliders together change, of"):
+        read(stage)
+    stage.RemovePrim("/B")
+    scale = quad(stage, "/C", 2).AddScaleOp()
+    scale.Set((1, 1, 1), 0)
+    scale.Set((1, 1, 2), 100)
+    colliding(stage.GetPrimAtPath("/C"))
+    with pytest.raises(SsilkError, match="of which 1 are left"):
+        read(stage)
+
+
+def test_what_surrounds_a_character_is_found_without_reading_shapes(stage):
+    mesh = quad(stage, "/Floor")
+    mesh.GetFaceVertexCountsAttr().Set([3], 5)  # which no collider may do
+    colliding(mesh.GetPrim())
+    UsdPhysics.Scene.Define(stage, "/Physics").CreateGravityMagnitudeAttr(100.0)
+    stage.GetRootLayer().Save()
+    path = stage.GetRootLayer().realPath
+    found = find_world(path, path, character(), motion())
+    assert found.parts == ("colliders", "its gravity")
+    with pytest.raises(SsilkError, match="its faces change over time"):
+        found.read()

@@ -13,12 +13,14 @@ import numpy as np
 from ...devices import select_device
 from ...errors import SsilkError, VerificationError
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, ShotWorld
+from ...scene.assets import Floats, Motion, Scene
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 from .world import asked_world, unseen, world_of
 
 if TYPE_CHECKING:
+    from ssilk_usd.reading.world import AskedWorld
+
     from ...physics.refine import RefinedFrame, Refiner
     from ...scene.decomposition import Decomposition
 
@@ -43,7 +45,7 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     if rollout.refinement is not None:
         return rollout
     if not rollout.request.refine:
-        if not rollout.request.lbs and (missed := unseen(_world(rollout, report))):
+        if not rollout.request.lbs and (missed := unseen(*_surrounded(rollout), report)):
             report(Message(f"{rollout.request.motion}: {missed}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
@@ -78,7 +80,7 @@ def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedF
     if rollout.request.feedback:  # the cloth is on its way when the shot begins
         left_out, played = rollout.lead, rollout.with_lead()
         report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
-    told, world = Countdown(played.motion.frame_count, report), _world(played, report)
+    told, world = Countdown(played.motion.frame_count, report), world_of(*_surrounded(played), report)
     for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices(), world)):
         told()
         if number >= left_out:
@@ -96,11 +98,11 @@ def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool
     return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
 
 
-def _world(rollout: BakeRollout, report: Reporter) -> ShotWorld | None:
-    """Return what surrounds the character from the first frame of a rollout's motion on."""
+def _surrounded(rollout: BakeRollout) -> tuple[str, str, Scene, Motion, AskedWorld | None]:
+    """Return what says what surrounds the character from the first frame of a rollout's motion on."""
     request = rollout.request
     asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
-    return world_of(request.motion, request.stage, rollout.deformer.scene, rollout.motion, asked, report)
+    return request.motion, request.stage, rollout.deformer.scene, rollout.motion, asked
 
 
 def _refiner(rollout: BakeRollout) -> Refiner:
@@ -135,7 +137,7 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """
     energies, (judged, measured) = [], tee(points)
     told = Countdown(rollout.motion.frame_count, report)
-    world = _world(rollout, silent)
+    world = world_of(*_surrounded(rollout))
     changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged, world)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()

@@ -14,7 +14,7 @@ from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MIN_FPS
 from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
-from .world import check_world
+from .world import parse_world
 
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
@@ -130,7 +130,7 @@ class BakeRequest:
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail_unknown("--refined-output", f"'{self.refined_output}'", self.refined_output, REFINED_OUTPUTS)
-        check_world(self.wind, self.gusts, self.gravity)
+        parse_world(self.wind, self.gusts, self.gravity)
         for name, text in (("--asset-version", self.asset_version), ("--asset-identifier", self.asset_identifier)):
             if text is not None and not (text.isprintable() and 0 < len(text) <= LONGEST_TEXT):
                 fail(name, f"{text[:40]!r}", f"1 to {LONGEST_TEXT} printable characters are allowed")

@@ -15,6 +15,8 @@ from ...scene.assets import Motion, Scene, ShotWorld
 if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
 
+Vector = tuple[float, float, float]
+
 GUSTS = "RMS[,SIZE[,SEED]]"
 UNSEEN = "the network does not see {}: it plays as in empty, still air; --refine N or --quality hero solve for it"
 
@@ -25,24 +27,27 @@ def asked_world(
     """Return what options ask for; None where they ask for nothing.
 
     Raises:
-        SsilkError: as `check_world`.
+        SsilkError: as `parse_world`.
     """
     from ssilk_usd.reading.world import AskedWorld
 
     if not colliders and wind is gusts is gravity is None:
         return None
-    air = None if gusts is None else _gusts(gusts)
-    blown, pull = (None if text is None else _vector(name, text) for name, text in _named(wind, gravity))
-    return AskedWorld(tuple(colliders), blown, air, pull)
+    return AskedWorld(tuple(colliders), *parse_world(wind, gusts, gravity))
 
 
-def check_world(wind: str | None, gusts: str | None, gravity: str | None) -> None:
-    """Raise `SsilkError` where an option is no vector, or gusts are not as `GUSTS`."""
-    for name, text in _named(wind, gravity):
-        if text is not None:
-            _vector(name, text)
-    if gusts is not None:
-        _gusts(gusts)
+def parse_world(
+    wind: str | None, gusts: str | None, gravity: str | None
+) -> tuple[Vector | None, tuple[float, float, int] | None, Vector | None]:
+    """Return wind, gusts and gravity as numbers, None where an option is.
+
+    Raises:
+        SsilkError: an option is no vector, or gusts are not as `GUSTS`.
+    """
+    blown, pull = (
+        None if text is None else _vector(name, text) for name, text in (("--wind", wind), ("--gravity", gravity))
+    )
+    return blown, None if gusts is None else _gusts(gusts), pull
 
 
 def world_of(
@@ -55,16 +60,16 @@ def world_of(
     return read_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
 
 
-def unseen(world: ShotWorld | None) -> str:
-    """Return the sentence that says what of a world the network does not see; empty where there is nothing."""
-    if world is None:
-        return ""
-    parts = ("colliders", world.colliders), ("wind", world.air), ("its gravity", world.gravity is not None)
-    return UNSEEN.format(" and ".join(name for name, there in parts if there))
+def unseen(source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter) -> str:
+    """Return the sentence that says what around a character the network does not see; empty where there is nothing.
 
+    No shape of a collider is read for it.
+    """
+    from ssilk_usd.reading.world import find_world
 
-def _named(wind: str | None, gravity: str | None) -> tuple[tuple[str, str | None], ...]:
-    return ("--wind", wind), ("--gravity", gravity)
+    garment = split_location(scene.garment.mesh.path)[1]
+    found = find_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
+    return UNSEEN.format(" and ".join(found.parts)) if found.parts else ""
 
 
 def _numbers(text: str) -> list[float]:
@@ -74,7 +79,7 @@ def _numbers(text: str) -> list[float]:
         return []
 
 
-def _vector(option: str, text: str) -> tuple[float, float, float]:
+def _vector(option: str, text: str) -> Vector:
     numbers = _numbers(text)
     if len(numbers) != 3 or not all(map(isfinite, numbers)):
         fail(option, f"'{text}'", "X,Y,Z is needed, such as 0,0,5; write --wind=-5,0,0 where X is negative")

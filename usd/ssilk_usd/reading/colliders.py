@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdPhysics
+from numpy.typing import NDArray
+from pxr import Usd, UsdGeom, UsdPhysics, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter
@@ -29,30 +30,39 @@ from .solids import SIZES, solid
 
 ENABLED = "physics:collisionEnabled"
 RIGID = 1e-6  # what the columns of a rotation may differ from unit length and right angles
-MOST_POINTS = 100_000_000  # of a collider that deforms, over all frames: 2.4 GB
+MOST_POINTS = 100_000_000  # of all colliders that deform, over all frames: 2.4 GB
 
 
 def colliding_prims(
-    stage: Usd.Stage, names: Sequence[str], own: Character, placed: Usd.Prim | None, garment: str | None
+    stage: Usd.Stage,
+    names: Sequence[str],
+    own: Character,
+    placed: Usd.Prim | None,
+    garment: str | None,
+    *,
+    at_home: bool,
 ) -> list[Usd.Prim]:
-    """Return the prims of a stage that collide, by the API and by name; some of the API may have no surface.
+    """Return the prims of a stage that collide, by the API and by name; some of the API may be none cloth can meet.
 
     Args:
         names: paths or names of prims; each must be in the stage.
         own: the character, whose body cloth meets anyway.
-        placed: its Skeleton in this stage, or None.
+        placed: its Skeleton in the shot, or None.
         garment: path or name of the garment that is not marked as one.
+        at_home: whether the stage is the character's own, in which its bodies have their paths.
 
     Raises:
-        SsilkError: a named prim is the garment, the character's body, or has no surface.
+        SsilkError: a named prim is the garment, the character's body, or cloth cannot meet it.
     """
     every = list(Usd.PrimRange(stage.GetPseudoRoot(), PRIMS))
     bodies = {split_location(each.mesh.path)[1] for each in (*own.bodies, *own.stand_ins)}
     leaves = {str(path).rsplit("/", 1)[-1] for path in bodies}
 
     def is_body(prim: Usd.Prim) -> bool:
-        skinned = placed is not None and bound_skeleton(prim) == placed
-        return str(prim.GetPath()) in bodies or (skinned and prim.GetName() in leaves)
+        rig = bound_skeleton(prim)
+        if not at_home and placed and rig and _character(rig) != _character(placed):
+            return False  # another of a crowd, which may have the path that this one has at home
+        return str(prim.GetPath()) in bodies or (placed is not None and rig == placed and prim.GetName() in leaves)
 
     cloth = named([prim for prim in every if prim.IsA(UsdGeom.Mesh)], garment) if garment else []
     found = []
@@ -69,38 +79,52 @@ def colliding_prims(
             if is_body(prim):
                 what = f"{prim.GetPath()} is the character's own body"
                 fail(f"--collider {name}", what, "the garment meets that anyway", "leave it out")
-            if not has_surface(prim):
-                what = f"{prim.GetPath()} is a {prim.GetTypeName()}"
-                fail(f"--collider {name}", what, f"colliders are of the types Mesh, {', '.join(SIZES)}")
+            if why := unmet(prim):
+                allowed = f"colliders are of the types Mesh, {', '.join(SIZES)}, each at a place of its own"
+                fail(f"--collider {name}", f"{prim.GetPath()} is {why}", allowed)
         found += chosen
     return list(dict.fromkeys(found))
 
 
-def has_surface(prim: Usd.Prim) -> bool:
-    """Return whether cloth can meet a prim."""
-    return bool(prim.IsA(UsdGeom.Mesh)) or str(prim.GetTypeName()) in SIZES
+def unmet(prim: Usd.Prim) -> str:
+    """Return in words what a prim is that cloth cannot meet; empty where it can."""
+    if not (prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in SIZES):
+        return f"a {prim.GetTypeName()}"
+    above = prim.GetParent()
+    while above and not above.IsA(UsdGeom.PointInstancer):
+        above = above.GetParent()
+    # It stands where the instancer puts copies of it, not where it is itself.
+    return f"scattered by the PointInstancer {above.GetPath()}" if above else ""
 
 
-def read_colliders(prims: Sequence[Usd.Prim], codes: Floats, report: Reporter) -> list[Collider]:
-    """Return prims of one stage as colliders, in the core's world [m], at its time codes (F,).
-
-    Raises:
-        SsilkError: the topology of a mesh changes, or its data is malformed.
-    """
+def met_prims(prims: Sequence[Usd.Prim], codes: Floats, report: Reporter) -> list[tuple[Usd.Prim, NDArray[np.bool_]]]:
+    """Return those of some prims that cloth meets at any of some time codes (F,), and when: (F,) or (1,)."""
     found = []
-    skinned = skinning_of(prims[0].GetStage()) if prims else {}
     for prim in prims:
-        if not has_surface(prim):
-            text = f"{location(prim)}: cloth does not meet a {prim.GetTypeName()}; colliders are meshes and solids"
-            report(Message(text, "warning"))
-            continue
-        present = _present(prim, codes)
-        if present.any():
-            found.append(_read(prim, codes, present, skinned))
+        if why := unmet(prim):
+            allowed = "colliders are meshes and solids at a place of their own"
+            report(Message(f"{location(prim)}: cloth does not meet it: it is {why}; {allowed}", "warning"))
+        elif (present := _present(prim, codes)).any():
+            found.append((prim, present))
     return found
 
 
-def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: Skinned) -> Collider:
+def read_colliders(met: Sequence[tuple[Usd.Prim, NDArray[np.bool_]]], codes: Floats) -> list[Collider]:
+    """Return prims of one stage that `met_prims` found as colliders, in the core's world [m], at its time codes (F,).
+
+    Raises:
+        SsilkError: the topology of a mesh changes, its data is malformed, or too many points move.
+    """
+    skinned = skinning_of(met[0][0].GetStage()) if met else {}
+    found: list[Collider] = []
+    for prim, present in met:
+        left = MOST_POINTS - sum(each.points[..., 0].size for each in found if len(each.points) > 1)
+        found.append(_read(prim, codes, present, skinned, left))
+    return found
+
+
+def _read(prim: Usd.Prim, codes: Floats, present: NDArray[np.bool_], skinned: Skinned, left: int) -> Collider:
+    """Return a prim as a collider; `left` is how many points may still move, over all frames."""
     to_core, where = StageUnits.of(prim.GetStage()).matrix, location(prim)
     if not prim.IsA(UsdGeom.Mesh):
         points, faces = solid(prim)
@@ -109,9 +133,7 @@ def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: Skinned) 
         deforms = UsdGeom.Mesh(prim).GetPointsAttr().ValueMightBeTimeVarying()
         if prim in skinned or deforms:
             player = posed_mesh(prim, skinned)
-            if len(points) * len(codes) > MOST_POINTS:
-                what = f"{len(points)} points in {len(codes)} frames"
-                fail(where, what, f"at most {MOST_POINTS} in all deform", "name a simpler mesh, or fewer frames")
+            _need_room(where, points, codes, left)
             moved = [apply(to_core, _points_at(player, code, len(points), where)) for code in codes]
             return Collider(where, faces, np.stack(moved), np.eye(4)[None], present)
     changes = len(codes) > 1 and change_times(xform_attributes(prim))
@@ -121,8 +143,16 @@ def _read(prim: Usd.Prim, codes: Floats, present: np.ndarray, skinned: Skinned) 
         fail(where, "it is placed at infinity or NaN", "colliders are somewhere", "repair the xforms above it")
     moves = _moves(world)
     if moves is None:  # its scale changes
+        _need_room(where, points, world, left)
         return Collider(where, faces, np.stack([apply(each, points) for each in world]), np.eye(4)[None], present)
     return Collider(where, faces, apply(world[0], points)[None], moves, present)
+
+
+def _need_room(where: str, points: Floats, frames: Floats, left: int) -> None:
+    if len(points) * len(frames) > left:
+        what = f"{len(points)} points in {len(frames)} frames"
+        allowed = f"at most {MOST_POINTS} of all colliders together change, of which {left} are left"
+        fail(where, what, allowed, "name simpler meshes, or fewer frames")
 
 
 def _moves(world: Floats) -> Floats | None:
@@ -163,7 +193,7 @@ def _points_at(player: SkinnedMesh | PlainMesh, code: float, count: int, where: 
     return points
 
 
-def _present(prim: Usd.Prim, codes: Floats) -> np.ndarray:
+def _present(prim: Usd.Prim, codes: Floats) -> NDArray[np.bool_]:
     """Return when cloth meets a prim, (F,) or (1,): the nearest API above it says so."""
     at = prim
     while at and not at.HasAPI(UsdPhysics.CollisionAPI):
@@ -186,6 +216,11 @@ def _named_prims(stage: Usd.Stage, every: list[Usd.Prim], name: str) -> list[Usd
     if not beneath:
         fail(f"--collider {name}", "nothing with a surface lies there", "name a mesh, or a prim above meshes")
     return beneath if len(beneath) == 1 else rendered([prim for prim in beneath if is_drawn(prim)]) or beneath
+
+
+def _character(rig: Usd.Prim) -> Usd.Prim:
+    """Return the SkelRoot that a Skeleton is of."""
+    return UsdSkel.Root.Find(rig).GetPrim()
 
 
 def _is_cloth(prim: Usd.Prim, named_cloth: list[Usd.Prim]) -> bool:

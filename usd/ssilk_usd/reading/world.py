@@ -12,18 +12,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import Usd, UsdPhysics
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import UP, Air, Character, Collider, Floats, Motion, ShotWorld
+from ssilk_core.scene.assets import UP, Air, Character, Floats, Motion, ShotWorld
 
 from ..names import GUST_LENGTH, GUST_SEED, GUSTS, WIND
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, open_stage, stage_name, value
 from ..opening.times import change_times
 from ..units import StageUnits
-from .colliders import colliding_prims, has_surface, read_colliders
+from .colliders import colliding_prims, met_prims, read_colliders
 from .motion import find_animation
 
 EARTH = 9.81  # [m/s2]
@@ -48,6 +49,90 @@ class AskedWorld:
     gravity: tuple[float, float, float] | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class FoundWorld:
+    """What surrounds a character, of which no shape is read yet.
+
+    Attributes:
+        stage: that has the colliders, kept open for them.
+        met: prims that collide, and when; codes: time codes of the motion's frames in their stage, shape (F,).
+        fps: of the motion [1/s].
+        gravity, air: as in `ShotWorld`.
+    """
+
+    stage: Usd.Stage
+    met: tuple[tuple[Usd.Prim, NDArray[np.bool_]], ...]
+    codes: Floats
+    fps: float
+    gravity: Floats | None
+    air: Air | None
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """What there is, in words; empty where nothing surrounds the character."""
+        parts = ("colliders", self.met), ("wind", self.air), ("its gravity", self.gravity is not None)
+        return tuple(name for name, there in parts if there)
+
+    def read(self, report: Reporter = silent) -> ShotWorld | None:
+        """Return it with its shapes; None where nothing surrounds the character.
+
+        Raises:
+            SsilkError: a collider cannot be one.
+        """
+        if not self.parts:
+            return None
+        if self.met:
+            prims = [prim for prim, _ in self.met]
+            some = f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
+            report(Message(f"{stage_name(self.stage)}: cloth meets {some}"))
+        return ShotWorld(self.fps, tuple(read_colliders(self.met, self.codes)), self.gravity, self.air)
+
+
+@explains_damage
+def find_world(
+    source: str,
+    stage: str,
+    character: Character,
+    motion: Motion,
+    asked: AskedWorld | None = None,
+    *,
+    garment: str | None = None,
+    report: Reporter = silent,
+) -> FoundWorld:
+    """Return what surrounds a character at each frame of its motion.
+
+    Colliders are those of the shot, or of the character's stage where the shot has none; so is the PhysicsScene.
+
+    Args:
+        source: of the motion, "file[:/Prim/Path]".
+        stage: the character's file.
+        garment: path or name of the garment in it that is not marked as one.
+
+    Raises:
+        SsilkError: a named collider is none, several PhysicsScenes say different things, or a value is out of range.
+    """
+    asked = asked or AskedWorld()
+    file, prim = split_location(source)
+    prim = prim or split_location(motion.path)[1]  # of a crowd's animations this character's
+    shot, home = open_stage(file), open_stage(stage)
+    _, placed = find_animation(shot, prim, None)
+    stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
+    seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
+    there, prims = _colliding(stages, asked.colliders, (character, placed, garment))
+    codes = seconds * there.GetTimeCodesPerSecond()
+    met = met_prims(prims, codes, report)
+    scene = next((found for found in map(_scene, stages) if found), None)
+    units = StageUnits.of(shot)
+    if asked.gravity is not None:
+        gravity: Floats | None = (units.rotation @ np.array(asked.gravity))[None]
+    else:
+        gravity = _gravity(scene, seconds) if scene else None
+    if gravity is not None and np.abs(gravity + EARTH * UP).max() <= SAME * EARTH:
+        gravity = None
+    air = _air(scene, seconds, asked, units)
+    return FoundWorld(there, tuple(met), codes, motion.fps, gravity, air)
+
+
 @explains_damage
 def read_world(
     source: str,
@@ -61,57 +146,23 @@ def read_world(
 ) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion; None where nothing does.
 
-    Colliders are those of the shot, or of the character's stage where the shot has none; so is the PhysicsScene.
-
-    Args:
-        source: of the motion, "file[:/Prim/Path]".
-        stage: the character's file.
-        garment: path or name of the garment in it that is not marked as one.
+    Arguments are those of `find_world`.
 
     Raises:
-        SsilkError: a collider cannot be one, several PhysicsScenes say different things, or a value is out of range.
+        SsilkError: as `find_world` and `FoundWorld.read` do.
     """
-    asked = asked or AskedWorld()
-    file, prim = split_location(source)
-    prim = prim or split_location(motion.path)[1]  # of a crowd's animations this character's
-    shot, home = open_stage(file), open_stage(stage)
-    _, placed = find_animation(shot, prim, None)
-    stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
-    seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
-    colliders = _colliders(stages, seconds, asked.colliders, (character, placed, garment), report)
-    scene = next((found for found in map(_scene, stages) if found), None)
-    units = StageUnits.of(shot)
-    if asked.gravity is not None:
-        gravity: Floats | None = (units.rotation @ np.array(asked.gravity))[None]
-    else:
-        gravity = _gravity(scene, seconds) if scene else None
-    if gravity is not None and np.abs(gravity + EARTH * UP).max() <= SAME * EARTH:
-        gravity = None
-    air = _air(scene, seconds, asked, units)
-    world = ShotWorld(motion.fps, tuple(colliders), gravity, air)
-    return None if world.is_usual else world
+    return find_world(source, stage, character, motion, asked, garment=garment, report=report).read(report)
 
 
-def _colliders(
-    stages: Sequence[Usd.Stage],
-    seconds: Floats,
-    names: tuple[str, ...],
-    own: tuple[Character, Usd.Prim | None, str | None],
-    report: Reporter,
-) -> list[Collider]:
-    for stage in stages:
-        last = stage is stages[-1]
-        there = [name for name in names if last or _has(stage, name)]
-        if names and len(there) < len(names):
-            continue
-        prims = colliding_prims(stage, names, *own)
-        if prims:
-            found = read_colliders(prims, seconds * stage.GetTimeCodesPerSecond(), report)
-            met = [prim for prim in prims if has_surface(prim)]
-            some = f"{listed(met[:4])}{f' and {len(met) - 4} more' if len(met) > 4 else ''}"
-            report(Message(f"{stage_name(stage)}: cloth meets {some}"))
-            return found
-    return []
+def _colliding(
+    stages: Sequence[Usd.Stage], names: tuple[str, ...], own: tuple[Character, Usd.Prim | None, str | None]
+) -> tuple[Usd.Stage, list[Usd.Prim]]:
+    """Return the stage that has the colliders, and these; none in the last where there are none."""
+    *shot, home = stages
+    for stage in shot:
+        if all(_has(stage, name) for name in names) and (prims := colliding_prims(stage, names, *own, at_home=False)):
+            return stage, prims
+    return home, colliding_prims(home, names, *own, at_home=True)
 
 
 def _has(stage: Usd.Stage, name: str) -> bool:
