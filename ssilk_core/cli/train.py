@@ -160,6 +160,8 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
     trained = options.stepper_of or options.start_from
     base = load_model(trained) if trained else None
+    if base:
+        _need_settings_of(base.config, model, train, options)
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
     return TrainJob(
@@ -177,6 +179,20 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         base=base,
         whole=options.start_from is not None,
     )
+
+
+def _need_settings_of(base: ModelConfig, model: ModelConfig, train: TrainConfig, options: argparse.Namespace) -> None:
+    """Raise `SsilkError` where a setting is asked for that training which goes on from a model cannot take."""
+    from ..training.job import STEPPER_SETTINGS
+
+    kept = set(setting_names(ModelConfig)) - (set() if options.start_from else set(STEPPER_SETTINGS))
+    for setting in options.settings:
+        name, where = setting.partition("=")[0], f"--set {setting}"
+        if name in kept and getattr(model, name) != (own := getattr(base, name)):
+            fail(where, f"the given model has {own}", "it is trained on as large as it is", "leave it out")
+        if name == "static_fraction" and train.static_fraction:
+            what = "training that goes on from a model has no static part"
+            fail(where, what, "0 is allowed", "leave it out")
 
 
 def _take_fabric(options: argparse.Namespace, report: Reporter) -> None:

@@ -165,8 +165,8 @@ def _need_same_scene(base: ModelFile, scene: Scene) -> None:
         fail(
             scene.garment.mesh.path,
             "another garment, rig or skeleton than the given model was trained on",
-            "a stepper is trained for the initialiser and decoder of the same scene",
-            "train a whole model",
+            "training goes on from a model of the same scene",
+            "train anew",
         )
 
 

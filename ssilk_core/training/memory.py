@@ -15,13 +15,16 @@ from ..errors import fail
 from ..network.settings import ModelConfig
 from ..physics.collision.samples import contact_samples
 from ..physics.energy.stitching import held_stitches
-from ..scene.assets import PINNED, Scene
+from ..physics.intersections.figures import EVERY
+from ..scene.assets import LOOSE, PINNED, Scene
 from ..scene.fabrics import Fabric
 from .settings import MOST_SMOOTHED_VERTICES, TrainConfig
 
 PLANNED_SHARE = 0.8  # of the free memory
 DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way to ask
 MAX_SEARCHED = 1 << 25  # pairs of a sample and a triangle of the body at once, as `collision.closest_point` takes
+CONTOUR_BYTES = 160  # for each triangle of a frame that is searched: bounds, corners, and places for pairs
+CONTOUR_VERTEX_BYTES = 72  # likewise for each vertex: positions and gradients, which are summed in whole numbers
 STITCH_NUMBERS = 60  # for each frame: arms, normal and offset, with their gradients
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
@@ -71,6 +74,7 @@ class StepMemory:
         samples: at which the garment meets the body (`collision.samples`), its vertices among them.
         stitches: that hold its islands on one another.
         smoothed: vertices whose blendshapes are smoothed by a matrix that is still to be built.
+        contours: whether the garment's intersections with itself are searched for.
     """
 
     scene: Scene
@@ -79,6 +83,7 @@ class StepMemory:
     samples: int
     stitches: int = 0
     smoothed: int = 0
+    contours: bool = False
 
     @classmethod
     def of(
@@ -88,16 +93,20 @@ class StepMemory:
         mesh = scene.garment.mesh
         samples = len(contact_samples(mesh, fabric).area)
         stitches = len(held_stitches(mesh, fabric, scene.classes))
-        return cls(scene, model, body_vertices, samples, stitches, smoothed_vertices(scene, model, config))
+        smoothed, contours = smoothed_vertices(scene, model, config), searches_contours(scene, config)
+        return cls(scene, model, body_vertices, samples, stitches, smoothed, contours)
 
     def needed(self, frames: int) -> int:
         """Predict the bytes of a step that decodes so many frames at once."""
-        cloth = 200 * self.scene.garment.mesh.vertex_count + 25 * self.samples + STITCH_NUMBERS * self.stitches
+        mesh = self.scene.garment.mesh
+        cloth = 200 * mesh.vertex_count + 25 * self.samples + STITCH_NUMBERS * self.stitches
         numbers = cloth + 22 * self.body_vertices + 60 * len(self.scene.joint_names)
         network = 12 * sum(self.model.widths) + 20 * self.model.latent
         searched = self.samples * self.body_vertices
         pairs = min(MAX_SEARCHED, 2 * frames * searched)  # a closed mesh has twice as many faces
-        return 4 * frames * (numbers + network) + 4 * searched + 8 * pairs + 4 * self.smoothed**2 + (40 << 20)
+        crossed = CONTOUR_BYTES * len(mesh.faces) + CONTOUR_VERTEX_BYTES * mesh.vertex_count if self.contours else 0
+        found = 4 * searched + 8 * pairs + ceil(frames / EVERY) * crossed
+        return 4 * frames * (numbers + network) + found + 4 * self.smoothed**2 + (40 << 20)
 
     def fitting_batch(self, config: TrainConfig, available: int) -> tuple[int, int]:
         """Return the largest batch and pretraining batch, up to the configured ones, that fit into so many bytes."""
@@ -119,6 +128,11 @@ class StepMemory:
                 f"{available / 2**30:.2g} GiB are free",
                 "free some, take another device (--device), or shorter windows (--set window=...)",
             )
+
+
+def searches_contours(scene: Scene, config: TrainConfig) -> bool:
+    """Return whether a training searches for contours of intersection, which count where cloth is loose."""
+    return bool(config.intersection_weight and (scene.classes == LOOSE).any())
 
 
 def smoothed_vertices(scene: Scene, model: ModelConfig, config: TrainConfig) -> int:

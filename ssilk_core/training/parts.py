@@ -20,6 +20,7 @@ from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .job import TrainJob
+from .memory import searches_contours
 from .motion_bank import MotionBank, build_bank, usable_spans
 from .objective import Objective
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -128,8 +129,8 @@ def build_parts(
     rest, frames = model.decoder.rest, job.train.valid_frames
     spans = usable_spans(job.held_out, skeleton, fps)
     contours = None
-    tension = job.train.intersection_weight * GRAVITY * float(energy.mass.sum())
-    if tension and job.has_loose:  # cloth that follows skin alone does not count
+    if searches_contours(scene, job.train):
+        tension = job.train.intersection_weight * GRAVITY * float(energy.mass.sum())
         contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)

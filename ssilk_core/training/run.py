@@ -208,7 +208,8 @@ class TrainingRun:
     def _step_memory(self) -> StepMemory:
         energy = self.parts.energy
         samples, stitches = len(energy.cloth.samples.area), len(energy.stitching or ())
-        return StepMemory(self.job.scene, self.job.model, self.parts.reached, samples, stitches)
+        contours = self.parts.validator.contours is not None
+        return StepMemory(self.job.scene, self.job.model, self.parts.reached, samples, stitches, contours=contours)
 
     def _reduce_batch(self, found: str, batch: int, pretraining_batch: int) -> None:
         before, lowered = self.config, self.state.lowered

@@ -148,3 +148,20 @@ def test_a_name_that_is_too_long_fails_its_task_alone(copy, capsys):
     assert "a name of 280 characters" in failed
     assert run("task job/job.json -o out --check --json") == 3
     assert "1 of 2 tasks are not done" in said(capsys, "error") and Path("out/shots/clip/shot.usda").is_file()
+
+
+@pytest.mark.parametrize("onward", ["--start-from", "--stepper-of"])
+def test_settings_that_a_given_model_cannot_take_are_refused(copy, capsys, onward):
+    """Nothing is trained with other settings than were asked for."""
+    before = sorted(copy.iterdir())
+    train = f"train rigged.usda --motions clip.usda --preset draft --device cpu -o more.safetensors {onward}"
+    for setting, complaint in (
+        ("latent=16", "--set latent=16: the given model has 8; it is trained on as large as it is"),
+        ("static_fraction=0.5", "training that goes on from a model has no static part"),
+    ):
+        assert run(f"{train} model.safetensors --set {setting}") == 2
+        assert complaint in capsys.readouterr().err
+    assert sorted(copy.iterdir()) == before
+    words = "--set latent=8 --set static_fraction=0 --set iterations=2 --set batch=2 --set window=4"
+    assert run(f"{train} model.safetensors {words} --set valid_frames=8") in (0, 5)
+    assert load_model("more.safetensors").config.latent == 8

@@ -63,10 +63,10 @@ class IntersectionContours:
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy of the contours [J], shape (N,), whose mean is that of one frame in `EVERY`.
 
-        Only these frames are searched. They stand for those that follow them, which have zero.
+        Only these frames are searched. They stand for the others, which have zero.
         """
-        found = x.new_zeros(x.shape[-1])
-        found[::EVERY] = EVERY * self.tension * self.lengths(x[..., ::EVERY].contiguous())
+        searched, found = x[..., ::EVERY].contiguous(), x.new_zeros(x.shape[-1])
+        found[::EVERY] = x.shape[-1] / searched.shape[-1] * self.tension * self.lengths(searched)
         return found
 
     def lengths(self, x: Tensor) -> Tensor:

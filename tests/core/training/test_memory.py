@@ -5,13 +5,14 @@ import weakref
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.energy import GarmentEnergy
-from ssilk_core.scene.assets import PINNED
+from ssilk_core.scene.assets import PINNED, TIGHT
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.training import memory
 from ssilk_core.training.memory import (
@@ -32,7 +33,8 @@ def test_more_of_anything_needs_more(scene):
     base = step.needed(64)
     wider = replace(MODEL, widths=(256, 512, 513))
     assert step.needed(65) > base
-    for change in ({"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"model": wider}):
+    more = {"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"contours": True}
+    for change in (*more, {"model": wider}):
         assert replace(step, **change).needed(64) > base
 
 
@@ -79,6 +81,28 @@ def test_what_a_step_keeps_of_its_stitches_is_counted(patched_scene):
         StepMemory(patched_scene, MODEL, 0, 0, count).needed(frames) for count in (0, len(energy.stitching))
     )
     assert some - none > sum(kept.values()) > 0
+
+
+def test_what_the_search_for_contours_takes_is_counted_where_cloth_is_loose(scene, monkeypatch):
+    """What the kernel is handed is held all at once."""
+    pytest.importorskip("triton")
+    from ssilk_core.physics.kernels import contours as kernel
+
+    frames, held, mesh = 32, [], scene.garment.mesh
+    monkeypatch.setattr(kernel, "_search", {(len(mesh.faces) // 32 + 1, 8): lambda *given, **_: held.extend(given)})
+    monkeypatch.setattr(kernel, "_measure", {(len(mesh.faces) // 32 + 1, 8): lambda *given, **_: held.extend(given)})
+    faces = torch.tensor(mesh.faces)
+    x = torch.tensor(mesh.points, dtype=torch.float32)[:, :, None].repeat(1, 1, frames)[..., ::4]
+    kernel.contours_kernel(x, faces, faces, faces[:, 0], faces[:1, 0], 0.2)
+    storages = {each.untyped_storage().data_ptr(): each for each in held if isinstance(each, torch.Tensor)}
+    kept = sum(each.untyped_storage().nbytes() for each in storages.values())
+    config = replace(CONFIG, intersection_weight=0.02, shape_smoothing=0)
+    pinned = replace(scene, garment=replace(scene.garment, classes=np.minimum(scene.classes, TIGHT)))
+    loose, tight, without = (
+        StepMemory.of(each, MODEL, asked, FABRICS["silk"], 100).needed(frames)
+        for each, asked in ((scene, config), (pinned, config), (scene, replace(config, intersection_weight=0)))
+    )
+    assert tight == without and loose - without > kept > 0
 
 
 def test_frames_cost_the_same_each(scene):

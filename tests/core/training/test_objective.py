@@ -136,7 +136,7 @@ def test_the_contours_of_every_fourth_frame_stand_for_all(objective, monkeypatch
     found = torch.cat([dynamic["intersection"], static_batch["intersection"]])
     expected = objective.contours.lengths(decoded[-1])
     assert len(found) == len(expected) == 15 and expected.min() > 0.1
-    torch.testing.assert_close(found[::4], 4 * 0.5 * expected[::4])
+    torch.testing.assert_close(found[::4], 15 / 4 * 0.5 * expected[::4])
     assert not found.reshape(-1)[torch.arange(15) % 4 > 0].any()
     slopes = gradients(objective, found.sum())
     for name in ("decoder.shapes", "stepper.0.weight", "initialiser.0.weight"):
