@@ -46,13 +46,21 @@ def check_world(wind: str | None, gusts: str | None, gravity: str | None) -> Non
 
 
 def world_of(
-    source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter = silent
+    source: str,
+    stage: str,
+    scene: Scene,
+    motion: Motion,
+    asked: AskedWorld | None,
+    report: Reporter = silent,
+    *,
+    colliders: bool = True,
 ) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
     from ssilk_usd.reading.world import read_world
 
     garment = split_location(scene.garment.mesh.path)[1]
-    return read_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
+    found = scene.character, motion, asked
+    return read_world(source, stage, *found, garment=garment, colliders=colliders, report=report)
 
 
 def unseen(world: ShotWorld | None) -> str:

@@ -57,6 +57,7 @@ def read_world(
     asked: AskedWorld | None = None,
     *,
     garment: str | None = None,
+    colliders: bool = True,
     report: Reporter = silent,
 ) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion; None where nothing does.
@@ -67,6 +68,7 @@ def read_world(
         source: of the motion, "file[:/Prim/Path]".
         stage: the character's file.
         garment: path or name of the garment in it that is not marked as one.
+        colliders: whether they are read, and not gravity and wind alone.
 
     Raises:
         SsilkError: a collider cannot be one, several PhysicsScenes say different things, or a value is out of range.
@@ -78,7 +80,8 @@ def read_world(
     _, placed = find_animation(shot, prim, None)
     stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
-    colliders = _colliders(stages, seconds, asked.colliders, (character, placed, garment), report)
+    own = character, placed, garment
+    met = _colliders(stages, seconds, asked.colliders, own, report) if colliders else []
     scene = next((found for found in map(_scene, stages) if found), None)
     units = StageUnits.of(shot)
     if asked.gravity is not None:
@@ -88,7 +91,7 @@ def read_world(
     if gravity is not None and np.abs(gravity + EARTH * UP).max() <= SAME * EARTH:
         gravity = None
     air = _air(scene, seconds, asked, units)
-    world = ShotWorld(motion.fps, tuple(colliders), gravity, air)
+    world = ShotWorld(motion.fps, tuple(met), gravity, air)
     return None if world.is_usual else world
 
 
