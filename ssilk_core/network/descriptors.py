@@ -11,6 +11,10 @@ Those of the paper are "absolute": beside the static descriptor S sees those of 
 rotations and positions in the world. A garment then behaves differently where its character stands or faces
 otherwise. The paper does not say of how many poses the root is seen; here it is of the same three. It takes static
 descriptors from NCS, in which gravity stands for the root's rotation, as it does here.
+
+Gravity also stands for wind. Drag is linear in the velocity of the air relative to the cloth, so that an even wind
+pulls on each vertex with the same acceleration, whatever it does. `Motion.gravity` holds the sum of both. The network
+sees it in units of the usual one, as `seen_gravity` compresses it.
 """
 
 from __future__ import annotations
@@ -32,7 +36,7 @@ SATURATION = 4.0  # limit of dynamic features, so that a teleport keeps the netw
 
 @dataclass(frozen=True, eq=False)
 class PoseFeatures:
-    """Descriptors of a motion's frames without gravity, which depends on the augmentation.
+    """Descriptors of a motion's frames, and apart from them gravity, which training varies.
 
     Attributes:
         static: 6D local rotations of the descriptor joints except the hub, shape (F, S); of joints above the hub,
@@ -40,6 +44,7 @@ class PoseFeatures:
         dynamic: first and second differences of these, the root's rotation, and accelerations, shape (F, D); absolute
             ones are those of the two frames before (2 S), and `VECTORS` in the world.
         down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
+        gravity: as the network sees it, shape (F, 3); None for the usual one, (0, -1, 0).
         earlier: likewise of the two frames before, shape (F, 2 J', 3, 3); none (F, 0, 3, 3) in relative ones.
     """
 
@@ -47,6 +52,17 @@ class PoseFeatures:
     dynamic: Floats
     down: Floats
     earlier: Floats
+    gravity: Floats | None = None
+
+
+def seen_gravity(gravity: Floats) -> Floats:
+    """Return accelerations (F, 3) [m/s2] in units of the usual one, with the length l > 1 as 1 + ln(l).
+
+    A storm then stays near the range that training has drawn from, and a weak pull as it is.
+    """
+    units = np.asarray(gravity) / GRAVITY
+    length = np.linalg.norm(units, axis=-1, keepdims=True).clip(min=1.0)
+    return units * ((1 + np.log(length)) / length)
 
 
 def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
@@ -91,12 +107,13 @@ def pose_features(
     above = np.flatnonzero(np.isin(joints, skeleton.hub_path[:-1]))
     local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
     static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
+    gravity = None if motion.gravity is None else seen_gravity(motion.gravity)
     if kind == "absolute":
         axes, places = six_d(root), world[:, centre, :3, 3]
         past = [_past(static, steps) for steps in (1, 2)]
         seen = [_past(values, steps) for values in (axes, places) for steps in (0, 1, 2)]
         earlier = np.concatenate([_past(down, steps) for steps in (1, 2)], axis=1)
-        return PoseFeatures(static, np.concatenate([*past, *seen], axis=1), down, earlier)
+        return PoseFeatures(static, np.concatenate([*past, *seen], axis=1), down, earlier, gravity)
     rate, change = _differences(static, motion.fps)
     turn = [
         six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
@@ -104,7 +121,7 @@ def pose_features(
     acceleration = _differences(world[..., :3, 3], motion.fps)[1] / (RATE_TIME**2 * GRAVITY)
     acceleration = np.einsum("fba,fjb->fja", root, acceleration).reshape(len(local), -1)
     dynamic = np.concatenate([rate, change, *turn, acceleration], axis=1)
-    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0])
+    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity)
 
 
 def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:

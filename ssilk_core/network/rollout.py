@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from ..errors import fail
+from ..physics.constants import GRAVITY
 from ..scene.assets import Floats, GarmentPose, Motion
 from ..scene.kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .descriptors import pose_features
-from .model.descriptors import upright_descriptors
+from .model.descriptors import motion_descriptors
 from .model.feedback import BodyFrames
 from .model.network import GarmentModel
 from .sampling import sample_pose
@@ -77,7 +78,7 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Rollo
     for block in blocks:
         if not abs(block.fps - fps) < 1e-6:
             fail(block.path, f"{block.fps:g} frames per second", f"the model steps at {fps:g}")
-        seen = block if past is None else _concatenate(past, block)
+        seen = block if past is None else block.after(past)
         if _is_at_rest(seen, state):
             states = [state[-1]] * HISTORY
             parts = _decode(model, state[-1], torch.zeros(1, dtype=torch.bool, device=state[-1].device))
@@ -91,15 +92,9 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Rollo
 
 def _is_at_rest(seen: Motion, state: list[Tensor]) -> bool:
     """Return whether a character holds still in all frames of `seen`, and the garment in the last of `state`."""
-    held = max(np.ptp(seen.rotations, axis=0).max(), np.ptp(seen.translations, axis=0).max()) < STILL_THRESHOLD
+    felt = [] if seen.gravity is None else [seen.gravity / GRAVITY]
+    held = max(np.ptp(v, axis=0).max() for v in (seen.rotations, seen.translations, *felt)) < STILL_THRESHOLD
     return len(state) == HISTORY and held and bool((state[-1] - state[-2]).abs().max() < REST_THRESHOLD)
-
-
-def _concatenate(past: Motion, block: Motion) -> Motion:
-    rotations, translations = (
-        np.concatenate([getattr(part, name) for part in (past, block)]) for name in ("rotations", "translations")
-    )
-    return replace(block, rotations=rotations, translations=translations)
 
 
 def _advance(
@@ -112,7 +107,7 @@ def _advance(
     parameter, skeleton = next(model.parameters()), model.scene.character.skeleton
     world = motion_transforms(seen, skeleton.parents)
     features = pose_features(seen, skeleton, model.joints, world, model.config.descriptors)
-    static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
+    static, dynamic = (values[-count:] for values in motion_descriptors(features, parameter))
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     starting = min(max(0, HISTORY - start), count)

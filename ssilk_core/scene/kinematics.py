@@ -173,8 +173,7 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
         int(np.ceil(last * fps / motion.fps - 1e-6)) + 1 if cover else frames_at(motion.frame_count, motion.fps, fps)
     )
     position = np.minimum(np.arange(count) * motion.fps / fps, last)
-    rotations, translations = sample_motion(motion, position)
-    return Motion(motion.path, fps, rotations, translations)
+    return Motion(motion.path, fps, *sample_motion(motion, position), gravity=sample_gravity(motion, position))
 
 
 MIN_FPS, MAX_FPS = 0.01, 10_000  # [1/s] of motions: beyond them, time codes and frames cannot be counted
@@ -194,7 +193,8 @@ def run_up(motion: Motion, seconds: float) -> Motion:
     first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
     rotations = slerp(first.rotations, second.rotations, -away[:, None])
     translations = first.translations - away[:, None, None] * (second.translations - first.translations)
-    return Motion(motion.path, motion.fps, rotations, translations)
+    gravity = None if first.gravity is None else first.gravity.repeat(count, axis=0)
+    return Motion(motion.path, motion.fps, rotations, translations, gravity=gravity)
 
 
 CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the hub was teleported, not animated
@@ -245,6 +245,15 @@ def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
     rotations = slerp(motion.rotations[low], motion.rotations[high], t)
     translations = motion.translations[low] * (1 - t[..., None]) + motion.translations[high] * t[..., None]
     return rotations, translations
+
+
+def sample_gravity(motion: Motion, position: Floats) -> Floats | None:
+    """Return the gravity (N, 3) of a motion at fractional frames (N,); None where it is the usual one."""
+    if motion.gravity is None:
+        return None
+    low = np.minimum(position.astype(int), motion.frame_count - 1)
+    high, t = np.minimum(low + 1, motion.frame_count - 1), (position - low)[:, None]
+    return motion.gravity[low] * (1 - t) + motion.gravity[high] * t
 
 
 def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ..errors import fail
 from ..network.descriptors import pose_features
-from ..network.model.descriptors import gravity_features, turned_vectors
+from ..network.model.descriptors import gravity_features, seen_gravity, turned_vectors
 from ..network.model.feedback import BodyFrames
 from ..scene.assets import Motion, Skeleton
 from ..scene.kinematics import centred_matrices, resample, split_at_cuts
@@ -66,24 +66,25 @@ class MotionBank:
         """Return the character in the two frames before each of `frames` (N,) and in itself, F = 3."""
         return self.body(frames + torch.arange(-2, 1, device=frames.device)[:, None])
 
-    def static_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
-        """Return static descriptors (N, S) of frames (N,) under unit gravity directions (N, 3)."""
-        return torch.cat([self.static[frames], gravity_features(self.down[frames], direction)], dim=1)
+    def static_descriptor(self, frames: Tensor, gravity: Tensor) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,) under gravity and wind (N, 3) [g]."""
+        return torch.cat([self.static[frames], gravity_features(self.down[frames], seen_gravity(gravity))], dim=1)
 
-    def dynamic_descriptor(self, frames: Tensor, direction: Tensor) -> Tensor:
-        """Return dynamic descriptors (N, D) of frames (N,) under unit gravity directions (N, 3)."""
-        return self.described(self.static_descriptor(frames, direction), frames, direction)
+    def dynamic_descriptor(self, frames: Tensor, gravity: Tensor) -> Tensor:
+        """Return dynamic descriptors (N, D) of frames (N,) under gravity and wind (N, 3) [g]."""
+        return self.described(self.static_descriptor(frames, gravity), frames, gravity)
 
-    def described(self, static: Tensor, frames: Tensor, direction: Tensor, heading: Tensor | None = None) -> Tensor:
-        """Return dynamic descriptors (N, D) from static ones (N, S) of the same frames and directions.
+    def described(self, static: Tensor, frames: Tensor, gravity: Tensor, heading: Tensor | None = None) -> Tensor:
+        """Return dynamic descriptors (N, D) from static ones (N, S) of the same frames and gravity.
 
         Args:
             heading: of absolute ones, where a motion is turned (`turned_vectors`); as it is without.
         """
         dynamic = self.dynamic[frames]
         if heading is not None:
-            dynamic = turned_vectors(dynamic, direction, heading)
-        return torch.cat([static, gravity_features(self.earlier[frames], direction), dynamic], dim=1)
+            dynamic = turned_vectors(dynamic, gravity, heading)
+        earlier = gravity_features(self.earlier[frames], seen_gravity(gravity))
+        return torch.cat([static, earlier, dynamic], dim=1)
 
 
 def build_bank(

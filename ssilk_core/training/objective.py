@@ -77,10 +77,8 @@ class Objective:
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
-    def quasi_static_terms(
-        self, x: Tensor, direction: Tensor, character: Tensor, buried: Tensor | None = None
-    ) -> Terms:
-        """Return all terms but inertia and drag of positions x (V, 3, N) under gravity directions (N, 3).
+    def quasi_static_terms(self, x: Tensor, down: Tensor, character: Tensor, buried: Tensor | None = None) -> Terms:
+        """Return all terms but inertia and drag of positions x (V, 3, N) under gravity and wind (N, 3) [g].
 
         Args:
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
@@ -89,7 +87,7 @@ class Objective:
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
         planes = self._planes(sampled.detach(), character, buried)
-        gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * direction.T, sampled, *planes)
+        gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * down.T, sampled, *planes)
         if self.newton:
             self.newton.planes = planes
         terms = {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
@@ -113,11 +111,11 @@ class Objective:
     def _buried(self, frames: Tensor) -> Tensor | None:
         return None if self.buried is None else self.buried[:, frames]
 
-    def static(self, frames: Tensor, direction: Tensor) -> Terms:
+    def static(self, frames: Tensor, down: Tensor) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
-        z = self.model.initial(self.bank.static_descriptor(frames, direction))
+        z = self.model.initial(self.bank.static_descriptor(frames, down))
         character = self.bank.character(frames)
-        return self.quasi_static_terms(self._vertices(z, character, 0), direction, character, self._buried(frames))
+        return self.quasi_static_terms(self._vertices(z, character, 0), down, character, self._buried(frames))
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -125,14 +123,14 @@ class Objective:
         return self.newton.attach(x, moving) if self.newton else x
 
     def window(
-        self, sampler: WindowSampler, noise: Tensor, frames: Tensor, direction: Tensor
+        self, sampler: WindowSampler, noise: Tensor, frames: Tensor, single_down: Tensor
     ) -> tuple[Terms, Terms, Tensor]:
         """Roll one window of every slot.
 
         Args:
             sampler: frames and states of the windows.
             noise: added to the first two latents, shape (2, batch, latent).
-            frames, direction: single poses for the initialiser (M,), and their gravity directions (M, 3).
+            frames, single_down: single poses for the initialiser (M,), and their gravity and wind (M, 3) [g].
 
         Returns:
             Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
@@ -141,7 +139,7 @@ class Objective:
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
         times = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
-        down = sampler.direction.repeat(length, 1)
+        down = sampler.gravity().flatten(0, 1)
         static = bank.static_descriptor(times, down)
         heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
         pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
@@ -160,14 +158,16 @@ class Objective:
             with torch.no_grad():
                 seen = model.seen_from(before, now, bank.triples(times[2 * batch :]))
             rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        quiet = model.initial(bank.static_descriptor(frames, direction))
+        quiet = model.initial(bank.static_descriptor(frames, single_down))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
         asked = torch.cat([times[2 * batch :], frames])
         character = bank.character(asked)
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
-        terms = self.quasi_static_terms(x, torch.cat([down[2 * batch :], direction]), character, self._buried(asked))
+        terms = self.quasi_static_terms(
+            x, torch.cat([down[2 * batch :], single_down]), character, self._buried(asked)
+        )
         if self.contours:
             terms[INTERSECTION] = self.contours.energy(x)
         count = (length - 2) * batch

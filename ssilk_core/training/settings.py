@@ -28,6 +28,8 @@ class TrainConfig:
             two poses are given.
         state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
+        wind_fraction: share of windows in which an even wind pulls on the cloth beside gravity, in any direction,
+            with up to `windows.STRONGEST_PULL`; it changes now and then.
         recombinations: number of extra motions for each motion, whose limbs move as in another motion; fewer where
             all poses would be more than `training.job.MOST_POSES`.
         perturbations: likewise with joints turned at random. About half go to and fro between these poses and the
@@ -83,6 +85,7 @@ class TrainConfig:
     window: int = 6
     state_reuse: float = 0.97
     rotated_fraction: float = 0.2
+    wind_fraction: float = 0.0
     recombinations: int = 3
     perturbations: int = 1
     tumbling: float = 0.25
@@ -125,7 +128,9 @@ class TrainConfig:
         need_between(self, 1, NO_BOUND, "iterations", "batch", "pretraining_batch", "validate_every")
         need_between(self, 0 if self.initial_loss else 1, NO_BOUND, "static_batch")
         need_between(self, 3, NO_BOUND, "valid_frames")
-        need_between(self, 0, 1, "state_reuse", "rotated_fraction", "noise_correlation", "noise_probability")
+        need_between(
+            self, 0, 1, "state_reuse", "rotated_fraction", "wind_fraction", "noise_correlation", "noise_probability"
+        )
         need_between(self, 0, 1, "shape_smoothing", "tumbling")
         need_between(self, 0, MOST_OF_ALL, "static_fraction", "ema_decay")
         need_between(

@@ -24,6 +24,18 @@ def random_directions(count: int, rotated: float, generator: torch.Generator, de
     return torch.where(turned, anywhere, down)
 
 
+GUSTS = 0.1  # chance that the wind changes within a window that continues another
+STRONGEST_PULL = 4.0  # [g] drawn at random; the usual fabric feels it in a wind of 20 m/s
+
+
+def random_pulls(count: int, share: float, generator: torch.Generator, device: torch.device) -> Tensor:
+    """Return what wind adds to gravity (count, 3) [g]: in any direction, of any strength, for a share; else zero."""
+    draw = torch.randn(count, 3, generator=generator, device=device)
+    size, chance = torch.rand(2, count, 1, generator=generator, device=device)
+    pull = STRONGEST_PULL * size * draw / draw.norm(dim=1, keepdim=True).clamp_min(1e-6)
+    return torch.where(chance < share, pull, torch.zeros_like(pull))
+
+
 def random_headings(direction: Tensor, generator: torch.Generator) -> Tensor:
     """Return directions (N, 3) for `turned_vectors`: at random where gravity was turned; else x turns nothing."""
     draw = torch.randn(direction.shape, generator=generator, device=direction.device)
@@ -32,11 +44,13 @@ def random_headings(direction: Tensor, generator: torch.Generator) -> Tensor:
 
 
 class WindowSampler:
-    """Draws windows; a share of the slots continues its clip and gravity direction from the last window.
+    """Draws windows; a share of the slots continues its clip and gravity from the last window.
 
     Attributes:
         first: first frame of each slot's window, shape (batch,).
         direction: gravity direction of each slot, shape (batch, 3).
+        pull: what wind adds to gravity in the first and in the last frame of the window [g], between which it
+            changes evenly, shape (2, batch, 3); None where nothing blows.
         heading: likewise how a slot is turned about gravity, for absolute descriptors; None for relative ones.
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
@@ -59,6 +73,7 @@ class WindowSampler:
             )
         self.first = self._fresh()
         self.direction = random_directions(config.batch, config.rotated_fraction, generator, device).clone()
+        self.pull = self._pulls().repeat(2, 1, 1) if config.wind_fraction else None
         self.heading = random_headings(self.direction, generator) if bank.is_absolute else None
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
@@ -67,17 +82,31 @@ class WindowSampler:
         pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
         return self.candidates[(pick * len(self.candidates)).long().clamp_max(len(self.candidates) - 1)]
 
+    def _pulls(self) -> Tensor:
+        return random_pulls(self.config.batch, self.config.wind_fraction, self.generator, self.candidates.device)
+
+    def gravity(self) -> Tensor:
+        """Return gravity and wind in each frame of the windows [g], shape (window, batch, 3)."""
+        length = self.config.window
+        if self.pull is None:
+            return self.direction.expand(length, *self.direction.shape)
+        part = torch.linspace(0, 1, length, device=self.pull.device)[:, None, None]
+        return self.direction + torch.lerp(self.pull[0], self.pull[1], part)
+
     def poses(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw single poses from all frames: frames (count,) and gravity directions (count, 3)."""
+        """Draw single poses from all frames: frames (count,), and gravity and wind [g], shape (count, 3)."""
         bank, device = self.bank, self.candidates.device
         draw = torch.rand(count, generator=self.generator, device=device)
         frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
-        return frames, random_directions(count, self.config.rotated_fraction, self.generator, device)
+        gravity = random_directions(count, self.config.rotated_fraction, self.generator, device)
+        if self.config.wind_fraction:
+            gravity = gravity + random_pulls(count, self.config.wind_fraction, self.generator, device)
+        return frames, gravity
 
-    def with_initial(self, frames: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    def with_initial(self, frames: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
         """Return single poses (M,), (M, 3) followed by the first two of each window."""
         own = torch.cat([self.first, self.first + 1])
-        return torch.cat([frames, own]), torch.cat([direction, self.direction.repeat(2, 1)])
+        return torch.cat([frames, own]), torch.cat([gravity, self.gravity()[:2].flatten(0, 1)])
 
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
@@ -105,6 +134,11 @@ class WindowSampler:
         go_on = fits & wish & latents.isfinite().all(dim=2).all(dim=0)
         self.first.copy_(torch.where(go_on, following, chosen))
         self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
+        if self.pull is not None:
+            reached, pull = torch.lerp(*self.pull, (config.window - 2) / (config.window - 1)), self._pulls()
+            gust = torch.rand(config.batch, generator=self.generator, device=device) < GUSTS
+            first = torch.where(go_on[:, None], reached, pull)
+            self.pull.copy_(torch.stack([first, torch.where((go_on & ~gust)[:, None], self.pull[1], pull)]))
         if self.heading is not None:
             self.heading.copy_(torch.where(go_on[:, None], self.heading, random_headings(fresh, self.generator)))
         self.latents.copy_(latents.detach())
@@ -112,8 +146,8 @@ class WindowSampler:
 
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
-        names = ("first", "direction", "latents", "carried", *(() if self.heading is None else ("heading",)))
-        return {name: getattr(self, name) for name in names}
+        names = ("first", "direction", "latents", "carried", "heading", "pull")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def state(self) -> dict[str, Tensor]:
         """Return all that a resumed run needs to continue exactly, random state included."""

@@ -21,6 +21,7 @@ from .character import on_character
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
 from .rollout import BakeRollout
+from .world import asked_world, world_of
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -83,7 +84,7 @@ class LoadedGarment:
         """
         request = replace(self.request, motion=motion, range=range, handles=handles)
         read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
-        source = read.source
+        source = read.source if request.lbs else self._felt(request, read.source)
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
@@ -138,6 +139,15 @@ class LoadedGarment:
             sampled = whole.clip(begun - handles, whole.frame_count)
         hidden = read_hidden(request.motion, sampled, root=root)
         return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
+
+    def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
+        """Return a motion with the gravity and wind of its shot."""
+        from ...physics.world.felt import felt_gravity
+
+        asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
+        world = world_of(request.motion, request.stage, self.deformer.scene, motion, asked, colliders=False)
+        gravity = felt_gravity(world, motion, self.deformer.scene, self.file.fabric)
+        return motion if gravity is None else replace(motion, gravity=gravity)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""

@@ -260,4 +260,7 @@ def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:
     rotations = slerp(motion.rotations[low], motion.rotations[high], part)
     step = motion.translations[high] - motion.translations[low]
     translations = motion.translations[low] + part[..., None] * step
-    return Motion(motion.path, motion.fps, rotations, translations, motion.start + first - whole)
+    start, gravity = motion.start + first - whole, motion.gravity
+    if gravity is not None:
+        gravity = gravity[low] + part[:, 0] * (gravity[high] - gravity[low])
+    return Motion(motion.path, motion.fps, rotations, translations, start, gravity)

@@ -51,13 +51,21 @@ def parse_world(
 
 
 def world_of(
-    source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter = silent
+    source: str,
+    stage: str,
+    scene: Scene,
+    motion: Motion,
+    asked: AskedWorld | None,
+    report: Reporter = silent,
+    *,
+    colliders: bool = True,
 ) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
     from ssilk_usd.reading.world import read_world
 
     garment = split_location(scene.garment.mesh.path)[1]
-    return read_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
+    found = scene.character, motion, asked
+    return read_world(source, stage, *found, garment=garment, colliders=colliders, report=report)
 
 
 def unseen(source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter) -> str:

@@ -89,7 +89,7 @@ class LatentRoller:
         lead, played = 0, span
         if self.pre_roll:
             before = run_up(span, self.pre_roll)
-            lead, played = before.frame_count, _joined(before, span)
+            lead, played = before.frame_count, span.after(before)
         frames = self._solved(played)
         for _ in islice(frames, lead):
             pass
@@ -106,10 +106,3 @@ class LatentRoller:
     def _block(self, start: int, frames: list[LatentFrame]) -> RolloutBlock:
         z = torch.cat([frame.solution.z for frame in frames]).to(next(self.model.parameters()).dtype)
         return RolloutBlock(start, *self.model.pose(z), torch.cat([frame.lost for frame in frames]))
-
-
-def _joined(before: Motion, span: Motion) -> Motion:
-    rotations, translations = (
-        np.concatenate([getattr(part, name) for part in (before, span)]) for name in ("rotations", "translations")
-    )
-    return Motion(span.path, span.fps, rotations, translations, span.start - before.frame_count)

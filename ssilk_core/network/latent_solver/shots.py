@@ -9,7 +9,7 @@ replaced by the network's quasi-static one for `RECOVERY_FRAMES` frames; the sho
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,12 +19,13 @@ from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
 from ...physics.simulate.cubature import spread_evenly
+from ...physics.simulate.incremental_potential import StepInputs
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import motion_transforms
 from ..descriptors import pose_features
-from ..model.descriptors import upright_descriptors
+from ..model.descriptors import motion_descriptors
 from ..model.feedback import BodyFrames, DecodedState
 from ..model.network import GarmentModel
 from ..settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
@@ -160,7 +161,10 @@ class LatentShots:
         for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(simulator, motions))):
             running = motions[: len(seen.rest)]
             past = past and past.first(len(running))
-            frame, past = self._advance(simulator, solver, number, past, poses, seen)
+            inputs = simulator.inputs(poses, past.cloth if past else None)
+            if any(motion.gravity is not None for motion in running):
+                inputs = replace(inputs, gravity=_gravity(running, number, inputs.gravity))
+            frame, past = self._advance(inputs, solver, number, past, poses, seen)
             yield frame
 
     def _poses(self, simulator: Simulator, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
@@ -200,7 +204,7 @@ class LatentShots:
         count = min(stop, motion.frame_count) - start
         skeleton, kind = model.scene.character.skeleton, model.config.descriptors
         features = pose_features(seen, skeleton, model.joints, kind=kind)
-        static, dynamic = (values[-count:] for values in upright_descriptors(features, parameter))
+        static, dynamic = (values[-count:] for values in motion_descriptors(features, parameter))
         rest = model.initial(static)
         sound = rest.abs().amax(dim=1, keepdim=True) < DIVERGENCE_BOUND  # NaN is not less than anything
         rest = torch.where(sound, rest, torch.zeros_like(rest))
@@ -208,7 +212,7 @@ class LatentShots:
 
     def _advance(
         self,
-        simulator: Simulator,
+        inputs: StepInputs,
         solver: LatentSolver,
         number: int,
         past: _Past | None,
@@ -217,7 +221,6 @@ class LatentShots:
     ) -> tuple[LatentFrame, _Past]:
         """Return a frame, and the states for the next one."""
         rest = seen.rest.to(solver.potential.dtype)
-        inputs = simulator.inputs(poses, past.cloth if past else None)
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
         else:
@@ -235,3 +238,12 @@ class LatentShots:
         before, earlier, root = (past.now, past.course[1], past.roots[1]) if past else (found.z, now, poses.root)
         roots, recovering = torch.stack([root, poses.root]), (recovering - 1).clamp_min(0)
         return LatentFrame(number, found, lost), _Past(before, found.z, (earlier, now), cloth, roots, recovering)
+
+
+def _gravity(motions: Sequence[Motion], frame: int, usual: Tensor) -> Tensor:
+    """Return what the cloth of each motion feels in a frame [m/s2], shape (3, N); as in `usual` where it says none."""
+    found = usual.clone()
+    for number, motion in enumerate(motions):
+        if motion.gravity is not None:
+            found[:, number] = torch.as_tensor(motion.gravity[frame].copy()).to(found)
+    return found

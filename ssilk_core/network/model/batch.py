@@ -13,7 +13,7 @@ from ...errors import fail
 from ...scene.assets import Motion
 from ...scene.kinematics import motion_transforms, split_at_cuts
 from ..descriptors import pose_features
-from .descriptors import upright_descriptors
+from .descriptors import motion_descriptors
 from .feedback import BodyFrames
 from .network import GarmentModel
 
@@ -67,7 +67,7 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, model.joints, world, model.config.descriptors)
     body = BodyFrames.of(world, skeleton, parameter)
-    static, pose = upright_descriptors(features, parameter)
+    static, pose = motion_descriptors(features, parameter)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
     origins = torch.as_tensor(world[:, skeleton.hub, :3, 3].copy()).to(parameter.device)
     return model.initial(static), pose, body.matrices[..., 0], body.bend[..., 0], origins, begins

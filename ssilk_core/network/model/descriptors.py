@@ -12,15 +12,16 @@ from ..descriptors import VECTORS, PoseFeatures
 DOWN = (0.0, -1.0, 0.0)  # where gravity points, but in training
 
 
-def upright_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return static descriptors (F, S) and dynamic ones (F, D) of frames under gravity along -y, as `like` is."""
+def motion_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Return static descriptors (F, S) and dynamic ones (F, D) of frames under their own gravity, as `like` is."""
 
     def tensor(values: Floats) -> Tensor:
         return torch.as_tensor(values).to(like)
 
-    direction = like.new_tensor(DOWN).expand(len(features.static), 3)
-    static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), direction)], dim=1)
-    earlier = gravity_features(tensor(features.earlier), direction)
+    usual = features.gravity is None
+    gravity = like.new_tensor(DOWN).expand(len(features.static), 3) if usual else tensor(features.gravity)
+    static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), gravity)], dim=1)
+    earlier = gravity_features(tensor(features.earlier), gravity)
     return static, torch.cat([static, earlier, tensor(features.dynamic)], dim=1)
 
 
@@ -28,9 +29,10 @@ def turned_vectors(dynamic: Tensor, direction: Tensor, heading: Tensor) -> Tenso
     """Return absolute features (N, D) of the motion turned as a whole about the origin of the world.
 
     Args:
-        direction: unit gravity directions (N, 3), which the rotation turns to -y.
+        direction: of gravity (N, 3), which the rotation turns to -y.
         heading: directions (N, 3), whose part across gravity it turns to x.
     """
+    direction = torch.nn.functional.normalize(direction, dim=1)
     across = heading - (heading * direction).sum(1, keepdim=True) * direction
     x, y = torch.nn.functional.normalize(across, dim=1), -direction
     rotation = torch.stack([x, y, torch.linalg.cross(x, y, dim=1)], dim=1)
@@ -38,6 +40,12 @@ def turned_vectors(dynamic: Tensor, direction: Tensor, heading: Tensor) -> Tenso
     return torch.cat([dynamic[:, : -3 * VECTORS], (vectors @ rotation.mT).flatten(1)], dim=1)
 
 
-def gravity_features(down: Tensor, direction: Tensor) -> Tensor:
-    """Return gravity's unit direction in each joint's frame: down (N, J', 3, 3), direction (N, 3), to (N, 3 J')."""
-    return torch.einsum("njab,nb->nja", down, direction).flatten(1)
+def gravity_features(down: Tensor, gravity: Tensor) -> Tensor:
+    """Return gravity in each joint's frame: down (N, J', 3, 3), gravity as seen (N, 3), to (N, 3 J')."""
+    return torch.einsum("njab,nb->nja", down, gravity).flatten(1)
+
+
+def seen_gravity(units: Tensor) -> Tensor:
+    """Return `network.descriptors.seen_gravity` of accelerations (N, 3) in units of the usual gravity."""
+    length = torch.linalg.vector_norm(units, dim=1, keepdim=True).clamp_min(1.0)
+    return units * ((1 + length.log()) / length)

@@ -53,7 +53,7 @@ class CharacterFrames:
 def character_frames(
     motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0, kind: str = "relative"
 ) -> CharacterFrames:
-    """Return descriptors and skinning matrices of a motion at the model's rate, with gravity along -y.
+    """Return descriptors and skinning matrices of a motion at the model's rate.
 
     Args:
         lookback: number of first frames, at most two, that only serve what looks back, and are none of the F frames.
@@ -61,12 +61,18 @@ def character_frames(
     """
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, joints, world, kind)
-    down, earlier = (-values[..., 1].reshape(len(values), -1) for values in (features.down, features.earlier))
+    down, earlier = (_into(values, features.gravity) for values in (features.down, features.earlier))
     static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
     rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback
     matrices, origins = _about_root(world[np.maximum(np.arange(-missing, len(world)), 0)], skeleton)
     return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins)
+
+
+def _into(frames: Floats, gravity: Floats | None) -> Floats:
+    """Return gravity as seen (F, 3) in frames (F, J, 3, 3), shape (F, 3 J); along -y by default."""
+    found = -frames[..., 1] if gravity is None else (frames @ gravity[:, None, :, None])[..., 0]
+    return found.reshape(len(frames), -1)
 
 
 def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:

@@ -118,7 +118,4 @@ def roll_span(player: NumpyGarment, span: Motion, block: int, pre_roll: float) -
     if not pre_roll:
         return RolledSpan(player, span, block, 0)
     before = run_up(span, max(pre_roll, HISTORY / span.fps))
-    rotations, translations = (
-        np.concatenate([getattr(part, name) for part in (before, span)]) for name in ("rotations", "translations")
-    )
-    return RolledSpan(player, Motion(span.path, span.fps, rotations, translations), block, before.frame_count)
+    return RolledSpan(player, span.after(before), block, before.frame_count)

@@ -116,7 +116,6 @@ class PosedSurface:
         self.surface, self.points = surface, np.ascontiguousarray(points)
         self._tree = igl.AABB()
         self._tree.init(self.points, np.ascontiguousarray(surface.faces))
-        self.low, self.high = points[surface.faces].min(axis=(0, 1)), points[surface.faces].max(axis=(0, 1))
 
     @cached_property
     def _normals(self) -> tuple[Floats, Floats, Floats]:

@@ -21,6 +21,7 @@ class Motion:
         rotations: local joint rotations, unit quaternions (w, x, y, z), shape (F, J, 4).
         translations: local joint translations [m], shape (F, J, 3); roots are in world space.
         start: index of the first frame, counted from time zero at `fps`; it begins at `start / fps` seconds.
+        gravity: acceleration that cloth feels, wind included [m/s2], shape (F, 3); None for the usual one.
     """
 
     path: str
@@ -28,6 +29,7 @@ class Motion:
     rotations: Floats
     translations: Floats
     start: float = 0.0
+    gravity: Floats | None = None
 
     def __post_init__(self) -> None:
         rotations, translations = frozen(self.rotations, np.float64), frozen(self.translations, np.float64)
@@ -47,6 +49,12 @@ class Motion:
         if not norms.min() > 1e-6:
             fail(self.path, "a rotation is the zero quaternion", "rotations are unit quaternions")
         assign(self, rotations=frozen(rotations / norms, np.float64), translations=translations)
+        if self.gravity is not None:
+            gravity = frozen(self.gravity, np.float64)
+            if gravity.shape != (len(rotations), 3):
+                fail(self.path, f"gravity of shape {gravity.shape}", f"({len(rotations)}, 3) is needed")
+            need_finite(gravity, self.path, "frames of gravity")
+            assign(self, gravity=gravity)
 
     @property
     def frame_count(self) -> int:
@@ -59,4 +67,18 @@ class Motion:
             rotations=self.rotations[start:stop],
             translations=self.translations[start:stop],
             start=self.start + start,
+            gravity=None if self.gravity is None else self.gravity[start:stop],
+        )
+
+    def after(self, before: Motion) -> Motion:
+        """Return the frames of another motion, which feels gravity as this one does or not, followed by these."""
+        gravity = self.gravity
+        if gravity is not None and before.gravity is not None:
+            gravity = np.concatenate([before.gravity, gravity])
+        return replace(
+            self,
+            rotations=np.concatenate([before.rotations, self.rotations]),
+            translations=np.concatenate([before.translations, self.translations]),
+            start=self.start - before.frame_count,
+            gravity=gravity,
         )

@@ -15,7 +15,7 @@ from ssilk_core.network.checkpoint import load_model, model_file, save_model
 from ssilk_core.network.descriptors import pose_features, six_d
 from ssilk_core.network.feedback import feedback_size
 from ssilk_core.network.model.batch import BatchPlayer, motion_inputs
-from ssilk_core.network.model.descriptors import turned_vectors, upright_descriptors
+from ssilk_core.network.model.descriptors import turned_vectors, motion_descriptors
 from ssilk_core.network.model.export import export_onnx
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import descriptor_sizes, parameter_shapes
@@ -203,12 +203,12 @@ def test_turning_a_motion_is_turning_gravity_and_what_is_seen_of_the_world(scene
     skeleton, joints, motion = scene.character.skeleton, np.arange(3), toy_motion(scene, 9)
     turn = Rotation.random(random_state=seed).as_matrix()
     features = pose_features(motion, skeleton, joints, kind="absolute")
-    there = upright_descriptors(pose_features(moved(motion, turn), skeleton, joints, kind="absolute"), torch.zeros(1))
+    there = motion_descriptors(pose_features(moved(motion, turn), skeleton, joints, kind="absolute"), torch.zeros(1))
     direction = torch.tensor(np.tile(turn.T @ [0.0, -1, 0], (9, 1)))
     heading = torch.tensor(np.tile(turn.T @ [1.0, 0, 0], (9, 1)))
     found = turned_vectors(torch.tensor(features.dynamic), direction, 3 * heading + 0.7 * direction)
     torch.testing.assert_close(found.float(), there[1][:, -found.shape[1] :], rtol=1e-4, atol=1e-5)
-    here = upright_descriptors(features, torch.zeros(1))[1][:, -found.shape[1] :]
+    here = motion_descriptors(features, torch.zeros(1))[1][:, -found.shape[1] :]
     assert (found - here)[:, -27:].abs().max() > 0.1
 
 

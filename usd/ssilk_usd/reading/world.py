@@ -97,6 +97,7 @@ def find_world(
     asked: AskedWorld | None = None,
     *,
     garment: str | None = None,
+    colliders: bool = True,
     report: Reporter = silent,
 ) -> FoundWorld:
     """Return what surrounds a character at each frame of its motion.
@@ -107,6 +108,7 @@ def find_world(
         source: of the motion, "file[:/Prim/Path]".
         stage: the character's file.
         garment: path or name of the garment in it that is not marked as one.
+        colliders: whether they are looked for, and not gravity and wind alone.
 
     Raises:
         SsilkError: a named collider is none, several PhysicsScenes say different things, or a value is out of range.
@@ -118,7 +120,8 @@ def find_world(
     _, placed = find_animation(shot, prim, None)
     stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
-    there, prims = _colliding(stages, asked.colliders, (character, placed, garment))
+    own = character, placed, garment
+    there, prims = _colliding(stages, asked.colliders, own) if colliders else (home, [])
     codes = seconds * there.GetTimeCodesPerSecond()
     met = met_prims(prims, codes, report)
     scene = next((found for found in map(_scene, stages) if found), None)
@@ -142,6 +145,7 @@ def read_world(
     asked: AskedWorld | None = None,
     *,
     garment: str | None = None,
+    colliders: bool = True,
     report: Reporter = silent,
 ) -> ShotWorld | None:
     """Return what surrounds a character at each frame of its motion; None where nothing does.
@@ -151,7 +155,8 @@ def read_world(
     Raises:
         SsilkError: as `find_world` and `FoundWorld.read` do.
     """
-    return find_world(source, stage, character, motion, asked, garment=garment, report=report).read(report)
+    found = find_world(source, stage, character, motion, asked, garment=garment, colliders=colliders, report=report)
+    return found.read(report)
 
 
 def _colliding(
