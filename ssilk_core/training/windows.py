@@ -135,7 +135,7 @@ class WindowSampler:
         self.first.copy_(torch.where(go_on, following, chosen))
         self.direction.copy_(torch.where(go_on[:, None], self.direction, fresh))
         if self.pull is not None:
-            reached, pull = torch.lerp(*self.pull, (config.window - 2) / (config.window - 1)), self._pulls()
+            reached, pull = torch.lerp(self.pull[0], self.pull[1], 1 - 1 / (config.window - 1)), self._pulls()
             gust = torch.rand(config.batch, generator=self.generator, device=device) < GUSTS
             first = torch.where(go_on[:, None], reached, pull)
             self.pull.copy_(torch.stack([first, torch.where((go_on & ~gust)[:, None], self.pull[1], pull)]))

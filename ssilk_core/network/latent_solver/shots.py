@@ -241,7 +241,7 @@ class LatentShots:
 
 
 def _gravity(motions: Sequence[Motion], frame: int, usual: Tensor) -> Tensor:
-    """Return what the cloth of each motion feels in a frame [m/s2], shape (3, N); as in `usual` where it says none."""
+    """Return what the cloth of each motion feels in a frame [m/s2], shape (3, N); that of `usual` by default."""
     found = usual.clone()
     for number, motion in enumerate(motions):
         if motion.gravity is not None:

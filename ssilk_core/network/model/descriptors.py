@@ -18,8 +18,9 @@ def motion_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, Te
     def tensor(values: Floats) -> Tensor:
         return torch.as_tensor(values).to(like)
 
-    usual = features.gravity is None
-    gravity = like.new_tensor(DOWN).expand(len(features.static), 3) if usual else tensor(features.gravity)
+    gravity = like.new_tensor(DOWN).expand(len(features.static), 3)
+    if features.gravity is not None:
+        gravity = tensor(features.gravity)
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), gravity)], dim=1)
     earlier = gravity_features(tensor(features.earlier), gravity)
     return static, torch.cat([static, earlier, tensor(features.dynamic)], dim=1)
