@@ -46,8 +46,8 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         return rollout
     if not rollout.request.refine:
         if not rollout.request.lbs:
-            known = {"sight": rollout.sight, "drag": rollout.fabric.drag}
-            if missed := unseen(*_surrounded(rollout), report, **known):
+            missed = unseen(*_surrounded(rollout), report, sight=rollout.sight, drag=rollout.fabric.drag)
+            if missed:
                 report(Message(f"{rollout.request.motion}: {missed}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
