@@ -25,6 +25,7 @@ from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.shapes import tell_changing_shapes
 from ..motions.sources import TIMELINE, Source
+from ..motions.world import world_over
 from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
@@ -209,7 +210,9 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         yield from loading_usd()
         from ssilk_usd.writing.files import write_motion
 
-        write_motion(self.work.folder / MOTION, self.take.motion(self.character), self.character.skeleton(ROOT))
+        motion = self.take.motion(self.character)
+        world = world_over(bpy.context.scene, self.take.frames, motion.fps)
+        write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
         stage = self.model.parent / STAGE
         self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
 
