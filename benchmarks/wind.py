@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the network follows wind: the hem beside the simulator's in even winds, and a picture of cape and gusts.
+
+    python benchmarks/wind.py hem --motion FOLDER/02_01.usdc --simulation winds.npz --device cuda
+    python benchmarks/wind.py look --motion FOLDER/02_01.usdc --wind 0,0,-4 --gusts 3 --simulation gusts.npz -o s.png
+
+`hem` plays the first --frames of a motion in still air that moves along, and in winds from ahead, from behind and
+from one side, in the world's axes, at each speed. The wind blows from the first frame on, in which the garment is at
+rest in it. Told are how far the lowest tenth of the loose vertices is moved by it on average, in the simulator and in
+the network, and by what share of the simulator's mean displacement the network's differs from it, as vectors.
+`look` draws network and simulator side by side. --simulation is read, or written where there is no such file, so that
+a GPU can write it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from helpers.pictures import PlayedShot, posed_body
+from helpers.reports import table
+from helpers.subjects import Subject, open_subject
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.stages import demo_body_path
+
+from ssilk_core.delivery.bake.world import parse_world
+from ssilk_core.delivery.view.shots import Look, film_of_shots, sheet_of_shots
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.errors import fail
+from ssilk_core.events import Reporter, TextReporter
+from ssilk_core.files import replacing
+from ssilk_core.network.runtime import Player
+from ssilk_core.physics.simulate import SimulationOptions, simulate
+from ssilk_core.physics.world.felt import felt_gravity
+from ssilk_core.quality.evaluation.methods import CachedPoints, build_take_set
+from ssilk_core.quality.evaluation.takes import takes_of
+from ssilk_core.scene.assets import LOOSE, Air, Floats, Motion, ShotWorld
+from ssilk_core.scene.kinematics import resample
+
+SIDES = {"ahead": (0.0, 0.0, -1.0), "behind": (0.0, 0.0, 1.0), "side": (1.0, 0.0, 0.0)}
+HEM = 0.1  # of the loose vertices
+
+
+def simulated(
+    path: Path, subject: Subject, motion: Motion, worlds: Sequence[ShotWorld | None], report: Reporter
+) -> Floats:
+    """Return the simulator's positions in each world, (W, F, V, 3) [m], from a file or into it."""
+    if not path.is_file():
+        options, count = SimulationOptions(fps=motion.fps), len(worlds)
+        found = simulate(
+            subject.scene, subject.file.fabric, [motion] * count, options, worlds=worlds, device=subject.device,
+            report=report,
+        )  # fmt: skip
+        with replacing(path) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, points=np.stack(found).astype(np.float32))
+    points = np.load(path, allow_pickle=False)["points"].astype(np.float64)
+    wanted = len(worlds), motion.frame_count, subject.scene.garment.mesh.vertex_count, 3
+    if points.shape != wanted:
+        fail(str(path), f"positions of the shape {points.shape}", f"these winds have {wanted}", "name another file")
+    return points
+
+
+def played(subject: Subject, motion: Motion, world: ShotWorld | None) -> Floats:
+    """Return the network's positions in a world [m], shape (F, V, 3)."""
+    felt = felt_gravity(world, motion, subject.scene, subject.file.fabric)
+    playback = Player(subject.file).play(replace(motion, gravity=felt))
+    return np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+
+
+def hem(options: argparse.Namespace, subject: Subject, motion: Motion, report: Reporter) -> None:
+    """Print how far each wind moves the hem."""
+    loose = np.flatnonzero(subject.scene.classes == LOOSE)
+    lowest = loose[np.argsort(subject.scene.garment.mesh.points[loose, 1])[: round(HEM * len(loose))]]
+    winds = [(speed, side) for speed in options.speeds for side in SIDES]
+    blown = [Air(speed * np.array([SIDES[side]]), np.zeros(1)) for speed, side in winds]
+    worlds = [None, *(ShotWorld(motion.fps, air=air) for air in blown)]
+    still, *solved = simulated(options.simulation, subject, motion, worlds, report)
+    calm, rows = played(subject, motion, None), []
+    for (speed, side), world, points in zip(winds, worlds[1:], solved):
+        wanted, found = (points - still)[:, lowest], (played(subject, motion, world) - calm)[:, lowest]
+        apart = np.linalg.norm(found.mean((0, 1)) - wanted.mean((0, 1))) / np.linalg.norm(wanted.mean((0, 1)))
+        sizes = (f"{np.linalg.norm(each, axis=-1).mean():.2f}" for each in (wanted, found))
+        rows.append([f"{speed:g}", side, *sizes, f"{100 * apart:.0f}"])
+    print(table(["wind [m/s]", "from", "simulator [m]", "network [m]", "apart [%]"], rows))
+
+
+def look(options: argparse.Namespace, subject: Subject, motion: Motion, report: Reporter) -> None:
+    """Draw network and simulator side by side in one wind."""
+    wind, gusts, _ = parse_world(options.wind, options.gusts, None)
+    speed, size, seed = gusts or (0.0, 2.0, 0)
+    air = Air(np.array([wind or (0.0, 0.0, 0.0)]), np.array([speed]), length=size, seed=seed)
+    world = ShotWorld(motion.fps, air=air)
+    solved = simulated(options.simulation, subject, motion, [world], report)[0]
+    rows = {
+        "simulator": solved,
+        "network": played(subject, motion, world),
+        "network, no wind": played(subject, motion, None),
+    }
+    takes = takes_of(Path(motion.path).stem, motion, subject.scene.character.skeleton, motion.fps)
+    plain, body, shots = (
+        build_take_set(takes, subject.dressed, subject.model.joints),
+        posed_body(subject.dressed, motion),
+        [],
+    )
+    for name, points in rows.items():
+        read = CachedPoints(
+            lambda _, frames, points=points: points[frames.start : frames.stop], subject.dressed, plain
+        )
+        shots.append(PlayedShot(name, subject.dressed, plain, read, body))
+    drawn = Look(*options.size, options.azimuth, workers=2)
+    if options.output:
+        sheet_of_shots(options.output, shots, labels=list(rows), columns=6, frames=None, look=drawn, report=report)
+    if options.film:
+        film_of_shots(options.film, shots, labels=list(rows), look=drawn, report=report)
+
+
+def main() -> None:
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("what", choices=["hem", "look"])
+    found.add_argument("--model", type=Path, default=shipped_path("cape"), metavar="FILE")
+    found.add_argument("--stage", type=Path, default=demo_body_path(), help="USD file with the character")
+    found.add_argument("--motion", type=Path, required=True, help="a motion file")
+    found.add_argument("--frames", type=int, default=40, help="of the motion, at the model's rate (default 40)")
+    found.add_argument("--speeds", type=float, nargs="+", default=[2, 5, 10, 20], help="[m/s] (default 2 5 10 20)")
+    found.add_argument("--wind", help="X,Y,Z [m/s] in the world, y up")
+    found.add_argument("--gusts", help="RMS[,SIZE[,SEED]]")
+    found.add_argument("--simulation", type=Path, required=True, metavar="NPZ", help="positions, read or written")
+    found.add_argument("-o", "--output", type=Path, metavar="PNG", help="sheet to write")
+    found.add_argument("--film", type=Path, metavar="MP4", help="film to write")
+    found.add_argument("--azimuth", type=float, default=150.0, help="of the camera [degrees] (default 150)")
+    found.add_argument(
+        "--size", type=int, nargs=2, default=(240, 300), metavar=("W", "H"), help="of a panel [pixels]"
+    )
+    found.add_argument("--device", default="cpu", help="where the simulator runs (default cpu)")
+    options = found.parse_args()
+    torch.set_num_threads(2)
+    subject = open_subject(options.model, options.stage, options.device)
+    motion = resample(read_motion(options.motion, subject.scene.character.skeleton), subject.file.config.fps)
+    task = hem if options.what == "hem" else look
+    task(options, subject, motion.clip(0, options.frames), TextReporter())
+
+
+if __name__ == "__main__":
+    main()
