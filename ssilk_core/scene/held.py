@@ -36,10 +36,10 @@ class HeldGarment:
     """
 
     def __init__(self, deformer: Deformer) -> None:
-        scene, count = deformer.scene, deformer.shape_count
+        scene = deformer.scene
         self.deformer, self.places = deformer, ProxyAxes.of(scene).places
         self.joints, self.proxies = scene.character.skeleton.joint_count, scene.rig.proxy_count
-        self.weights = np.where(np.arange(count) == count - 1, 1.0, 0.5)  # the last one recentres all others
+        self.weights = _nearest_to_rest(deformer.shapes)
         self._rest = local_transforms(scene.bind_transforms, scene.parents)[self.joints :]
         rows = np.random.default_rng(0).permutation(scene.garment.mesh.vertex_count)[:SAMPLE]
         self._rows = np.sort(rows)
@@ -97,6 +97,20 @@ class HeldGarment:
         weights = held.weights + part * (free.weights - held.weights)
         moved = start + part[..., None] * (end - start)
         return GarmentPose(free.start, slerp(held.rotations, free.rotations, part), weights, moved)
+
+
+def _nearest_to_rest(shapes: Floats) -> Floats:
+    """Return weights in [0, 1] of shapes (K, V, 3) that leave about the rest shape; the last one is constant.
+
+    It recentres all others, and only in models that were cut down to another shape than that at rest.
+    """
+    count = len(shapes)
+    if not count:
+        return np.zeros(0)
+    flat = shapes.reshape(count, -1)
+    middle = 0.5 * flat[:-1].sum(axis=0) + flat[-1]
+    change = np.linalg.lstsq(flat[:-1].T, -middle, rcond=1e-6)[0]
+    return np.append((0.5 + change).clip(0, 1), 1.0)
 
 
 def _moved(motion: tuple[Floats, Floats], points: Floats) -> Floats:

@@ -277,7 +277,7 @@ class BakeRollout:
         tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
         if self.held_off:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
-            text = f"in {len(self.held_off)} frames the garment is held or let go; proxies hold it within"
+            text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
             report(Message(f"{self.request.motion}: {text} {off:.2g} mm (RMS) of linear blend skinning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
