@@ -81,6 +81,8 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
+        layout.prop(context.object.ssilk, "free")
+        layout.prop(context.object.ssilk, "hold")
         layout.operator("ssilk.bake", icon="REC")
         draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")
