@@ -128,7 +128,8 @@ def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Itera
 def _solved_frames(played: BakeRollout, first: int, stop: int, report: Reporter) -> Iterator[_Frame]:
     """Yield frames that the solver refines, from its start in the first of them on."""
     source, stage, scene, motion, asked = _surrounded(played)
-    part = motion.clip(first, stop)
+    # What is cut out is normalised again, which changes its last digits.
+    part = motion if stop - first == motion.frame_count else motion.clip(first, stop)
     world = world_of(source, stage, scene, part, asked, report)
     network = islice(played.network_vertices(), first, stop)
     for frame in _refiner(played).frames(part, network, world):
