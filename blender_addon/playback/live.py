@@ -101,7 +101,10 @@ class Live:
     @property
     def behind(self) -> bool:
         """Whether the scene's frames, its rate, or how the garment is held are others by now than was read."""
-        return self.times != self._asked()
+        try:
+            return self.times != self._asked()
+        except SetupError:  # it was deleted, which is told where it is shown
+            return False
 
     def _asked(self) -> tuple[object, ...]:
         """Return what the garment is played over and how, besides what keys say."""
