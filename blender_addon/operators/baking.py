@@ -27,6 +27,7 @@ from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.shapes import tell_changing_shapes
 from ..motions.sources import TIMELINE, Source
+from ..motions.world import world_over
 from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
@@ -215,12 +216,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         yield from loading_usd()
         from ssilk_usd.writing.files import write_direction, write_motion
 
-        motion = self.work.folder / MOTION
-        write_motion(motion, self.take.motion(self.character), self.character.skeleton(ROOT))
+        motion = self.take.motion(self.character)
+        world = world_over(bpy.context.scene, self.take.frames, motion.fps)
+        write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
         garment, _ = self.pair.objects()
         free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
         if hold > 1 or (free < 1).any():
-            write_direction(motion, self.prim, free, self.take.frames.start, hold)
+            write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold)
         stage = self.model.parent / STAGE
         self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
 

@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.runtime import Player
+from ssilk_core.scene.kinematics import hub_places
 
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
 
@@ -78,9 +84,9 @@ def test_a_file_is_simulated_again_where_the_wind_is_another(stage, capsys):
 
 
 def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
-    assert main([*BAKE, "floored.usda", "-o", "network.usdc", "--wind", "1,0,0"]) == 0
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
     told = capsys.readouterr().err
-    assert "the network does not see colliders and wind: it plays as in empty, still air; --refine N or" in told
+    assert "the network does not see colliders: it plays without; --refine N or" in told
     assert main([*BAKE, "plain.usda", "-o", "plain_network.usdc"]) == 0
     assert "does not see" not in capsys.readouterr().err
     np.testing.assert_array_equal(points_of("network.usdc"), points_of("plain_network.usdc"))
@@ -93,6 +99,35 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
     assert "does not see" not in capsys.readouterr().err
+
+
+def test_the_network_feels_wind_and_gravity_as_the_player_does(stage, capsys):
+    clip = Usd.Stage.Open("plain.usda")
+    scene = UsdPhysics.Scene.Define(clip, "/Physics")
+    scene.CreateGravityDirectionAttr(Gf.Vec3f(1, -1, 0))
+    clip.GetRootLayer().Save()
+    assert main([*BAKE, "plain.usda", "-o", "blown.usdc", "--wind", "0,0,4"]) == 0
+    told = capsys.readouterr().err
+    assert "does not see" not in told and "was trained in still air" in told
+    player = Player.load("model.safetensors")
+    motion = read_motion("plain.usda", player.skeleton)
+    fabric = player.file.fabric
+    felt = 9.81 * np.array([1, -1, 0]) / np.sqrt(2) + fabric.drag / fabric.density * np.array([0, 0, 4.0])
+    hub = hub_places(player.skeleton, motion.rotations, motion.translations)
+    steps = np.diff(hub, axis=0) * motion.fps
+    pulled = felt - fabric.drag / fabric.density * np.concatenate([steps[:1], steps])
+    playback = player.play(replace(motion, gravity=pulled))
+    expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+    np.testing.assert_allclose(points_of("blown.usdc"), expected, atol=1e-5)
+    assert main(["verify", "blown.usdc"]) == 0
+
+
+def test_a_network_that_was_trained_in_wind_says_nothing_of_it(stage, capsys):
+    file = load_model("model.safetensors")
+    train = {**file.provenance.get("train", {}), "wind_fraction": 0.25}
+    save_model("model.safetensors", replace(file, provenance={**file.provenance, "train": train}))
+    assert main([*BAKE, "plain.usda", "-o", "blown.usdc", "--wind", "0,0,4"]) == 0
+    assert "network" not in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("more", [["--refine", "30"], ["--refine", "30", "--feedback"]], ids=["refine", "feedback"])

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel, Vt
 from ssilk_usd.reading import colliders
+from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.posed import SkinnedMesh, skinning_of
 from ssilk_usd.reading.world import AskedWorld, find_world, read_world
+from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.scene.assets import Body, Character, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
+from ssilk_core.scene.assets import Air, Body, Character, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
 
 FPS, FRAMES, FIRST = 25.0, 5, 10
 TO_CORE = {"Y": np.eye(3), "Z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
@@ -273,6 +275,22 @@ def test_wind_is_an_attribute_of_the_physics_scene_over_time(stage):
     asked = read(stage, wind=(0.0, -1.0, 0.0), gusts=(2.0, 3.0, 9)).air
     np.testing.assert_allclose(asked.velocity, [[0, 0, 1]])
     assert (asked.gusts, asked.length, asked.seed) == (2, 3, 9)
+
+
+@pytest.mark.parametrize("keyed", [False, True])
+def test_a_motion_is_written_with_its_gravity_and_wind(tmp_path, keyed):
+    many = FRAMES if keyed else 1
+    rng = np.random.default_rng(1)
+    pull, blown = rng.normal(size=(many, 3)) * 10, rng.normal(size=(many, 3)) * 5
+    world = ShotWorld(motion().fps, gravity=pull, air=Air(blown, np.abs(blown[:, 0]), length=1.25, seed=3))
+    path, skeleton = tmp_path / "clip.usdc", character().skeleton
+    write_motion(path, motion(), skeleton, world)
+    again = read_motion(str(path), skeleton)
+    found = read_world(str(path), str(path), character(), again)
+    np.testing.assert_allclose(found.gravity, pull, atol=1e-5)
+    np.testing.assert_allclose(found.air.velocity, blown, atol=1e-5)
+    np.testing.assert_allclose(found.air.gusts, np.abs(blown[:, 0]), atol=1e-5)
+    assert (found.air.length, found.air.seed) == (1.25, 3)
 
 
 def test_the_stage_of_the_character_gives_what_the_shot_lacks(stage, tmp_path):

@@ -23,7 +23,7 @@ from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
 from .rollout import BakeRollout
-from .world import asked_world, world_of
+from .world import Sight, asked_world, world_of
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -111,6 +111,7 @@ class LoadedGarment:
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
+            sight=Sight.of(self.file),
             reduction=reduction,
             direction=None if request.lbs else self._directed(request, read),
         )
@@ -144,7 +145,9 @@ class LoadedGarment:
         return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
 
     def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
-        """Return a motion with the gravity and wind of its shot."""
+        """Return a motion with the gravity and wind of its shot, where the network sees them."""
+        if not Sight.of(self.file).pull:
+            return motion
         from ...physics.world.felt import felt_gravity
 
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)

@@ -47,8 +47,10 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     if rollout.refinement is not None:
         return rollout
     if not rollout.request.refine:
-        if not rollout.request.lbs and (missed := unseen(*_surrounded(rollout), report)):
-            report(Message(f"{rollout.request.motion}: {missed}", "warning"))
+        if not rollout.request.lbs:
+            missed = unseen(*_surrounded(rollout), report, sight=rollout.sight, drag=rollout.fabric.drag)
+            if missed:
+                report(Message(f"{rollout.request.motion}: {missed}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
 

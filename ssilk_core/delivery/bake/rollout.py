@@ -28,6 +28,7 @@ from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
 from .request import BakeRequest
 from .result import FrameSpan, LatentSummary, RefinementSummary
+from .world import Sight
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
@@ -80,6 +81,7 @@ class BakeRollout:
         record: how the garment's model was made.
         info: of the garment as an asset.
         names: the joints as the shot's target finds them.
+        sight: what the network knows of the world around the character.
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
@@ -103,6 +105,7 @@ class BakeRollout:
     info: AssetInfo
     names: JointNames
     fabric: Fabric
+    sight: Sight
     lead: int = 0
     frames: FrameRange | None = None
     reduction: SizeReduction | None = None

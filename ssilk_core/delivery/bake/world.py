@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
@@ -15,10 +16,15 @@ from ...scene.assets import Motion, Scene, ShotWorld
 if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
 
+    from ...network.checkpoint import ModelFile
+
 Vector = tuple[float, float, float]
 
 GUSTS = "RMS[,SIZE[,SEED]]"
-UNSEEN = "the network does not see {}: it plays as in empty, still air; --refine N or --quality hero solve for it"
+UNSEEN = "the network does not see {}: it plays without; --refine N or --quality hero solve for it"
+STILL = (
+    "the network was trained in still air: it knows where wind and gravity pull, but not how cloth swings under more"
+)
 
 
 def asked_world(
@@ -68,16 +74,53 @@ def world_of(
     return read_world(source, stage, *found, garment=garment, colliders=colliders, report=report)
 
 
-def unseen(source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None, report: Reporter) -> str:
-    """Return the sentence that says what around a character the network does not see; empty where there is nothing.
+@dataclass(frozen=True)
+class Sight:
+    """What a network knows of the world around its character.
+
+    Attributes:
+        pull: whether it sees gravity and wind; absolute descriptors name the axes of the world.
+        strength: whether it was trained under others than the usual gravity.
+    """
+
+    pull: bool
+    strength: bool
+
+    @classmethod
+    def of(cls, file: ModelFile) -> Sight:
+        """Return that of a trained network."""
+        blown = file.provenance.get("train", {}).get("wind_fraction", 0) > 0
+        return cls(file.config.descriptors == "relative", blown)
+
+
+def unseen(
+    source: str,
+    stage: str,
+    scene: Scene,
+    motion: Motion,
+    asked: AskedWorld | None,
+    report: Reporter,
+    *,
+    sight: Sight,
+    drag: float,
+) -> str:
+    """Return what a network misses of the world around its character, in words; empty where that is nothing.
 
     No shape of a collider is read for it.
+
+    Args:
+        drag: of the garment's fabric, by which air moves it.
     """
     from ssilk_usd.reading.world import find_world
 
     garment = split_location(scene.garment.mesh.path)[1]
     found = find_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
-    return UNSEEN.format(" and ".join(found.parts)) if found.parts else ""
+    sees = {"wind": sight.pull and drag > 0, "its gravity": sight.pull}
+    missed = [part for part in found.parts if not sees.get(part, False)]
+    told = [UNSEEN.format(" and ".join(missed))] if missed else []
+    if not sight.strength and len(missed) < len(found.parts):
+        told.append(STILL)
+    return "; ".join(told)
 
 
 def _numbers(text: str) -> list[float]:

@@ -8,8 +8,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ssilk_core.network.descriptors import RATE_TIME, SATURATION, descriptor_joints, pose_features, six_d
-from ssilk_core.network.model.descriptors import gravity_features
+from ssilk_core.network.descriptors import (
+    RATE_TIME,
+    SATURATION,
+    descriptor_joints,
+    pose_features,
+    seen_gravity,
+    six_d,
+)
+from ssilk_core.network.model.descriptors import gravity_features, motion_descriptors
+from ssilk_core.network.model.descriptors import seen_gravity as seen_units
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.scene.assets import Motion
 from ssilk_core.scene.kinematics import matrix_from_quaternion, motion_transforms, quaternion_from_matrix
@@ -140,3 +148,33 @@ def test_joints_in_view_keep_their_ancestors(scene):
     assert descriptor_joints(skeleton, [False, True, False]).tolist() == [0, 1]
     assert descriptor_joints(skeleton, [True, False, False]).tolist() == [0]
     assert descriptor_joints(skeleton, [False, False, False]).tolist() == []
+
+
+def test_gravity_is_seen_as_it_is_up_to_its_usual_strength_and_then_by_its_logarithm():
+    along = np.array([0.6, 0.0, -0.8])
+    lengths = np.array([0.0, 0.3, 1.0, np.e, 10.0])
+    found = seen_gravity(GRAVITY * lengths[:, None] * along)
+    expected = [0.0, 0.3, 1.0, 2.0, 1 + np.log(10)]
+    np.testing.assert_allclose(found, np.outer(expected, along), atol=1e-12)
+    step = np.linalg.norm(seen_gravity(GRAVITY * np.outer([1 - 1e-6, 1, 1 + 1e-6], along)), axis=1)
+    np.testing.assert_allclose(np.diff(step), 1e-6, rtol=1e-4)  # without a kink
+    units = torch.tensor(np.outer(lengths, along))
+    np.testing.assert_allclose(seen_units(units), found, atol=1e-12)
+
+
+def test_a_motions_own_gravity_is_what_its_descriptors_hold(scene, motion):
+    felt = np.random.default_rng(3).normal(size=(40, 3)) * 15
+    found = motion_descriptors(
+        pose_features(replace(motion, gravity=felt), scene.character.skeleton, JOINTS), torch.zeros(1).double()
+    )
+    world = motion_transforms(motion, scene.character.skeleton.parents)[:, :, :3, :3]
+    expected = np.einsum("fjab,fa->fjb", world, seen_gravity(felt)).reshape(40, 9)
+    np.testing.assert_allclose(found[0][:, 12:], expected, atol=1e-12)
+    np.testing.assert_allclose(found[1][:, 12:21], expected, atol=1e-12)
+    usual = motion_descriptors(
+        pose_features(replace(motion, gravity=np.tile(GRAVITY * DOWN, (40, 1))), scene.character.skeleton, JOINTS),
+        torch.zeros(1).double(),
+    )
+    without = motion_descriptors(pose_features(motion, scene.character.skeleton, JOINTS), torch.zeros(1).double())
+    for one, other in zip(usual, without):
+        np.testing.assert_allclose(one, other, atol=1e-15)

@@ -23,6 +23,7 @@ from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics import loops
 from ssilk_core.physics.collision import SmoothedDistance, contacts
+from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.simulator import StepHistory
@@ -289,6 +290,17 @@ def test_a_garment_at_rest_in_a_held_pose_stays_put(scene, toy_model, toy_motion
     assert bool(found[0].converged.all())
     for each in found[1:]:
         torch.testing.assert_close(each.x, found[0].x, rtol=0, atol=1e-6)
+
+
+def test_it_solves_under_the_gravity_that_each_motion_feels(scene, toy_model, toy_motion) -> None:
+    motion = toy_motion(scene, 4)
+    made = LatentShots(toy_model(scene, scale=0.1), CLOTH, replace(EXACT, iterations=4), precision="float64")
+    usual, aside = np.array([0.0, -GRAVITY, 0.0]), np.array([3 * GRAVITY, 0.0, 0.0])
+    said = [replace(motion, gravity=np.tile(each, (4, 1))) for each in (usual, aside)]
+    for plain, both in zip(made.frames([motion]), made.frames(said)):
+        torch.testing.assert_close(both.solution.x[..., 0], plain.solution.x[..., 0], rtol=0, atol=1e-6)
+        moved = both.solution.x[..., 1] - both.solution.x[..., 0]
+        assert moved[:, 0].mean() > 1e-3
 
 
 def test_shots_that_are_solved_together_come_out_as_each_by_itself(scene, toy_model, toy_motion) -> None:

@@ -15,7 +15,7 @@ from ssilk_core.network.checkpoint import load_model, model_file, save_model
 from ssilk_core.network.descriptors import pose_features, six_d
 from ssilk_core.network.feedback import feedback_size
 from ssilk_core.network.model.batch import BatchPlayer, motion_inputs
-from ssilk_core.network.model.descriptors import turned_vectors, motion_descriptors
+from ssilk_core.network.model.descriptors import motion_descriptors, turned_vectors
 from ssilk_core.network.model.export import export_onnx
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import descriptor_sizes, parameter_shapes

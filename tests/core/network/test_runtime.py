@@ -80,6 +80,24 @@ def test_vertices_are_those_of_the_network(toy_scene, toy_model, toy_motion, opt
     )
 
 
+def windy(motion):
+    """The motion in a wind that turns and grows."""
+    at = np.linspace(0, 1, motion.frame_count)[:, None]
+    return replace(motion, gravity=(1 - at) * [0, -9.81, 0] + at * [25.0, -2.0, 8.0])
+
+
+@pytest.mark.parametrize("fps", [30.0, 24.0])
+def test_wind_and_gravity_move_it_as_they_move_the_network(model, motion, fps):
+    blown = windy(resample(motion, fps))
+    playback, still = player_of(model).play(blown, pre_roll=0.5), player_of(model).play(replace(blown, gravity=None))
+    expected = [decode(model, blown, pose) for pose in garment_poses(model, blown, fps, pre_roll=0.5)]
+    found = all_vertices(playback)
+    np.testing.assert_allclose(found, np.concatenate(expected), rtol=0, atol=1e-5)
+    assert np.abs(found - all_vertices(still)).max() > 1e-3
+    later = replace(blown, gravity=blown.gravity + np.where(np.arange(blown.frame_count)[:, None] < 60, 0, 5.0))
+    np.testing.assert_array_equal(all_vertices(playback.with_motion(later, 60))[:59], found[:59])
+
+
 def test_limits_are_reached_and_kept_as_in_the_network(scene, toy_model, motion):
     model = toy_model(scene, scale=0.1, latent_bound=0.2, max_latent_step=0.02).eval()
     free = toy_model(scene, scale=0.1, latent_bound=0.0, max_latent_step=0.0).eval()

@@ -18,6 +18,7 @@ from ssilk_core.physics.simulate.incremental_potential import IncrementalPotenti
 from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
+from ssilk_core.physics.world.felt import felt_gravity
 from ssilk_core.physics.world.surface import CollisionSurface
 from ssilk_core.physics.world.surroundings import Surroundings
 from ssilk_core.scene.assets import (
@@ -267,6 +268,51 @@ def test_a_sheet_that_hangs_in_wind_tilts_by_the_ratio_of_drag_and_weight(scene,
     hem, seam = found[-1, -3:].mean(axis=0), found[-1, :3].mean(axis=0)
     tilt = np.arctan2(hem[2] - seam[2], seam[1] - hem[1])
     assert tilt == pytest.approx(np.arctan(fabric.drag * speed / (fabric.density * G)), abs=5e-3)
+
+
+def test_an_even_wind_is_gravity_to_cloth_whatever_the_character_does(scene, toy_grid) -> None:
+    points, faces = toy_grid(5, 3, height=0.4, width=0.1)
+    cloth, frames = dressed(scene, points + AWAY, faces, points[:, 1] > -1e-9), 8
+    fabric, wind, glide = replace(CLOTH, drag=0.6), np.array([3.0, 1.0, 4.0]), np.array([0.0, 0.0, -1.5])
+    pull = np.linspace([0, -9.81, 0], [2.0, -5.0, 0.0], frames)
+    motion = still(cloth, frames)
+    places = motion.translations.copy()
+    places[:, 0] += np.arange(frames)[:, None] / FPS * glide
+    motion = replace(motion, translations=places)
+    world = ShotWorld(FPS, gravity=pull, air=Air(wind[None], np.zeros(1)))
+    felt = felt_gravity(world, motion, cloth, fabric)
+    np.testing.assert_allclose(felt, pull + fabric.drag / fabric.density * (wind - glide), atol=1e-9)
+    options = SimulationOptions(fps=FPS, precision="float64", solver=SolverOptions(tolerance=1e-7))
+    # The simulator's first frame is at rest, where the root has no velocity yet: the wind starts from there.
+    felt[0] += fabric.drag / fabric.density * glide
+    blown, pulled = (
+        simulate(cloth, fabric, [motion], options, worlds=[each])[0] for each in (world, ShotWorld(FPS, gravity=felt))
+    )
+    np.testing.assert_allclose(blown, pulled, atol=1e-5)
+
+
+def test_what_cloth_feels_is_the_usual_where_nothing_says_otherwise(scene, toy_grid) -> None:
+    points, faces = toy_grid(3, 2)
+    cloth = dressed(scene, points + AWAY, faces, points[:, 1] > -1e-9)
+    motion, wind = still(cloth, 3), Air(np.array([[5.0, 0, 0]]), np.zeros(1))
+    assert felt_gravity(None, motion, cloth, CLOTH) is None
+    assert felt_gravity(ShotWorld(FPS, (floor(0.0),)), motion, cloth, CLOTH) is None
+    assert felt_gravity(ShotWorld(FPS, air=wind), motion, cloth, replace(CLOTH, drag=0.0)) is None
+    jump = replace(motion, translations=motion.translations + np.array([[[0.0]], [[0.0]], [[100.0]]]))
+    blown = felt_gravity(ShotWorld(FPS, air=wind), jump, cloth, replace(CLOTH, drag=0.6))
+    np.testing.assert_allclose(blown, np.tile([10.0, -9.81, 0.0], (3, 1)), atol=1e-9)  # a teleport is no wind
+
+
+def test_gusts_are_felt_as_their_mean_over_the_cloth(scene, toy_grid) -> None:
+    points, faces = toy_grid(9, 9, height=0.4, width=0.4)
+    cloth = dressed(scene, points + AWAY, faces, points[:, 1] > 1)
+    world = ShotWorld(FPS, air=Air(np.array([[2.0, 0, 0]]), np.array([3.0]), length=4.0, seed=2))
+    motion, fabric = still(cloth, 12), replace(CLOTH, drag=0.6)
+    felt = felt_gravity(world, motion, cloth, fabric)
+    air, at = MovingAir(world.air, FPS), cloth.garment.mesh.points
+    every = np.stack([air.velocity(at, frame / FPS).mean(axis=0) for frame in range(12)])
+    np.testing.assert_allclose(felt, fabric.drag / fabric.density * every - [0, 9.81, 0], atol=0.5)
+    assert np.ptp(felt, axis=0).max() > 1
 
 
 def test_gravity_that_turns_and_grows_in_a_shot_moves_free_cloth_as_implicit_euler_does(scene) -> None:

@@ -12,7 +12,7 @@ from ssilk_core.network.descriptors import pose_features
 from ssilk_core.scene.kinematics import motion_transforms, skinning_matrices
 from ssilk_core.training.motion_bank import MotionBank, build_bank
 from ssilk_core.training.settings import TrainConfig
-from ssilk_core.training.windows import WindowSampler, random_directions
+from ssilk_core.training.windows import STRONGEST_PULL, WindowSampler, random_directions, random_pulls
 
 CPU, JOINTS = torch.device("cpu"), np.arange(3)
 CONFIG = TrainConfig(batch=6, window=5, state_reuse=0.7)
@@ -123,6 +123,37 @@ def test_the_share_that_is_rotated_points_anywhere(share):
         np.testing.assert_allclose(directions.T @ directions / 20_000, np.eye(3) / 3, atol=0.01)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.4, 1.0])
+def test_the_share_that_is_in_wind_is_pulled_anywhere_up_to_the_strongest(share):
+    pulls = random_pulls(20_000, share, generator(), CPU).double()
+    sizes = pulls.norm(dim=1)
+    assert (sizes > 0).double().mean().item() == pytest.approx(share, abs=0.02)
+    if share:
+        blown = pulls[sizes > 0] / sizes[sizes > 0, None]
+        np.testing.assert_allclose(blown.mean(0), 0, atol=0.02)
+        assert sizes.max().item() == pytest.approx(STRONGEST_PULL, rel=0.01)
+        assert sizes[sizes > 0].mean().item() == pytest.approx(STRONGEST_PULL / 2, rel=0.03)
+
+
+def test_wind_goes_on_from_window_to_window_and_changes_evenly_within_one(scene, toy_motion):
+    long = build_bank([toy_motion(scene, 4000)], scene.character.skeleton, JOINTS, 30.0, CPU)
+    config = replace(CONFIG, batch=400, state_reuse=0.9, wind_fraction=0.5)
+    sampler, changed = WindowSampler(long, config, 3, generator()), 0.0
+    assert torch.equal(sampler.pull[0], sampler.pull[1])  # the first windows start at rest, in a steady wind
+    for _ in range(20):
+        before = sampler.gravity()
+        np.testing.assert_allclose(before.diff(n=2, dim=0), 0, atol=1e-5)
+        sampler.advance(torch.zeros(2, 400, 3))
+        now, kept = sampler.gravity(), sampler.carried
+        np.testing.assert_allclose(now[0, kept], before[-2, kept], atol=1e-5)
+        assert torch.equal(sampler.pull[0][~kept], sampler.pull[1][~kept])
+        changed += (sampler.pull[0] != sampler.pull[1]).any(1).double().mean().item() / 20
+    assert 0.05 < changed < 0.4
+    poses = sampler.poses(4000)[1]
+    straight = (poses == torch.tensor([0.0, -1, 0])).all(dim=1).double().mean().item()
+    assert straight == pytest.approx(0.5 * (1 - config.rotated_fraction), abs=0.03)
+
+
 @pytest.mark.parametrize("correlation", [0.0, 0.99])
 def test_noise_has_its_size_and_correlation(bank, correlation):
     config = replace(CONFIG, batch=5000, noise=0.2, noise_correlation=correlation)
@@ -131,8 +162,10 @@ def test_noise_has_its_size_and_correlation(bank, correlation):
     assert torch.corrcoef(torch.stack([first, second]))[0, 1].item() == pytest.approx(correlation, abs=0.02)
 
 
-def test_a_restored_sampler_goes_on_exactly(bank):
-    sampler, other = (WindowSampler(bank, CONFIG, 3, generator(seed)) for seed in (1, 2))
+@pytest.mark.parametrize("wind", [0.0, 0.5])
+def test_a_restored_sampler_goes_on_exactly(bank, wind):
+    config = replace(CONFIG, wind_fraction=wind)
+    sampler, other = (WindowSampler(bank, config, 3, generator(seed)) for seed in (1, 2))
     sampler.advance(torch.randn(2, 6, 3))
     other.restore({name: value.clone() for name, value in sampler.state().items()})
     for _ in range(5):

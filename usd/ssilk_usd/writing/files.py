@@ -10,12 +10,13 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.files import replacing
-from ssilk_core.scene.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, Skeleton
+from ssilk_core.scene.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, ShotWorld, Skeleton
 
 from ..names import FREE, GARMENT, HOLD
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
 from .export import new_stage, save
+from .world import define_world
 
 CORE_UNITS = StageUnits(1.0, UsdGeom.Tokens.y)
 
@@ -91,8 +92,12 @@ def write_cache(path: str | Path, mesh: Mesh, points: Sequence[Floats], fps: flo
         save(layer, path)
 
 
-def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
-    """Write a motion as a SkelAnimation in its own file, one time code per frame, in metres and y up."""
+def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton, world: ShotWorld | None = None) -> None:
+    """Write a motion as a SkelAnimation in its own file, one time code per frame, in metres and y up.
+
+    Args:
+        world: whose gravity and wind the file says too.
+    """
     with replacing(path) as temporary:
         stage = new_stage(temporary, CORE_UNITS)
         animation = UsdSkel.Animation.Define(stage, "/Animation")
@@ -101,6 +106,8 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton) -> None:
         stage.SetFramesPerSecond(motion.fps)
         stage.SetStartTimeCode(motion.start)
         stage.SetEndTimeCode(motion.start + motion.frame_count - 1)
+        if world is not None:
+            define_world(stage, world, motion.start)
         animation.CreateJointsAttr(Vt.TokenArray(skeleton.joint_names))
         animation.CreateScalesAttr(Vt.Vec3hArray(skeleton.joint_count, Gf.Vec3h(1)))
         rotations, translations = (
