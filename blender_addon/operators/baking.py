@@ -15,12 +15,14 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, StringProperty
 from ssilk_usd.names import LAYER_SUFFIXES
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
+from ..motions.freedom import freedom, is_held
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.shapes import tell_changing_shapes
@@ -162,10 +164,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if not self.to_timeline and not self.to_usd:
             raise SetupError("Choose where to bake to: the timeline, USD, or both.")
         self.model, armature = model_of(garment), armature_of(garment)
+        solves = self.quality != WHOLE and QUALITIES[self.quality].refine
+        if solves and garment.ssilk.hold > 1:
+            raise SetupError("A solver moves each frame: set Hold Frames to 1, or choose another quality.")
         joints = self.known_joints(garment, armature)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
-        if self.to_timeline and self.quality != WHOLE and QUALITIES[self.quality].refine:
+        if self.to_timeline and (solves or is_held(garment)):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
@@ -192,6 +197,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             scene = load_model(self.model).scene
         except SsilkError as error:
             raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
+        self.prim = split_location(scene.garment.mesh.path)[1]
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
         joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
         joint_order(joints, scene.joint_names, fewer_proxies=True)
@@ -208,11 +214,15 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         _, armature = self.pair.objects()
         yield from sample(armature, self.character, [self.take])
         yield from loading_usd()
-        from ssilk_usd.writing.files import write_motion
+        from ssilk_usd.writing.files import write_direction, write_motion
 
         motion = self.take.motion(self.character)
         world = world_over(bpy.context.scene, self.take.frames, motion.fps)
         write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
+        garment, _ = self.pair.objects()
+        free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
+        if hold > 1 or (free < 1).any():
+            write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold)
         stage = self.model.parent / STAGE
         self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
 

@@ -23,7 +23,7 @@ def live_line(garment: bpy.types.Object) -> str:
     if played.done is not None:
         return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
     if played.behind:
-        return "The frame range or the rate changed since the motion was read"
+        return "The frame range, the rate, Free or Hold Frames changed since the motion was read"
     if played.unkeyed:
         return f"Renders lack it: {played.unkeyed}"
     if played.stale:
@@ -81,6 +81,8 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout = self.layout
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
+        layout.prop(context.object.ssilk, "free")
+        layout.prop(context.object.ssilk, "hold")
         layout.operator("ssilk.bake", icon="REC")
         draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")

@@ -13,17 +13,21 @@ frame by frame, in the viewport, until the motion is read again.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator
+from functools import partial
 from pathlib import Path
 
 import bpy
 import numpy as np
 from ssilk_usd.shots.skinned import SkinnedGarment
 
-from ssilk_core.network.runtime import Playback
+from ssilk_core.delivery.bake.direction import DirectedPoses, Direction
+from ssilk_core.network.runtime import Playback, Player
 from ssilk_core.scene.assets import GarmentPose, Motion
+from ssilk_core.scene.held import HeldGarment
 
 from ..arrays.joints import Joints
 from ..errors import SetupError
+from ..motions.freedom import freedom, is_held, is_keyed
 from ..motions.keys import has_live_keys, need_tracks, remove_keys
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
 from ..motions.sources import TIMELINE, Source
@@ -54,6 +58,8 @@ class Live:
         done: the part of the motion that was read; None when there is nothing to read.
         stale: whether the armature does something else by now than what was read.
         unkeyed: why what is played stands not as keys, so that renders lack it; empty where it does.
+        free: how freely the garment moves in each frame; None where it does throughout, and holds no pose.
+        hold: frames that each pose is held.
         model_only: whether a newer model is read, for the motion that was read before.
 
     Raises:
@@ -67,6 +73,7 @@ class Live:
         self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
         self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
+        self.free, self.hold = None, 1
         self.done: float | None = None
         self.stale = self.model_only = False
         self.unkeyed = ""
@@ -76,7 +83,7 @@ class Live:
         """Read the motion again; the old one is played until that is done."""
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self._steps, self.times = self._reading(take), _times()
+        self._steps, self.times = self._reading(take), self._asked()
         self.done, self.stale, self.model_only = 0.0, False, False
 
     def take_up(self) -> None:
@@ -93,8 +100,16 @@ class Live:
 
     @property
     def behind(self) -> bool:
-        """Whether the scene's frames or its rate are others by now than those that were read."""
-        return self.times != _times()
+        """Whether the scene's frames, its rate, or how the garment is held are others by now than was read."""
+        try:
+            return self.times != self._asked()
+        except SetupError:  # it was deleted, which is told where it is shown
+            return False
+
+    def _asked(self) -> tuple[object, ...]:
+        """Return what the garment is played over and how, besides what keys say."""
+        garment, _ = self.objects()
+        return *_times(), garment.ssilk.hold, None if is_keyed(garment) else garment.ssilk.free
 
     def read(self) -> bool:
         """Read a little of the model, then of the motion; return whether there is more.
@@ -134,7 +149,7 @@ class Live:
             self._take_notice(armature.evaluated_get(depsgraph), index)
         if not self.stale and not self.unkeyed:
             return
-        pose = self.playback.pose(index)
+        pose = self._pose(index)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
@@ -145,6 +160,16 @@ class Live:
         blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
         for name, weight in zip(self.shapes, pose.weights[0].tolist()):
             blocks[name].value = weight
+
+    def _pose(self, index: int) -> GarmentPose:
+        """Return the pose of a frame whose motion was edited since it was read."""
+        if self.free is None:
+            return self.playback.pose(index)
+        index -= index % self.hold
+        if self.free[index] == 1:
+            return self.playback.pose(index)
+        held, _ = self._held.pose(_motion(self.trained, self.placed[index : index + 1]))
+        return self._held.blended(held, self.playback.pose(index), self.free[index : index + 1])
 
     def disagrees(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> bool:
         """Return whether an evaluated frame shows another pose than what was read, or none that was."""
@@ -203,8 +228,12 @@ class Live:
             yield from self._dressing()
         _, armature = self.objects()
         yield from (READING * done for done in sample(armature, self.joints.character, [take]))
-        need_company(*self.objects(), take)
-        placed = np.array(take.worlds)
+        garment, armature = self.objects()
+        need_company(garment, armature, take)
+        placed, self.hold, free = np.array(take.worlds), garment.ssilk.hold, freedom(garment, take.frames)
+        self.free = free if self.hold > 1 or (free < 1).any() else None
+        if is_held(garment):
+            need_movable(armature, self.joints.proxies)
         playback, poses = yield from self._rolling(self.trained, placed, READING)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
         self._key(poses, self.first)
@@ -213,8 +242,13 @@ class Live:
         self, trained: TrainedGarment, placed: np.ndarray, done: float
     ) -> Generator[float, None, tuple[Playback, list[GarmentPose]]]:
         """Return what plays joints to the world, (F, J, 4, 4), with all poses; yield the part that is done."""
-        playback, poses = trained.player.play(_motion(trained, placed), pre_roll=PRE_ROLL, block=BLOCK), []
-        for pose in playback.poses():
+        motion, player, poses = _motion(trained, placed), trained.player, []
+        playback, some = player.play(motion, pre_roll=PRE_ROLL, block=BLOCK), None
+        if self.free is not None:
+            deformer = player.deformer()
+            self._held, direction = HeldGarment(deformer), Direction(self.free, self.hold, motion, 0)
+            some = DirectedPoses(direction, deformer, partial(_rolled, player, motion)).poses(0, len(placed))
+        for pose in playback.poses() if some is None else some:
             poses.append(pose)
             yield done + (1 - done) * pose.start / len(placed)
         return playback, poses
@@ -294,6 +328,14 @@ def remove_live_keys(garment: bpy.types.Object) -> None:
 def _times() -> tuple[int, int, float, float]:
     scene = bpy.context.scene
     return scene.frame_start, scene.frame_end, scene_rate(), scene_step()
+
+
+def _rolled(player: Player, motion: Motion, first: int, stop: int, step: int) -> Iterator[GarmentPose]:
+    """Yield the network's poses at frames first, first + step, ..., below stop; the motion is straight in between."""
+    seen = slice(first, stop, step)
+    gravity = None if motion.gravity is None else motion.gravity[seen]
+    part = Motion(motion.path, motion.fps / step, motion.rotations[seen], motion.translations[seen], gravity=gravity)
+    return player.play(part, pre_roll=PRE_ROLL, block=BLOCK).poses()
 
 
 def _joined(poses: list[GarmentPose]) -> GarmentPose:

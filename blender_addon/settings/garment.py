@@ -4,7 +4,16 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import BoolProperty, CollectionProperty, FloatProperty, PointerProperty, StringProperty
+from bpy.props import (
+    BoolProperty,
+    CollectionProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ssilk_core.scene.kinematics import MAX_HOLD
 
 from ..scene.classes import tighten
 from . import fabric, training
@@ -67,6 +76,24 @@ class GarmentSettings(bpy.types.PropertyGroup):
         subtype="FILE_PATH",
         options=RELATIVE,
         description="Trained model of the garment; that of its own training when empty",
+        override=SHOTS,
+    )
+    free: FloatProperty(
+        name="Free",
+        description="How much the network moves the garment: at 0 its bones carry it. Keyed, it holds the garment "
+        "and lets it go",
+        default=1.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        override=SHOTS,
+    )
+    hold: IntProperty(
+        name="Hold Frames",
+        description="For how many frames each pose of the garment is held: 2 for animation on twos",
+        default=1,
+        min=1,
+        max=MAX_HOLD,
         override=SHOTS,
     )
     bones: CollectionProperty(

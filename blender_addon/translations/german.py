@@ -302,6 +302,15 @@ WORDS = {
     "Wall time to fill with as many steps as fit, in place of the preset's; zero for these": (
         "Zeit, die mit so vielen Schritten gefüllt wird, wie hineinpassen, statt denen der Vorgabe; null: diese"
     ),
+    "Free": "Frei",
+    "How much the network moves the garment: at 0 its bones carry it. Keyed, it holds the garment and lets it go": (
+        "Wie sehr das Netzwerk das Kleidungsstück bewegt: bei 0 tragen es seine Knochen. Mit Keyframes wird es "
+        "gehalten und losgelassen"
+    ),
+    "Hold Frames": "Bilder halten",
+    "For how many frames each pose of the garment is held: 2 for animation on twos": (
+        "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
+    ),
     "Tightness": "Enge",
     "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, once classes "
     "were found automatically": (

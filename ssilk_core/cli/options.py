@@ -15,6 +15,7 @@ from ..delivery.bake.request import (
     ALL_ELEMENTS,
     LATENT_ELEMENTS,
     MAX_HANDLES,
+    MAX_HOLD,
     MAX_PRE_ROLL,
     MAX_REFINE,
     MAX_SAMPLES_PER_FRAME,
@@ -181,6 +182,9 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
+    verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
+                      help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
+                           "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip
     add_world(verb, "with --refine and --quality hero, and the network does not see it")
     _add_names(verb)
     _add_output(verb)
@@ -307,6 +311,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             latent_elements=options.latent_elements,
             refined_output=options.refined_output,
             hide_covered=options.hide_covered,
+            hold=options.hold or 0,
             colliders=tuple(options.collider),
             wind=options.wind,
             gusts=options.gusts,

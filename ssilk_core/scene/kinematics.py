@@ -176,6 +176,7 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
     return Motion(motion.path, fps, *sample_motion(motion, position), gravity=sample_gravity(motion, position))
 
 
+MAX_HOLD = 100  # frames for which a garment's pose is held
 MIN_FPS, MAX_FPS = 0.01, 10_000  # [1/s] of motions: beyond them, time codes and frames cannot be counted
 EASE = 0.25  # [s] in which a run-up accelerates from rest to the speed of the motion
 

@@ -19,10 +19,15 @@ def blocks(document: str, language: str) -> list[str]:
 
 
 def test_layers_of_artists_are_read():
-    (text,) = blocks("docs/pipeline.md", "usda")
-    layer = Sdf.Layer.CreateAnonymous(".usda")
-    assert layer.ImportFromString(text)
-    assert layer.ListTimeSamplesForPath("/Shot/cape/Animation.blendShapeWeights") == [12]
+    for text, attribute, codes in zip(
+        blocks("docs/pipeline.md", "usda"),
+        ("/Shot/cape/Animation.blendShapeWeights", "/Hero/Cape.ssilk:free"),
+        ([12], [1020, 1028, 1050, 1058]),
+        strict=True,
+    ):
+        layer = Sdf.Layer.CreateAnonymous(".usda")
+        assert layer.ImportFromString(text)
+        assert layer.ListTimeSamplesForPath(attribute) == codes
 
 
 def is_there(name: str) -> bool:

@@ -15,6 +15,8 @@ GEOM_BIND = "primvars:skel:geomBindTransform"
 LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 # Of a PhysicsScene, in the stage's units of length and its axes: wind and the RMS speed of gusts [1/s], size, seed.
 WIND, GUSTS, GUST_LENGTH, GUST_SEED = "ssilk:wind", "ssilk:gusts", "ssilk:gustLength", "ssilk:gustSeed"
+# Of a garment in a shot: 1 where it moves freely, 0 where it is held to linear blend skinning; frames of each pose.
+FREE, HOLD = "ssilk:free", "ssilk:hold"
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...devices import select_device
 from ...errors import fail
+from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
@@ -18,6 +19,7 @@ from ...scene.assets import Deformer, Floats, Motion, Scene
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ..targets import JointNames, Target, fit, joint_names
 from .character import on_character
+from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
 from .rollout import BakeRollout
@@ -111,6 +113,7 @@ class LoadedGarment:
             fabric=self.file.fabric,
             sight=Sight.of(self.file),
             reduction=reduction,
+            direction=None if request.lbs else self._directed(request, read),
         )
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
@@ -151,6 +154,24 @@ class LoadedGarment:
         world = world_of(request.motion, request.stage, self.deformer.scene, motion, asked, colliders=False)
         gravity = felt_gravity(world, motion, self.deformer.scene, self.file.fabric)
         return motion if gravity is None else replace(motion, gravity=gravity)
+
+    def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
+        """Return how the shot directs the garment; None where it moves freely throughout."""
+        from ssilk_usd.reading.direction import read_direction
+
+        garment = split_location(self.deformer.scene.garment.mesh.path)[1]
+        assert garment is not None
+        said = read_direction(request.motion, request.stage, garment, read.whole)
+        hold = request.hold or said.hold
+        if hold > 1 and request.refine:
+            found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
+            fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
+        if said.free is None and hold == 1:
+            return None
+        samples, count = request.samples_per_frame, read.whole.frame_count
+        first = read.lead + (read.frames.before * samples if read.frames else 0)
+        free = np.ones(count) if said.free is None else said.free
+        return Direction(free, hold * samples, read.whole, first) if hold > 1 else Direction(free, 1, read.whole, 0)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""

@@ -4,16 +4,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
-from itertools import tee
+from dataclasses import dataclass, replace
+from itertools import islice, tee
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...devices import select_device
-from ...errors import SsilkError, VerificationError
+from ...errors import SsilkError, VerificationError, fail
 from ...events import Countdown, Message, Reporter, silent
-from ...scene.assets import Floats, Motion, Scene
+from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.kinematics import deform, lbs_deformer, lbs_poses
+from .direction import free_stretches
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 from .world import asked_world, unseen, world_of
@@ -21,7 +23,7 @@ from .world import asked_world, unseen, world_of
 if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
 
-    from ...physics.refine import RefinedFrame, Refiner
+    from ...physics.refine import FrameChange, Refiner
     from ...scene.decomposition import Decomposition
 
 # Rounding points to float32 may raise the energy of a frame: by this near the origin [J], ...
@@ -55,7 +57,7 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     means, points = RefinementMeans(), []
     for frame in _refined_frames(rollout, report):
         points.append(frame.points)
-        means.changes.append(frame.change)
+        means.changes += [frame.change] if frame.change else []
     if rollout.request.writes_points:
         found = _summary(rollout.request.refine, means.figures(), None)
         return replace(rollout, refinement=Refinement(tuple(points), (), found))
@@ -77,16 +79,63 @@ def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[
     return (frame.points for frame in _refined_frames(rollout, report))
 
 
-def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[RefinedFrame]:
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """Vertices of a frame in the world [m], shape (V, 3), and what the solver changed; None where it is held."""
+
+    points: Floats
+    change: FrameChange | None
+
+
+def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[_Frame]:
     left_out, played = 0, rollout
     if rollout.request.feedback:  # the cloth is on its way when the shot begins
         left_out, played = rollout.lead, rollout.with_lead()
         report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
-    told, world = Countdown(played.motion.frame_count, report), world_of(*_surrounded(played), report)
-    for number, frame in enumerate(_refiner(played).frames(played.motion, played.network_vertices(), world)):
+    told, count = Countdown(played.motion.frame_count, report), played.motion.frame_count
+    free = np.ones(count) if played.direction is None else played.direction.free[played.lead : played.lead + count]
+    frames = _directed_frames(played, free, report) if (free < 1).any() else _solved_frames(played, 0, count, report)
+    for number, frame in enumerate(frames):
         told()
         if number >= left_out:
             yield frame
+
+
+def _directed_frames(played: BakeRollout, free: Floats, report: Reporter) -> Iterator[_Frame]:
+    """Yield frames between linear blend skinning and refined ones; the solver starts anew where the network does.
+
+    Args:
+        free: share of the refined ones, shape (F,).
+    """
+    stretches = free_stretches(free)
+    if not stretches:
+        found, allowed = "the garment is held in all frames", "--refine solves for cloth that moves freely"
+        fail(played.request.motion, found, allowed, "leave --refine out, or key ssilk:free")
+    deformer, motion = lbs_deformer(played.deformer.scene), played.motion
+    done = 0
+    for first, stop in [*stretches, (len(free), len(free))]:
+        yield from (_Frame(points, None) for points in _skinned(deformer, motion, done, first))
+        solved = _solved_frames(played, first, stop, report) if first < stop else ()
+        for share, points, frame in zip(free[first:stop], _skinned(deformer, motion, first, stop), solved):
+            yield _Frame(points + share * (frame.points - points), frame.change)
+        done = stop
+
+
+def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Iterator[Floats]:
+    """Yield the vertices of frames under linear blend skinning in the world [m], shape (V, 3)."""
+    for pose in lbs_poses(stop - first):
+        yield from deform(deformer, motion.clip(first, stop), pose)
+
+
+def _solved_frames(played: BakeRollout, first: int, stop: int, report: Reporter) -> Iterator[_Frame]:
+    """Yield frames that the solver refines, from its start in the first of them on."""
+    source, stage, scene, motion, asked = _surrounded(played)
+    # What is cut out is normalised again, which changes its last digits.
+    part = motion if stop - first == motion.frame_count else motion.clip(first, stop)
+    world = world_of(source, stage, scene, part, asked, report)
+    network = islice(played.network_vertices(), first, stop)
+    for frame in _refiner(played).frames(part, network, world):
+        yield _Frame(frame.points, frame.change)
 
 
 def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:

@@ -11,7 +11,7 @@ from math import inf
 
 from ...errors import fail, fail_unknown
 from ...quality.reduction import ModelSize
-from ...scene.kinematics import MAX_FPS, MIN_FPS
+from ...scene.kinematics import MAX_FPS, MAX_HOLD, MIN_FPS
 from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
 from .world import parse_world
@@ -59,6 +59,7 @@ class BakeRequest:
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
             numbers as text (`delivery.bake.world`). Refinement alone meets it.
+        hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.
@@ -91,6 +92,7 @@ class BakeRequest:
     wind: str | None = None
     gusts: str | None = None
     gravity: str | None = None
+    hold: int = 0
     keep: ModelSize | None = None
     device: str = "cpu"
     garment: str | None = None
@@ -113,6 +115,8 @@ class BakeRequest:
             parse_range(self.range)
         if not 0 <= self.pre_roll <= MAX_PRE_ROLL:
             fail("--pre-roll", f"{self.pre_roll:g} seconds", f"0 to {MAX_PRE_ROLL:g} are allowed")
+        if not 0 <= self.hold <= MAX_HOLD or int(self.hold) != self.hold:
+            fail("--hold", f"{self.hold:g} frames", f"1 to {MAX_HOLD} are allowed")
         if self.fps is not None and not MIN_FPS <= self.fps <= MAX_FPS:
             fail("--fps", f"{self.fps:g} frames per second", ALLOWED_FPS)
         if not 0 <= self.refine <= MAX_REFINE or int(self.refine) != self.refine:

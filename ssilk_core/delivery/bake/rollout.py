@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,8 +14,17 @@ from ...events import Countdown, Message, Reporter, silent
 from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.fabrics import Fabric
-from ...scene.kinematics import deform, lbs_poses, slerp, split_at_cuts
+from ...scene.kinematics import (
+    deform,
+    held_at_cuts,
+    lbs_poses,
+    sample_gravity,
+    sample_motion,
+    slerp,
+    split_at_cuts,
+)
 from ..targets import JointNames
+from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
 from .request import BakeRequest
 from .result import FrameSpan, LatentSummary, RefinementSummary
@@ -28,8 +38,6 @@ if TYPE_CHECKING:
 
     from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
-
-CHUNK = 256  # frames in memory at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,8 +85,10 @@ class BakeRollout:
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
+        direction: where the garment is held; None where it moves freely throughout.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
+        held_off: RMS distance from linear blend skinning of frames that are held [m], likewise.
     """
 
     request: BakeRequest
@@ -101,7 +111,9 @@ class BakeRollout:
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
     latents: SolvedLatents | None = None
+    direction: Direction | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
+    held_off: list[float] = field(default_factory=list)
 
     @property
     def start(self) -> float:
@@ -134,17 +146,36 @@ class BakeRollout:
             return
         if roller is None and self.request.latent_iterations:
             roller = self.latent_roller()
-        from ...network.rollout import garment_poses
-
         self.recovered.clear()
-        rate, pre_roll = self.motion.fps, self.request.pre_roll
-        driver = self._driver()
         stop = self.lead + self.motion.frame_count
-        for pose in garment_poses(self.model, driver, rate, CHUNK, self._note, pre_roll=pre_roll, roller=roller):
-            shown = slice(max(self.lead - pose.start, 0), max(stop - pose.start, 0))
-            part = pose.part(shown)
+        if self.direction is not None:
+            directed = DirectedPoses(self.direction, self.deformer, partial(self._rolled, roller=roller))
+            yield from directed.poses(self.lead, stop)
+            self.held_off[:] = directed.off
+            return
+        for pose in self._rolled(0, stop, 1, roller):
+            part = pose.part(slice(max(self.lead - pose.start, 0), None))
             if part.frame_count:
                 yield replace(part, start=part.start - self.lead)
+
+    def _rolled(self, first: int, stop: int, step: int, roller: LatentRoller | None) -> Iterator[GarmentPose]:
+        """Yield the network's poses at samples of `whole`, first, first + step, ..., below stop; it starts at first.
+
+        In between the motion is seen as straight.
+        """
+        from ...network.rollout import garment_poses
+
+        assert self.model is not None
+        count, pre_roll = len(range(first, stop, step)), self.request.pre_roll
+
+        def note(frames: range) -> None:
+            self._note(range(first + frames[0] * step, min(first + (frames[-1] + 1) * step, stop)))
+
+        driver, rate = self._driver(first, stop, step), self.motion.fps / step
+        for pose in garment_poses(self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller):
+            part = pose.part(slice(0, max(count - pose.start, 0)))
+            if part.frame_count:
+                yield part
 
     def latent_roller(self, advanced: Callable[[], object] = lambda: None) -> LatentRoller:
         """Return what solves for the network's states in latents; `advanced` is called after each frame."""
@@ -161,11 +192,19 @@ class BakeRollout:
 
         assert self.model is not None
         skeleton = self.deformer.scene.character.skeleton
-        return frames_to_solve(self._driver(), skeleton, self.model.config.fps, self.request.pre_roll)
+        driver = self._driver(0, self.lead + self.motion.frame_count, 1)
+        return frames_to_solve(driver, skeleton, self.model.config.fps, self.request.pre_roll)
 
-    def _driver(self) -> Motion:
-        """Return the motion that is rolled over, from the first sample of the lead on, at its own rate."""
-        return _from_fraction(self.source, self.deformer.scene.character.skeleton, self._source_frame(-self.lead))
+    def _driver(self, first: int, stop: int, step: int) -> Motion:
+        """Return the motion that is rolled over, from a sample of `whole` on: at its own rate, or in steps."""
+        skeleton, source = self.deformer.scene.character.skeleton, self.source
+        at = [self._source_frame(sample - self.lead) for sample in range(first, stop, step)]
+        if step == 1:
+            driver = _from_fraction(source, skeleton, at[0])
+            return driver if stop == self.lead + self.motion.frame_count else driver.clip(0, int(at[-1] - at[0]) + 2)
+        position = held_at_cuts(source, skeleton, np.array(at).clip(0, source.frame_count - 1))
+        gravity, poses = sample_gravity(source, position), sample_motion(source, position)
+        return Motion(source.path, self.motion.fps / step, *poses, gravity=gravity)
 
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
@@ -239,6 +278,10 @@ class BakeRollout:
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
         tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
+        if self.held_off:
+            off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
+            text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
+            report(Message(f"{self.request.motion}: {text} {off:.2g} mm (RMS) of linear blend skinning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
 

@@ -124,6 +124,8 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     if rollout.request.refine and rollout.refinement is None:
         if rollout.request.feedback:
             return _verify_extent(shot, times, path, rollout, report, "refined with feedback")
+        if rollout.direction is not None and not shot.is_skinned:  # held points have any energy
+            return _verify_extent(shot, times, path, rollout, report, "refined, and held for a while")
         if not shot.is_skinned:
             return verify_energies(rollout, map(shot.garment_points, times), report)
         if not rollout.request.writes_points:

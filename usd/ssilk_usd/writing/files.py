@@ -12,7 +12,7 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_core.files import replacing
 from ssilk_core.scene.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, ShotWorld, Skeleton
 
-from ..names import GARMENT
+from ..names import FREE, GARMENT, HOLD
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
 from .export import new_stage, save
@@ -121,6 +121,24 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton, world: Sh
             layer.SetTimeSample(rotations, motion.start + frame, Vt.QuatfArray.FromNumpy(turns))
             layer.SetTimeSample(translations, motion.start + frame, Vt.Vec3fArray.FromNumpy(moves))
         save(layer, path)
+
+
+def write_direction(path: str | Path, garment: str, free: Floats, start: float, hold: int) -> None:
+    """Add to a motion's file how a garment is directed over its frames (`reading.direction`).
+
+    Args:
+        garment: path of its prim.
+        free: 0 where it is held to 1 where it moves freely, from the time code `start` on, shape (F,).
+        hold: frames that each pose is held.
+    """
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.OverridePrim(garment)
+    if hold != 1:
+        prim.CreateAttribute(HOLD, Sdf.ValueTypeNames.Int).Set(hold)
+    attribute = prim.CreateAttribute(FREE, Sdf.ValueTypeNames.Float)
+    for frame, value in enumerate(free.tolist()):
+        attribute.Set(value, start + frame)
+    stage.GetRootLayer().Save()
 
 
 def _root_path(name: str) -> str:

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments that are held and let go, and poses on twos: as Blender evaluates them, baked and played live."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from blender_addon.playback.models import model_of
+
+from .conftest import activate
+from .scenes import decoded, shown
+from .test_baking import refused
+
+FRAMES = range(1, 41)
+NEAR = 2e-5  # [m]
+
+
+def key(garment, values: dict[int, float]) -> None:
+    for frame, value in values.items():
+        garment.ssilk.free = value
+        garment.ssilk.keyframe_insert("free", frame=frame)
+
+
+def bake(bpy, garment) -> np.ndarray:
+    activate(bpy, garment)
+    assert bpy.ops.ssilk.bake() == {"FINISHED"}
+    return shown(bpy, garment, FRAMES)
+
+
+def live(bpy, garment) -> np.ndarray:
+    activate(bpy, garment)
+    assert bpy.ops.ssilk.play_live() == {"FINISHED"}
+    return shown(bpy, garment, FRAMES)
+
+
+def test_a_keyed_slider_holds_the_garment_and_lets_it_go_baked_and_live(ready, trained, tmp_path, ssilk_python):
+    free = bake(ready, trained)
+    skinned = decoded(ssilk_python, model_of(trained), tmp_path, lbs=True)
+    key(trained, {10: 0.0, 20: 1.0})
+    held = bake(ready, trained)
+    off = np.sqrt(((held - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    apart = np.sqrt(((free - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    assert off[:10].max() < 0.01 < 2 * 0.01 < apart[:10].max()
+    assert (np.diff(off[9:19]) > 0).all() and off[19:].min() > 0.01
+    steps = [np.linalg.norm(np.diff(each, axis=0), axis=-1).max() for each in (held, free, skinned)]
+    assert steps[0] < max(steps[1:]) + np.linalg.norm(free - skinned, axis=-1).max() / 10 + 0.01
+    assert np.abs(live(ready, trained) - held).max() < NEAR
+    key(trained, {10: 1.0})
+    ready.ops.ssilk.refresh_live()
+    assert np.abs(shown(ready, trained, FRAMES) - free).max() < NEAR
+
+
+def test_a_slider_without_keys_holds_all_frames_and_is_followed_live(ready, trained, tmp_path, ssilk_python):
+    free = live(ready, trained)
+    trained.ssilk.free = 0.0
+    shown(ready, trained, range(1, 2))
+    ready.ops.ssilk.refresh_live()
+    held = shown(ready, trained, FRAMES)
+    assert np.abs(bake(ready, trained) - held).max() < NEAR
+    skinned = decoded(ssilk_python, model_of(trained), tmp_path, lbs=True)
+    assert np.sqrt(((held - skinned) ** 2).sum(axis=-1).mean()) < 0.01 < np.abs(free - skinned).max()
+
+
+def test_poses_on_twos_are_held_baked_and_live(ready, trained):
+    bones = [bone for bone in ready.data.objects["Rig"].pose.bones if bone.name.startswith("Skirt_proxy")]
+
+    def turns() -> np.ndarray:
+        found = []
+        for frame in FRAMES:
+            ready.context.scene.frame_set(frame)
+            found.append([tuple(bone.rotation_quaternion) for bone in bones])
+        return np.array(found)
+
+    trained.ssilk.hold = 2
+    baked = bake(ready, trained)
+    held = turns()
+    np.testing.assert_array_equal(held[::2], held[1::2])
+    assert (np.abs(np.diff(held[::2], axis=0)).max(axis=(1, 2)) > 1e-5).all()
+    assert np.abs(live(ready, trained) - baked).max() < NEAR
+    assert "A solver moves each frame: set Hold Frames to 1" in refused(ready, trained, quality="hero")
+
+
+def test_edits_of_a_held_garment_are_followed(ready, trained):
+    key(trained, {10: 0.0, 20: 1.0})
+    live(ready, trained)
+    spine = ready.data.objects["Rig"].pose.bones["Spine"]
+    spine.rotation_quaternion = (1, 0.5, 0.3, 0)
+    spine.keyframe_insert("rotation_quaternion", frame=5)
+    stale = shown(ready, trained, range(1, 10))
+    ready.ops.ssilk.refresh_live()
+    np.testing.assert_allclose(shown(ready, trained, range(1, 10)), stale, atol=1e-4)

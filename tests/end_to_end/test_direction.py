@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A garment that is held to linear blend skinning and let go, and poses on twos: as UsdSkel plays them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdSkel
+from ssilk_usd.shots.play import Shot
+
+from ssilk_core.cli import main
+from ssilk_core.network.checkpoint import load_model, save_model
+
+FRAMES = 24
+BAKE = ["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion"]
+HOLD_OFF = 8e-3  # [m] RMS, by which proxies may miss linear blend skinning in the toy
+
+
+@pytest.fixture
+def stage(toy, tmp_path, monkeypatch):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    toy.write_clip(tmp_path / "clip.usda", frames=FRAMES)
+    lively(tmp_path / "model.safetensors", tmp_path / "lively.safetensors")
+    return tmp_path
+
+
+def lively(model, path) -> None:
+    """Write a model whose cloth moves far from linear blend skinning, with weights of its own."""
+    file, rng = load_model(model), np.random.default_rng(1)
+    own = {name: value.copy() for name, value in file.parameters.items()}
+    own["output.2.weight"] *= 20
+    own["output.2.bias"] += rng.normal(scale=0.3, size=own["output.2.bias"].shape).astype(np.float32)
+    own["decoder.skin_offset"] += rng.normal(scale=0.3, size=own["decoder.skin_offset"].shape).astype(np.float32)
+    save_model(path, replace(file, parameters=own))
+
+
+def direct(path, free=None, hold=None, prim: str = "/Hero/Skirt") -> None:
+    """Key a garment in a shot, by an over where the shot has none."""
+    clip = Usd.Stage.Open(str(path))
+    over = clip.OverridePrim(prim)
+    if free is not None:
+        attribute = over.CreateAttribute("ssilk:free", Sdf.ValueTypeNames.Float)
+        for code, value in free.items():
+            attribute.Set(value, code)
+    if hold is not None:
+        over.CreateAttribute("ssilk:hold", Sdf.ValueTypeNames.Int).Set(hold)
+    clip.GetRootLayer().Save()
+
+
+def points_of(path) -> np.ndarray:
+    """Vertices of the garment in all frames, by UsdSkel's own queries, shape (F, V, 3) [m]."""
+    shot = Shot(path)
+    return np.stack([shot.garment_points(time) for time in shot.frame_times])
+
+
+def baked(name: str, motion: str = "clip.usda", *more: str) -> np.ndarray:
+    assert main([*BAKE, motion, "-o", name, *more]) == 0
+    assert main(["verify", name]) == 0
+    return points_of(name)
+
+
+def test_a_garment_without_direction_has_the_bytes_that_it_had(stage):
+    baked("plain.usdc")
+    direct("clip.usda", free={0: 1.0, 10: 1.0}, hold=1)
+    assert main([*BAKE, "clip.usda", "-o", "free.usdc"]) == 0
+    plain, free = (Sdf.Layer.FindOrOpen(name).ExportToString().splitlines() for name in ("plain.usdc", "free.usdc"))
+    differs = [line for line, other in zip(plain, free, strict=True) if line != other]
+    assert all("motion_sha256" in line for line in differs), differs  # which says what it was baked from
+
+
+def test_a_held_garment_is_where_skinning_has_it_and_is_let_go_without_a_jump(stage, capsys):
+    plain, skinned = baked("plain.usdc"), baked("lbs.usdc", "clip.usda", "--lbs")
+    direct("clip.usda", free={8: 0.0, 14: 1.0})
+    capsys.readouterr()
+    found = baked("held.usdc")
+    assert "14 poses are held or let go" in capsys.readouterr().err
+    off = np.sqrt(((found - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    apart = np.sqrt(((plain - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    assert off[:9].max() < HOLD_OFF < 3 * HOLD_OFF < apart[:9].max(), (off, apart)
+    steps = np.linalg.norm(np.diff(found, axis=0), axis=-1).max(axis=1)
+    usual = max(np.linalg.norm(np.diff(each, axis=0), axis=-1).max() for each in (plain, skinned))
+    between = np.linalg.norm(plain - skinned, axis=-1).max()
+    assert steps.max() < usual + between / 6 + HOLD_OFF
+
+
+def poses_of(path) -> list[np.ndarray]:
+    """Local transforms of the proxies, and weights of the blendshapes, in all frames, by UsdSkel's own queries."""
+    stage = Usd.Stage.Open(str(path))
+    cache = UsdSkel.Cache()
+    rig = next(UsdSkel.Skeleton(prim) for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton))
+    cache.Populate(UsdSkel.Root.Find(rig.GetPrim()), Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(rig)
+    first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    codes = np.arange(first, last + 0.5)
+    names = list(query.GetJointOrder())
+    proxies = [number for number, name in enumerate(names) if name not in ("Hips", "Hips/Spine", "Hips/Spine/Head")]
+    local = np.stack([np.array(query.ComputeJointLocalTransforms(code))[proxies] for code in codes])
+    weights = np.stack([np.array(query.GetAnimQuery().ComputeBlendShapeWeights(code)) for code in codes])
+    return [local.reshape(len(codes), -1), weights]
+
+
+def test_on_twos_each_pose_is_held_and_the_cloth_does_not_feel_the_steps_of_its_character(stage):
+    baked("ones.usdc")
+    smooth = baked("twos.usdc", "clip.usda", "--hold", "2")
+    for held, ones in zip(poses_of("twos.usdc"), poses_of("ones.usdc"), strict=True):
+        np.testing.assert_array_equal(held[::2], held[1::2])
+        assert (np.abs(np.diff(held[::2], axis=0)).max(axis=1) > 1e-5).all()
+        assert (np.abs(np.diff(ones, axis=0)).max(axis=1) > 1e-5).all()
+    clip = Usd.Stage.Open("clip.usda")
+    animation = UsdSkel.Animation(clip.GetPrimAtPath("/Clip"))
+    for attribute in (animation.GetRotationsAttr(), animation.GetTranslationsAttr()):
+        for code in range(1, FRAMES, 2):
+            attribute.Set(attribute.Get(code - 1), code)
+    clip.GetRootLayer().Save()
+    direct("clip.usda", hold=2)
+    stepped = baked("stepped.usdc")
+    np.testing.assert_allclose(stepped[::2], smooth[::2], atol=1e-6)
+    np.testing.assert_array_equal(stepped[1::2], stepped[::2])  # the character stands still, too
+    assert np.abs(baked("each.usdc", "clip.usda", "--hold", "1")[1::2] - stepped[1::2]).max() > 1e-4
+
+
+def test_held_poses_are_counted_from_the_first_frame_of_the_range(stage):
+    baked("some.usdc", "clip.usda", "--range", "5-16", "--handles", "2", "--hold", "3")
+    weights = poses_of("some.usdc")[1]  # from frame 3 on
+    assert len(weights) == 16
+    changes = np.flatnonzero(np.abs(np.diff(weights, axis=0)).max(axis=1) > 0) + 1 + 3
+    np.testing.assert_array_equal(changes, [5, 8, 11, 14, 17])
+
+
+def test_samples_within_a_frame_and_another_rate_hold_as_frames_do(stage):
+    direct("clip.usda", free={8: 0.0, 14: 1.0})
+    skinned = baked("lbs.usdc", "clip.usda", "--lbs")
+    ways = ["--samples-per-frame", "2"], ["--fps", "24"], ["--pre-roll", "0.5"], ["--quality", "game"]
+    for more in ways:  # shapes that were cut down leave some millimetres
+        found = baked("held.usdc", "clip.usda", *more)
+        np.testing.assert_allclose(found[0], skinned[0], atol=5e-3 if "game" in more else 1e-6)
+        assert np.abs(found[-1] - skinned[-1]).max() > 0.02
+
+
+def test_what_happened_before_the_garment_was_held_is_forgotten(stage):
+    """It begins anew at rest where it is let go."""
+    direct("clip.usda", free={4: 1.0, 5: 0.0, 9: 0.0, 10: 1.0})
+    whole = baked("whole.usdc")
+    part = baked("part.usdc", "clip.usda", "--range", "9-23")
+    clip = Usd.Stage.Open("clip.usda")
+    clip.GetPrimAtPath("/Hero/Skirt").RemoveProperty("ssilk:free")
+    clip.GetRootLayer().Save()
+    direct("clip.usda", free={9: 0.0, 10: 1.0})
+    np.testing.assert_allclose(whole[9:], baked("late.usdc")[9:], atol=1e-6)
+    np.testing.assert_allclose(whole[9:], part, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "more", [[], ["--refined-output", "points"], ["--feedback"]], ids=["joints", "points", "hero"]
+)
+def test_a_refined_garment_is_held_where_skinning_has_it(stage, more):
+    direct("clip.usda", free={8: 0.0, 14: 1.0})
+    skinned = baked("lbs.usdc", "clip.usda", "--lbs")
+    found = baked("held.usdc", "clip.usda", "--refine", "2", *more)
+    assert np.abs(found[:9] - skinned[:9]).max() < 5.1e-3
+    assert np.abs(found[-1] - skinned[-1]).max() > 0.02
+
+
+def test_a_layer_on_the_garment_of_the_shot_comes_before_its_own_stage(stage):
+    direct("rigged.usda", free={0: 0.0})
+    skinned = baked("lbs.usdc", "clip.usda", "--lbs")
+    np.testing.assert_allclose(baked("home.usdc"), skinned, atol=1e-4)
+    direct("clip.usda", free={0: 0.5})
+    half = baked("half.usdc")
+    direct("clip.usda", free={0: 1.0})
+    np.testing.assert_allclose(half, (skinned + baked("free.usdc")) / 2, atol=0.02)
+    assert np.abs(half - skinned).max() > 0.02
+    assert (
+        main(["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion", "clip.usda", "-o", "layers"]) == 0
+    )
+
+
+@pytest.mark.parametrize(
+    ("free", "hold", "more", "complaint"),
+    [
+        ({3: 0.0, 5: 1.5}, None, [], "ssilk:free is 1.5 at time code 5; 0, held to linear blend skinning, to 1"),
+        ({3: float("nan")}, None, [], "ssilk:free is nan at time code 0"),
+        (None, 0, [], "ssilk:hold is 0; a whole number of frames from 1 to 100 is needed"),
+        (None, 2, ["--refine", "2"], "poses that are held for 2 frames, and --refine"),
+        ({0: 0.0}, None, ["--refine", "2"], "the garment is held in all frames"),
+    ],
+)
+def test_direction_that_cannot_be_followed_is_refused_in_one_sentence(stage, capsys, free, hold, more, complaint):
+    direct("clip.usda", free=free, hold=hold)
+    before = sorted(stage.iterdir())
+    assert main([*BAKE, "clip.usda", "-o", "refused.usdc", *more]) == 2
+    assert complaint in capsys.readouterr().err
+    assert sorted(stage.iterdir()) == before
