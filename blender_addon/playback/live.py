@@ -8,10 +8,14 @@ armature differs from what was read, latents are kept up to that frame and rolle
 What was rolled out stands as keys on tracks of its own while it is played. Every evaluation of the file reads these:
 renders with an unlocked interface, in other scenes and on farms. Only what differs from them by an edit is written
 frame by frame, in the viewport, until the motion is read again.
+
+At a level of quality that is solved for (`solving`), solved frames take the place of the network's as they come in,
+and the keys are put once more when all have come.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
 
@@ -19,6 +23,7 @@ import bpy
 import numpy as np
 from ssilk_usd.shots.skinned import SkinnedGarment
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.network.runtime import Playback
 from ssilk_core.scene.assets import GarmentPose, Motion
 
@@ -40,10 +45,12 @@ from .bake import (
     turns_from_rest,
 )
 from .models import TrainedGarment
+from .solving import SOLVED, Solving, need_solver
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
 PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
 READING = 0.8  # the part of the preparation that is reading, mostly; the rest is rolling
+QUIET = 0.3  # seconds after a pose was found to differ before the motion is solved again
 MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
 
 
@@ -55,13 +62,17 @@ class Live:
         stale: whether the armature does something else by now than what was read.
         unkeyed: why what is played stands not as keys, so that renders lack it; empty where it does.
         model_only: whether a newer model is read, for the motion that was read before.
+        level: of quality, as `GarmentSettings.live_quality` names it.
+        solving: what solves for frames; None where the network alone is played.
+        unsolved: why nothing does though the level asks for it; empty otherwise.
 
     Raises:
-        SetupError: bones or the garment do not deform as ssilk has it.
+        SetupError: bones or the garment do not deform as ssilk has it, or nothing can solve at this level.
     """
 
     def __init__(self, garment: bpy.types.Object, model: Path) -> None:
-        armature = armature_of(garment)
+        armature, self.level = armature_of(garment), garment.ssilk.live_quality
+        need_solver(self.level)
         self.joints = read_joints(armature, garment)
         need_bakeable(garment, armature, self.joints)
         self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
@@ -69,7 +80,11 @@ class Live:
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.done: float | None = None
         self.stale = self.model_only = False
-        self.unkeyed = ""
+        self.unkeyed = self.unsolved = ""
+        self.solving: Solving | None = None
+        self._solved_with = 0.0  # when the model was written that the solver has
+        self._keyed = 0  # solved frames that keys show
+        self._noticed: float | None = None  # when a pose differed that the solver does not know yet
         self.refresh()
 
     def refresh(self) -> None:
@@ -95,6 +110,55 @@ class Live:
     def behind(self) -> bool:
         """Whether the scene's frames or its rate are others by now than those that were read."""
         return self.times != _times()
+
+    def choose(self, level: str) -> None:
+        """Play at another level of quality; where it cannot be solved for, the network is played."""
+        self.close()
+        self.level = level
+        if self.trained:
+            self._prepare_solver()
+        if self.playback:
+            self._follow()
+            self.key_again()
+
+    def close(self) -> None:
+        """End what runs outside."""
+        if self.solving:
+            self.solving.close()
+        self.solving, self._keyed, self._noticed = None, 0, None
+
+    def solve(self) -> bool:
+        """Take in what was solved; return whether more will come."""
+        if self.solving is None or self.playback is None:
+            return False
+        if self._noticed is not None:
+            if time.monotonic() - self._noticed < QUIET and not bpy.app.background:
+                return True
+            self._follow()
+        self.solving.poll()
+        if self.solving.complete and self._keyed < self.solving.total:
+            self.key_again()
+        return self.solving.waits
+
+    @property
+    def busy(self) -> bool:
+        """Whether more is read or solved."""
+        return self.done is not None or bool(self.solving and self.solving.waits) or self.noticed
+
+    @property
+    def noticed(self) -> bool:
+        """Whether a pose was found to differ that the solver does not know yet."""
+        return self._noticed is not None
+
+    @property
+    def wrong(self) -> str:
+        """Why frames are not solved though the level asks for it, in a sentence; empty otherwise."""
+        return self.unsolved or (self.solving.error if self.solving else "")
+
+    @property
+    def solved(self) -> int:
+        """How many frames are solved, from the first one on."""
+        return len(self.solving.frames) if self.solving else 0
 
     def read(self) -> bool:
         """Read a little of the model, then of the motion; return whether there is more.
@@ -132,9 +196,9 @@ class Live:
         index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
-        if not self.stale and not self.unkeyed:
+        if not self.stale and not self.unkeyed and not self._keyed <= index < self.solved:
             return
-        pose = self.playback.pose(index)
+        pose = self.solving.frames[index] if index < self.solved else self.playback.pose(index)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
@@ -181,8 +245,39 @@ class Live:
         except SetupError as error:  # the artist tweaks a strip: it is played nevertheless
             self.unkeyed = str(error)
             return
-        self.unkeyed = ""
-        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
+        self.unkeyed, self._keyed = "", self.solved
+        shown = _joined(poses)
+        if self._keyed:
+            shown = GarmentPose.joined([*self.solving.frames, shown.part(slice(self._keyed, None))])
+        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, shown, first, live=True)
+
+    def key_again(self) -> None:
+        """Let keys show what is known by now, as after an undo, which may have brought back those of before."""
+        if self.playback and not self.stale:
+            self._key(list(self.playback.poses()), self.first)
+
+    def _prepare_solver(self) -> None:
+        """Prepare what solves for frames with the model that was read last, where the level asks for it."""
+        if self.solving and self._solved_with == self._written:
+            return
+        self.close()
+        self.unsolved, self._solved_with = "", self._written
+        if self.level not in SOLVED:
+            return
+        try:
+            garment, armature = self.objects()
+            if not self.ready():
+                raise SetupError(f"'{garment.name}' is not in Object Mode; go there and choose the quality again.")
+            self.solving = Solving(garment, armature, self.model, self.trained, self.level, PRE_ROLL)
+        except SsilkError as error:
+            self.unsolved = str(error)
+
+    def _follow(self) -> None:
+        """Let the solver follow the motion as it is known by now."""
+        self._noticed = None
+        if self.solving:
+            self.solving.follow(_motion(self.trained, self.placed))
+            self._keyed = min(self._keyed, self.solved)
 
     def _need_bones(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
         """Check that no bone that is read or written to was deleted or renamed."""
@@ -207,6 +302,7 @@ class Live:
         placed = np.array(take.worlds)
         playback, poses = yield from self._rolling(self.trained, placed, READING)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
+        self._follow()
         self._key(poses, self.first)
 
     def _rolling(
@@ -242,6 +338,8 @@ class Live:
             playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback, self._written = trained, playback, written
+        self._prepare_solver()
+        self._follow()
         self._key(poses, self.first)
 
     def _dressing(self) -> Iterator[float]:
@@ -257,6 +355,7 @@ class Live:
         self.joints = self._joints_now()
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
+        self._prepare_solver()
         yield 0.0
 
     def _joints_now(self) -> Joints:
@@ -276,6 +375,9 @@ class Live:
             return
         self.placed[index] = placed
         self.playback, self.stale = self.playback.with_motion(_motion(self.trained, self.placed), index), True
+        if self.solving:
+            self.solving.forget_from(index)
+            self._keyed, self._noticed = min(self._keyed, self.solved), time.monotonic()
 
     def _placed(self, armature: bpy.types.Object) -> np.ndarray:
         bones = [armature.pose.bones.find(name) for name in self.joints.character.names]

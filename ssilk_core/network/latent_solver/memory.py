@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from ...scene.assets import Motion
 from .shots import LatentFrame, LatentShots
 
@@ -34,7 +32,7 @@ class _KeptSpan:
 
     def follow(self, motion: Motion) -> LatentFrame | None:
         """Forget all from where another motion differs on; return the frame to go on from, None to begin."""
-        same = _same_frames(self.motion, motion)
+        same = self.motion.same_frames(motion)
         self.motion = motion
         self.ends = {number: frame for number, frame in self.ends.items() if number < same}
         last = max(self.ends, default=-1)
@@ -79,15 +77,3 @@ class LatentMemory:
             for frame in shots.frames([motion], after):
                 kept.add(frame)
                 yield frame, True
-
-
-def _same_frames(one: Motion, other: Motion) -> int:
-    """Return in how many frames, from the first one on, two motions are the same."""
-    count = min(one.frame_count, other.frame_count)
-    if one.rotations.shape[1] != other.rotations.shape[1]:
-        return 0
-    differ = np.zeros(count + 1, dtype=bool)
-    differ[count] = True
-    for name in ("rotations", "translations"):
-        differ[:count] |= (getattr(one, name)[:count] != getattr(other, name)[:count]).any(axis=(1, 2))
-    return int(differ.argmax())
