@@ -25,12 +25,9 @@ def solved_line(played: Live) -> str:
         return "The solver starts; the network is played"
     last = played.first + solving.total - 1
     if solving.waits:
-        done = (
-            f"up to frame {played.first + played.solved - 1} of {last}"
-            if played.solved
-            else f"no frame of {last} yet"
-        )
-        return f"Solved: {done}; then the network is played"
+        if not played.solved:
+            return f"Solves frame {played.first} to {last}; the network is played"
+        return f"Solved up to frame {played.first + played.solved - 1} of {last}; then the network is played"
     lost = f"; {len(solving.lost)} frames were lost and put to rest" if solving.lost else ""
     failed = f"; at {solving.failed} steps nothing lowered the energy" if solving.failed else ""
     return f"Follows the armature, solved up to frame {last}{failed}{lost}"

@@ -179,7 +179,8 @@ def _read() -> float | None:
             if not more:
                 _show_all(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
             return BETWEEN
-    return SOLVING if any([_solve(uid, played) for uid, played in list(_played.items())]) else None
+    waits = [_solve(uid, played) for uid, played in list(_played.items())]
+    return SOLVING if any(waits) else None
 
 
 def _solve(uid: int, played: Live) -> bool:
@@ -316,7 +317,8 @@ def _render_began(scene: bpy.types.Scene, *_: object) -> None:
         if played.unkeyed:
             print(f"SSILK: The render lacks what is played live. {played.unkeyed}")
         if played.wrong:
-            _warnings[uid] = f"The render shows the network's motion. {played.wrong}"
+            name = played.objects()[0].name
+            _warnings[uid] = f"The render shows the network's motion of '{name}': {played.wrong}"
             print(f"SSILK: {_warnings[uid]}")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Frames of a garment that a process outside Blender solves while it is played, in order, as a cache of physics is made.
+"""Frames that a process outside Blender solves while a garment is played, in order, as a cache of physics is made.
 
 The whole motion is sent whenever it changes. The process keeps what it has solved of the one before, and goes on from
 where they differ, so that a late edit costs few frames. Until a frame is there, the network's is played.
@@ -66,7 +66,7 @@ class Solving:
         scene = None if stage.exists() else gather(garment, joints=trained.joints)
         self._temporary = tempfile.TemporaryDirectory(prefix="ssilk-", dir=bpy.app.tempdir or None)
         if scene:
-            given = hand_over(scene, Pair.of(garment, armature), Path(self._temporary.name))
+            given = hand_over(scene, Pair.of(garment, armature), self.folder)
             stage, self._words = given.stage, given.words
         self._command = [
             interpreter(preferences(bpy.context)), "-m", "ssilk_core", "live", str(model), "--stage", str(stage),
@@ -101,11 +101,10 @@ class Solving:
         if self._talk is None:
             self.started = False
             try:
-                self._talk = Conversation(self._command, Path(self._temporary.name))
+                self._talk = Conversation(self._command, self.folder)
             except OSError as error:
-                self.error = (
-                    f"{self._command[0]} cannot be started ({error.strerror or error}); choose another Python."
-                )
+                python, why = self._command[0], error.strerror or error
+                self.error = f"{python} cannot be started ({why}); choose another Python."
                 return
         self._talk.send(LiveMessage.of_motion(self._number, motion))
 
@@ -138,6 +137,11 @@ class Solving:
         self._end_talk()
         self._temporary.cleanup()
 
+    @property
+    def folder(self) -> Path:
+        """Where the process runs; it goes with `close`."""
+        return Path(self._temporary.name)
+
     def _take(self, message: LiveMessage) -> None:
         if message.kind == "done":
             self.complete, self.failed = True, message.numbers["failed"]
@@ -153,5 +157,5 @@ class Solving:
             self._talk = None
 
     def _in_words(self, sentence: str) -> str:
-        sentence = reworded(sentence, Path(self._temporary.name), self._words)
+        sentence = reworded(sentence, self.folder, self._words)
         return with_bones(reworded(sentence, self._model.parent, recall(self._model.parent)), self._bones)

@@ -25,12 +25,9 @@ FRAMES = 9
 ITERATIONS, PRE_ROLL = 2, 0.1
 PATIENCE = 60  # seconds
 REQUEST = BakeRequest(
-    model="model.safetensors",
-    stage="rigged.usda",
-    motion="brief.usda",
-    latent_iterations=ITERATIONS,
+    model="model.safetensors", stage="rigged.usda", motion="brief.usda", latent_iterations=ITERATIONS,
     pre_roll=PRE_ROLL,
-)
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -162,10 +159,11 @@ def test_it_ends_with_its_pipes_at_any_time(start):
     ("said", "complaint"),
     [
         (b"GET / HTTP/1.1\r\n\r\n", "error: standard input: a message that cannot be read: it begins with b'GET '"),
-        (LiveMessage("done", {"number": 0, "frames": 0, "unconverged": 0, "failed": 0}).to_bytes(), "of the kind 'done'"),
+        (LiveMessage("ready", {"joints": 3, "proxies": 4, "shapes": 5}).to_bytes(), "of the kind 'ready'"),
         (LiveMessage.of_motion(0, Motion("m", 30.0, np.ones((2, 9, 4)), np.ones((2, 9, 3)))).to_bytes(), "9 joints"),
         (LiveMessage("motion", {"number": 0, "fps": 30.0, "start": 0.0}, {
-            "rotations": np.ones((2, 3, 4)), "translations": np.full((2, 3, 3), np.nan)}).to_bytes(), "NaN or infinity"),
+            "rotations": np.ones((2, 3, 4)), "translations": np.full((2, 3, 3), np.nan),
+        }).to_bytes(), "NaN or infinity"),
     ],
 )  # fmt: skip
 def test_what_it_cannot_use_ends_it_with_a_sentence(start, said, complaint):
