@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
+from typing import IO, BinaryIO
 
 from ssilk_core.delivery.live.messages import LiveMessage, read_message
 
@@ -32,8 +33,12 @@ class Conversation:
         self._heard: queue.SimpleQueue[LiveMessage] = queue.SimpleQueue()
         self._complaints: deque[str] = deque(maxlen=LAST_WORDS)
         self._unreadable = ""
-        works = (self._write, self._read, self._listen)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
+        works = (
+            (self._write, self._popen.stdin),
+            (self._read, self._popen.stdout),
+            (self._listen, self._popen.stderr),
+        )
+        self._threads = [threading.Thread(target=work, args=(stream,), daemon=True) for work, stream in works]
         for thread in self._threads:
             thread.start()
 
@@ -71,8 +76,7 @@ class Conversation:
         for thread in self._threads:
             thread.join(PATIENCE)
 
-    def _write(self) -> None:
-        stream = self._popen.stdin
+    def _write(self, stream: IO[bytes]) -> None:
         try:
             with stream:
                 while (message := self._unsent.get()) is not None:
@@ -81,15 +85,15 @@ class Conversation:
         except OSError:  # it has ended, and `ending` says why
             return
 
-    def _read(self) -> None:
-        with self._popen.stdout as stream:
+    def _read(self, stream: BinaryIO) -> None:
+        with stream:
             try:
                 while (message := read_message(stream)) is not None:
                     self._heard.put(message)
             except ValueError as error:
                 self._unreadable = str(error)
 
-    def _listen(self) -> None:
-        with self._popen.stderr as stream:
+    def _listen(self, stream: IO[bytes]) -> None:
+        with stream:
             for line in stream:
                 self._complaints.append(line.decode("utf-8", "replace").rstrip())

@@ -44,9 +44,10 @@ def live_line(garment: bpy.types.Object) -> str:
         return "The frame range or the rate changed since the motion was read"
     if played.unkeyed:
         return f"Renders lack it: {played.unkeyed}"
+    solved = solved_line(played)
     if played.stale:
-        return "The motion changed since it was read"
-    return playing.warning(garment) or solved_line(played) or "Follows the armature"
+        return f"The motion changed since it was read{solved and '. '}{solved}"
+    return playing.warning(garment) or solved or "Follows the armature"
 
 
 class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):

@@ -185,11 +185,11 @@ def _read() -> float | None:
 
 def _solve(uid: int, played: Live) -> bool:
     """Take in what was solved for a garment, and show it; return whether more will come."""
-    before = played.solved
+    before, scene = played.solved, bpy.context.scene
     waits = bool(_attempt(uid, played.solve))
-    if played.solved != before or not waits:
-        _show_all(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
-        _redraw_panels()
+    if not waits or before <= scene.frame_current - played.first < played.solved:
+        _show_all(scene, bpy.context.evaluated_depsgraph_get())
+    _redraw_panels()
     return waits
 
 

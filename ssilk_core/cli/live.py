@@ -12,6 +12,7 @@ import argparse
 import os
 import sys
 
+from ..delivery.bake import BakeRequest, load_garment
 from ..delivery.bake.request import ALL_ELEMENTS, LATENT_ELEMENTS, MAX_PRE_ROLL, MAX_REFINE
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
@@ -39,8 +40,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Serve until the input ends."""
-    from ..delivery.bake.load import load_garment
-    from ..delivery.bake.request import BakeRequest
     from ..delivery.live.service import serve
 
     if options.json:

@@ -124,7 +124,7 @@ def test_an_edit_is_solved_from_where_it_begins(ready, trained, windowed):
     spine.rotation_quaternion = (1, 0.5, 0.3, 0)
     spine.keyframe_insert("rotation_quaternion", frame=33)
     playing._read_again(ready.context.scene)  # as Blender tells of edited keys
-    assert line(ready) == "The motion changed since it was read"
+    assert line(ready).startswith("The motion changed since it was read")
     step_until(lambda: live.done is None and not live.stale)
     assert 20 < live.solved < len(FRAMES), "what comes before the edit is kept"
     step_until(lambda: not live.busy)

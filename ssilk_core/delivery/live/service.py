@@ -16,7 +16,7 @@ from ...network.latent_solver import LatentMemory, LatentOptions, LatentRoller
 from ...network.latent_solver.roller import LatentTally
 from ...network.rollout import garment_poses
 from ...scene.assets import Motion
-from ..bake.load import LoadedGarment
+from ..bake import LoadedGarment
 from .messages import LiveMessage, read_message
 
 CHUNK = 4  # frames that are sent at once
