@@ -16,7 +16,7 @@ and the keys are put once more when all have come.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 
 import bpy
@@ -237,8 +237,8 @@ class Live:
         keys = garment.data.shape_keys
         return [armature, *([keys] if self.shapes and keys else [])]
 
-    def _key(self, poses: list[GarmentPose], first: int) -> None:
-        """Let keys show what was rolled out."""
+    def _key(self, poses: Iterable[GarmentPose], first: int) -> None:
+        """Let keys show what was solved, and what was rolled out after it."""
         garment, armature = self.objects()
         try:
             need_tracks(animated(garment, armature))
@@ -246,15 +246,15 @@ class Live:
             self.unkeyed = str(error)
             return
         self.unkeyed, self._keyed = "", self.solved
-        shown = _joined(poses)
-        if self._keyed:
-            shown = GarmentPose.joined([*self.solving.frames, shown.part(slice(self._keyed, None))])
+        solved = self.solving.frames if self.solving else []
+        after = [pose.part(slice(max(self._keyed - pose.start, 0), None)) for pose in poses]
+        shown = GarmentPose.joined([*solved, *after])
         put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, shown, first, live=True)
 
     def key_again(self) -> None:
         """Let keys show what is known by now, as after an undo, which may have brought back those of before."""
         if self.playback and not self.stale:
-            self._key(list(self.playback.poses()), self.first)
+            self._key(self.playback.poses() if self.solved < len(self.placed) else (), self.first)
 
     def _prepare_solver(self) -> None:
         """Prepare what solves for frames with the model that was read last, where the level asks for it."""
@@ -396,17 +396,6 @@ def remove_live_keys(garment: bpy.types.Object) -> None:
 def _times() -> tuple[int, int, float, float]:
     scene = bpy.context.scene
     return scene.frame_start, scene.frame_end, scene_rate(), scene_step()
-
-
-def _joined(poses: list[GarmentPose]) -> GarmentPose:
-    """Return consecutive poses as one."""
-    moved = [pose.translations for pose in poses]
-    return GarmentPose(
-        poses[0].start,
-        np.concatenate([pose.rotations for pose in poses]),
-        np.concatenate([pose.weights for pose in poses]),
-        None if moved[0] is None else np.concatenate(moved),
-    )
 
 
 def _motion(trained: TrainedGarment, placed: np.ndarray) -> Motion:

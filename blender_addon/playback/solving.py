@@ -25,7 +25,8 @@ from ..scene.handover import STAGE, hand_over
 from ..scene.objects import Pair
 from .models import TrainedGarment
 
-SOLVED = tuple(name for name, level in QUALITIES.items() if level.latent_iterations and not level.refine)
+ITERATIONS = ["--latent-iterations", str(QUALITIES["latent"].latent_iterations)]
+SOLVED = {"latent": ITERATIONS, "latent_few": [*ITERATIONS, "--latent-elements", "few"]}  # as 'ssilk live' has them
 
 
 def no_solver(level: str) -> str:
@@ -70,7 +71,7 @@ class Solving:
             stage, self._words = given.stage, given.words
         self._command = [
             interpreter(preferences(bpy.context)), "-m", "ssilk_core", "live", str(model), "--stage", str(stage),
-            "--pre-roll", f"{pre_roll:g}", "--latent-iterations", str(QUALITIES[level].latent_iterations),
+            "--pre-roll", f"{pre_roll:g}", *SOLVED[level],
         ]  # fmt: skip
         self._talk: Conversation | None = None
         self._asked: Motion | None = None

@@ -396,6 +396,10 @@ WORDS = {
     "As Bake solves it: in the Python with ssilk, frame by frame in the background": (
         "Wie beim Backen gelöst: im Python mit ssilk, Bild für Bild im Hintergrund"
     ),
+    "Latent, Few Elements": "Latent, wenige Elemente",
+    "Likewise in a quarter of the time, on a sample of the cloth: less exact": (
+        "Ebenso in einem Viertel der Zeit, auf einer Auswahl des Stoffs: weniger genau"
+    ),
     "Play Live": "Live spielen",
     "Play the trained garment on the armature as it is, frame by frame, without a bake": (
         "Das trainierte Kleidungsstück auf dem Skelett spielen, wie es ist, Bild für Bild, ohne zu backen"

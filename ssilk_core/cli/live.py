@@ -34,7 +34,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
                       help="iterations of the solver in each frame (default %(default)s)")  # fmt: skip
     verb.add_argument("--latent-elements", choices=LATENT_ELEMENTS, default=ALL_ELEMENTS,
                       help="sum the energy over the whole garment (default), or over few of its elements, which are "
-                           "chosen anew for each motion")  # fmt: skip
+                           "chosen for the first motion")  # fmt: skip
     verb.add_argument("--device", default="cpu", help="where it is solved (default cpu)")
 
 

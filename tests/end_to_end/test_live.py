@@ -23,7 +23,7 @@ from ssilk_core.scene.kinematics import deform
 
 FRAMES = 9
 ITERATIONS, PRE_ROLL = 2, 0.1
-PATIENCE = 60  # seconds
+PATIENCE = 300  # seconds, on a busy machine
 REQUEST = BakeRequest(
     model="model.safetensors", stage="rigged.usda", motion="brief.usda", latent_iterations=ITERATIONS,
     pre_roll=PRE_ROLL,
@@ -133,7 +133,7 @@ def test_a_motion_that_changes_takes_the_place_of_the_one_before(start):
         same(found, heard(fresh, 0)[0], 1e-6)
 
 
-def test_few_elements_are_chosen_for_each_motion(start):
+def test_few_elements_are_chosen_for_the_first_motion(start):
     process = start("--latent-elements", "few")
     say(process, 0, motion_of("brief.usda"))
     found, _ = heard(process, 0)

@@ -95,7 +95,7 @@ def serve(garment: LoadedGarment, incoming: BinaryIO, outgoing: BinaryIO) -> Non
         except BrokenPipeError as error:
             raise _OvertakenError from error
 
-    memory = None if options.sampled else LatentMemory()
+    memory = LatentMemory()
     roller = LatentRoller(
         garment.model, garment.file.fabric, options, pre_roll=request.pre_roll, advanced=look_up, memory=memory,
         chunk=CHUNK,
@@ -108,8 +108,7 @@ def serve(garment: LoadedGarment, incoming: BinaryIO, outgoing: BinaryIO) -> Non
         if motion.rotations.shape[1] != sizes["joints"]:
             found = f"a motion of {motion.rotations.shape[1]} joints"
             fail("standard input", found, f"the model's character has {sizes['joints']}")
-        if memory:
-            memory.begin()
+        memory.begin()
         try:
             _answer(asked.numbers["number"], motion, roller, send)
         except _OvertakenError:

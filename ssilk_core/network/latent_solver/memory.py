@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 from ...scene.assets import Motion
-from .shots import LatentFrame, LatentShots
+from .shots import LatentFrame, LatentShots, Sampled
 
 APART = 16  # frames between two that may be gone on from
 
@@ -50,10 +50,14 @@ class _KeptSpan:
 
 
 class LatentMemory:
-    """Keeps what was solved of the motion that is played, one span without cuts after the other."""
+    """Keeps what was solved of the motion that is played, one span without cuts after the other.
+
+    Few elements are those that were chosen for the first span of all.
+    """
 
     def __init__(self) -> None:
         self._spans: list[_KeptSpan] = []
+        self._elements: Sampled | None = None
         self._next = 0
 
     def begin(self) -> None:
@@ -70,10 +74,12 @@ class LatentMemory:
             self._spans.append(_KeptSpan(motion))
         kept = self._spans[self._next]
         self._next += 1
+        if shots.options.sampled and self._elements is None:
+            self._elements = shots.sampled([motion])
         after = kept.follow(motion)
         for frame in list(kept.frames):
             yield frame, False
         if after is None or after.number + 1 < motion.frame_count:
-            for frame in shots.frames([motion], after):
+            for frame in shots.frames([motion], after, self._elements):
                 kept.add(frame)
                 yield frame, True

@@ -10,7 +10,6 @@ from itertools import islice
 import numpy as np
 import torch
 
-from ...errors import fail
 from ...scene.assets import Motion, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import resample, run_up, split_at_cuts
@@ -73,9 +72,6 @@ class LatentRoller:
 
     Attributes:
         tally: of all frames so far.
-
-    Raises:
-        SsilkError: frames are to be kept on few elements, which are chosen for one motion.
     """
 
     def __init__(
@@ -89,8 +85,6 @@ class LatentRoller:
         memory: LatentMemory | None = None,
         chunk: int = CHUNK,
     ) -> None:
-        if memory and options.sampled:
-            fail("latent solver", "few elements", "other motions have others, and no frame can be kept")
         self.model, self.pre_roll, self.advanced = model, pre_roll, advanced
         self.memory, self.chunk = memory, chunk
         self.shots = LatentShots(model, fabric, options)

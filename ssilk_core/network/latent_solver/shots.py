@@ -36,6 +36,7 @@ from .warm_start import Course, FrameDescriptors, NetworkSteps
 LOOK_BACK = 2  # earlier frames that descriptors need
 DESCRIBED, POSED = 256, 16  # frames of each motion at once
 CHOSEN_FROM, CHOSEN_STATES = 8, 32  # motions and states that elements are chosen for, at most
+Sampled = tuple[Simulator, LatentSolver]  # both on few elements
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +111,7 @@ class LatentShots:
         self.steps = NetworkSteps(model)
 
     @torch.no_grad()
-    def sampled(self, motions: Sequence[Motion]) -> tuple[Simulator, LatentSolver]:
+    def sampled(self, motions: Sequence[Motion]) -> Sampled:
         """Return a simulator and a solver on few elements, chosen for what the network does in some motions.
 
         States are taken from at most `CHOSEN_FROM` of the motions, `CHOSEN_STATES` in all.
@@ -142,12 +143,15 @@ class LatentShots:
         return torch.where(sound, states, rest)[:, 0]
 
     @torch.no_grad()
-    def frames(self, motions: Sequence[Motion], after: LatentFrame | None = None) -> Iterator[LatentFrame]:
+    def frames(
+        self, motions: Sequence[Motion], after: LatentFrame | None = None, elements: Sampled | None = None
+    ) -> Iterator[LatentFrame]:
         """Yield the frames of motions without cuts, at the model's rate, all motions at once.
 
         Args:
             motions: of decreasing length; a frame holds those that have not ended.
             after: a frame of motions that are these as far as it; those that follow it are yielded. All by default.
+            elements: as `sampled` returns them, where the options ask for few; chosen for the motions by default.
 
         Raises:
             SsilkError: a motion is not at the model's rate.
@@ -158,7 +162,9 @@ class LatentShots:
         lengths = [motion.frame_count for motion in motions]
         if lengths != sorted(lengths, reverse=True):
             fail("latent solver", "motions of increasing length", "the longest must come first")
-        simulator, solver = self.sampled(motions) if self.options.sampled else (self.simulator, self.solver)
+        simulator, solver = self.simulator, self.solver
+        if self.options.sampled:
+            simulator, solver = elements or self.sampled(motions)
         first, past = 0, None
         if after:
             first, past = after.number + 1, after.past

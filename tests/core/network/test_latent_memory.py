@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.errors import SsilkError
-from ssilk_core.network.latent_solver import LatentMemory, LatentOptions, LatentRoller, memory
+from ssilk_core.network.latent_solver import LatentMemory, LatentOptions, LatentRoller, memory, shots
 from ssilk_core.network.rollout import RolloutBlock
 from ssilk_core.scene.assets import Motion
 from ssilk_core.scene.fabrics import Fabric
@@ -121,6 +120,20 @@ def test_what_follows_is_kept_of_few_frames(scene, toy_motion, roller):
     assert all(frame.past is None and not frame.solution.x.numel() for frame in span.frames)
 
 
-def test_few_elements_are_refused(roller, scene, toy_model):
-    with pytest.raises(SsilkError, match="no frame can be kept"):
-        LatentRoller(toy_model(scene), CLOTH, LatentOptions(sampled=True), memory=LatentMemory())
+def test_few_elements_stay_those_of_the_first_motion(scene, toy_motion, toy_model, monkeypatch):
+    chosen: list[int] = []
+    choose = shots.choose_elements
+    monkeypatch.setattr(shots, "choose_elements", lambda *given: chosen.append(1) or choose(*given))
+    model, solved = toy_model(scene), []
+    settings = LatentOptions(iterations=2, first_iterations=3, sampled=True)
+
+    def few(**options: object) -> LatentRoller:
+        return LatentRoller(model, CLOTH, settings, **options)
+
+    kept, motion = LatentMemory(), changed(toy_motion(scene, FRAMES), FRAMES)
+    lasting = few(memory=kept, advanced=lambda: solved.append(1))
+    np.testing.assert_array_equal(states(list(lasting(motion))), states(list(few()(motion))))
+    assert len(chosen) == 2 and len(solved) == FRAMES
+    kept.begin()
+    other = states(list(lasting(changed(toy_motion(scene, FRAMES), 10))))
+    assert len(chosen) == 2 and 4 <= len(solved) - FRAMES < 4 + APART and np.isfinite(other).all()
