@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -107,15 +108,17 @@ def look(options: argparse.Namespace, subject: Subject, motion: Motion, report: 
         [],
     )
     for name, points in rows.items():
-        read = CachedPoints(
-            lambda _, frames, points=points: points[frames.start : frames.stop], subject.dressed, plain
-        )
+        read = CachedPoints(partial(_frames_of, points), subject.dressed, plain)
         shots.append(PlayedShot(name, subject.dressed, plain, read, body))
-    drawn = Look(*options.size, options.azimuth, workers=2)
+    drawn = Look(options.size[0], options.size[1], options.azimuth, workers=2)
     if options.output:
         sheet_of_shots(options.output, shots, labels=list(rows), columns=6, frames=None, look=drawn, report=report)
     if options.film:
         film_of_shots(options.film, shots, labels=list(rows), look=drawn, report=report)
+
+
+def _frames_of(points: Floats, _: str, frames: range) -> Floats:
+    return points[frames.start : frames.stop]
 
 
 def main() -> None:

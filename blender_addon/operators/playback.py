@@ -9,6 +9,7 @@ from ..errors import SetupError
 from ..motions.shapes import tell_changing_shapes
 from ..playback import playing
 from ..playback.models import model_of, no_model
+from ..playback.solving import no_solver
 from ..scene.garment import unplayable, unplayable_here
 from .reporting import ReportingOperator
 
@@ -26,7 +27,7 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
             return reason
         if playing.live(context.object):
             return f"'{context.object.name}' is played already"
-        return no_model(context.object)
+        return no_model(context.object) or no_solver(context.object.ssilk.live_quality)
 
     def apply(self, context: bpy.types.Context) -> str:
         tell_changing_shapes(self, context.object)

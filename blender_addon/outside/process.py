@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 # Blender's own modules must not reach another Python, nor those of a folder that it happens to stand in.
 FOREIGN = ("PYTHONHOME", "PYTHONPATH", "PYTHONSTARTUP", "__PYVENV_LAUNCHER__")
@@ -50,6 +50,19 @@ def _heeding_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+def started(command: Sequence[str], folder: Path, **pipes: Any) -> subprocess.Popen:
+    """Start a command in a folder, in the environment for another Python.
+
+    Args:
+        pipes: what `subprocess.Popen` takes for its input and its output.
+
+    Raises:
+        OSError: it cannot be started.
+    """
+    with _heeding_interrupts():
+        return subprocess.Popen(command, cwd=folder, env=environment(), creationflags=NEW_GROUP, **pipes)
+
+
 class Process:
     """A running command; its output is collected by threads, so that `lines` never waits."""
 
@@ -59,11 +72,10 @@ class Process:
         Raises:
             OSError: it cannot be started.
         """
-        with _heeding_interrupts():
-            self._popen = subprocess.Popen(
-                command, cwd=folder, env=environment(), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE, encoding="utf-8", errors="replace", creationflags=NEW_GROUP,
-            )  # fmt: skip
+        self._popen = started(
+            command, folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            encoding="utf-8", errors="replace",
+        )  # fmt: skip
         self._said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._complaints: deque[str] = deque(maxlen=LAST_WORDS)
         readers = ((self._popen.stdout, self._said.put), (self._popen.stderr, self._complaints.append))

@@ -7,12 +7,30 @@ import bpy
 
 from ..motions.keys import has_keys
 from ..playback import playing
+from ..playback.live import Live
 from ..playback.models import no_model
 from ..playback.overrides import overriding
 from ..scene.garment import armature_of
 from .base import PlayableGarmentPanel, draw_text, saying_errors
 
-NOT_LIVE = "Plays the network. A solver's motion needs PyTorch, which Blender lacks: bake it with the quality Latent"
+
+def solved_line(played: Live) -> str:
+    """Return how far frames are solved; empty where the network alone is played."""
+    if played.wrong:
+        return f"The network is played: {played.wrong}"
+    solving = played.solving
+    if solving is None:
+        return ""
+    if not solving.started:
+        return "The solver starts; the network is played"
+    last = played.first + solving.total - 1
+    if solving.waits:
+        if not played.solved:
+            return f"Solves frame {played.first} to {last}; the network is played"
+        return f"Solved up to frame {played.first + played.solved - 1} of {last}; then the network is played"
+    lost = f"; {len(solving.lost)} frames were lost and put to rest" if solving.lost else ""
+    failed = f"; at {solving.failed} steps nothing lowered the energy" if solving.failed else ""
+    return f"Follows the armature, solved up to frame {last}{failed}{lost}"
 
 
 def live_line(garment: bpy.types.Object) -> str:
@@ -26,9 +44,10 @@ def live_line(garment: bpy.types.Object) -> str:
         return "The frame range, the rate, Free or Hold Frames changed since the motion was read"
     if played.unkeyed:
         return f"Renders lack it: {played.unkeyed}"
+    solved = solved_line(played)
     if played.stale:
-        return "The motion changed since it was read"
-    return playing.warning(garment) or "Follows the armature"
+        return f"The motion changed since it was read{solved and '. '}{solved}"
+    return playing.warning(garment) or solved or "Follows the armature"
 
 
 class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
@@ -45,7 +64,7 @@ class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
             row.operator("ssilk.refresh_live", text="", icon="FILE_REFRESH")
         else:
             layout.operator("ssilk.play_live", icon="PLAY")
-            draw_text(layout, NOT_LIVE)
+        layout.prop(context.object.ssilk, "live_quality")
         if line:
             draw_text(layout, line)
 

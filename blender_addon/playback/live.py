@@ -8,11 +8,16 @@ armature differs from what was read, latents are kept up to that frame and rolle
 What was rolled out stands as keys on tracks of its own while it is played. Every evaluation of the file reads these:
 renders with an unlocked interface, in other scenes and on farms. Only what differs from them by an edit is written
 frame by frame, in the viewport, until the motion is read again.
+
+At a level of quality that is solved for (`solving`), solved frames take the place of the network's as they come in,
+and the keys are put once more when all have come.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+import time
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +26,9 @@ import numpy as np
 from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ssilk_core.delivery.bake.direction import DirectedPoses, Direction
+from ssilk_core.errors import SsilkError
 from ssilk_core.network.runtime import Playback, Player
+from ssilk_core.physics.world.felt import felt_gravity
 from ssilk_core.scene.assets import GarmentPose, Motion
 from ssilk_core.scene.held import HeldGarment
 
@@ -31,6 +38,7 @@ from ..motions.freedom import freedom, is_held, is_keyed
 from ..motions.keys import has_live_keys, need_tracks, remove_keys
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
 from ..motions.sources import TIMELINE, Source
+from ..motions.world import signature, world_over
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
 from ..scene.objects import found_again, scene_rate, scene_step
@@ -44,10 +52,12 @@ from .bake import (
     turns_from_rest,
 )
 from .models import TrainedGarment
+from .solving import SOLVED, Solving, need_solver
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
 PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
 READING = 0.8  # the part of the preparation that is reading, mostly; the rest is rolling
+QUIET = 0.3  # seconds after a pose was found to differ before the motion is solved again
 MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
 
 
@@ -60,23 +70,32 @@ class Live:
         unkeyed: why what is played stands not as keys, so that renders lack it; empty where it does.
         free: how freely the garment moves in each frame; None where it does throughout, and holds no pose.
         hold: frames that each pose is held.
+        world: gravity and wind that were read; None for the usual gravity and no wind.
         model_only: whether a newer model is read, for the motion that was read before.
+        level: of quality, as `GarmentSettings.live_quality` names it.
+        solving: what solves for frames; None where the network alone is played.
+        unsolved: why nothing does though the level asks for it; empty otherwise.
 
     Raises:
-        SetupError: bones or the garment do not deform as ssilk has it.
+        SetupError: bones or the garment do not deform as ssilk has it, or nothing can solve at this level.
     """
 
     def __init__(self, garment: bpy.types.Object, model: Path) -> None:
-        armature = armature_of(garment)
+        armature, self.level = armature_of(garment), garment.ssilk.live_quality
+        need_solver(self.level)
         self.joints = read_joints(armature, garment)
         need_bakeable(garment, armature, self.joints)
         self.things = tuple((thing.name, thing.session_uid) for thing in (garment, armature))
         self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
-        self.free, self.hold = None, 1
+        self.free, self.hold, self.world = None, 1, None
         self.done: float | None = None
         self.stale = self.model_only = False
-        self.unkeyed = ""
+        self.unkeyed = self.unsolved = ""
+        self.solving: Solving | None = None
+        self._solved_with = 0.0  # when the model was written that the solver has
+        self._keyed = 0  # solved frames that keys show
+        self._noticed: float | None = None  # when a pose differed that the solver does not know yet
         self.refresh()
 
     def refresh(self) -> None:
@@ -109,7 +128,57 @@ class Live:
     def _asked(self) -> tuple[object, ...]:
         """Return what the garment is played over and how, besides what keys say."""
         garment, _ = self.objects()
-        return *_times(), garment.ssilk.hold, None if is_keyed(garment) else garment.ssilk.free
+        own = garment.ssilk.hold, None if is_keyed(garment) else garment.ssilk.free
+        return *_times(), *own, *signature(bpy.context.scene)
+
+    def choose(self, level: str) -> None:
+        """Play at another level of quality; where it cannot be solved for, the network is played."""
+        self.close()
+        self.level = level
+        if self.trained:
+            self._prepare_solver()
+        if self.playback:
+            self._follow()
+            self.key_again()
+
+    def close(self) -> None:
+        """End what runs outside."""
+        if self.solving:
+            self.solving.close()
+        self.solving, self._keyed, self._noticed = None, 0, None
+
+    def solve(self) -> bool:
+        """Take in what was solved; return whether more will come."""
+        if self.solving is None or self.playback is None:
+            return False
+        if self._noticed is not None:
+            if time.monotonic() - self._noticed < QUIET and not bpy.app.background:
+                return True
+            self._follow()
+        self.solving.poll()
+        if self.solving.complete and self._keyed < self.solving.total:
+            self.key_again()
+        return self.solving.waits
+
+    @property
+    def busy(self) -> bool:
+        """Whether more is read or solved."""
+        return self.done is not None or bool(self.solving and self.solving.waits) or self.noticed
+
+    @property
+    def noticed(self) -> bool:
+        """Whether a pose was found to differ that the solver does not know yet."""
+        return self._noticed is not None
+
+    @property
+    def wrong(self) -> str:
+        """Why frames are not solved though the level asks for it, in a sentence; empty otherwise."""
+        return self.unsolved or (self.solving.error if self.solving else "")
+
+    @property
+    def solved(self) -> int:
+        """How many frames are solved, from the first one on."""
+        return len(self.solving.frames) if self.solving else 0
 
     def read(self) -> bool:
         """Read a little of the model, then of the motion; return whether there is more.
@@ -147,9 +216,9 @@ class Live:
         index = min(max(scene.frame_current - self.first, 0), len(self.placed) - 1)
         if index == scene.frame_current - self.first:
             self._take_notice(armature.evaluated_get(depsgraph), index)
-        if not self.stale and not self.unkeyed:
+        if not self.stale and not self.unkeyed and not self._keyed <= index < self.solved:
             return
-        pose = self._pose(index)
+        pose = self.solving.frames[index] if index < self.solved else self._pose(index)
         turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
@@ -168,7 +237,7 @@ class Live:
         index -= index % self.hold
         if self.free[index] == 1:
             return self.playback.pose(index)
-        held, _ = self._held.pose(_motion(self.trained, self.placed[index : index + 1]))
+        held, _ = self._held.pose(self._motion(self.trained, self.placed[index : index + 1]))
         return self._held.blended(held, self.playback.pose(index), self.free[index : index + 1])
 
     def disagrees(self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> bool:
@@ -198,16 +267,50 @@ class Live:
         keys = garment.data.shape_keys
         return [armature, *([keys] if self.shapes and keys else [])]
 
-    def _key(self, poses: list[GarmentPose], first: int) -> None:
-        """Let keys show what was rolled out."""
+    def _key(self, poses: Iterable[GarmentPose], first: int) -> None:
+        """Let keys show what was solved, and what was rolled out after it."""
         garment, armature = self.objects()
         try:
             need_tracks(animated(garment, armature))
         except SetupError as error:  # the artist tweaks a strip: it is played nevertheless
             self.unkeyed = str(error)
             return
-        self.unkeyed = ""
-        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, _joined(poses), first, live=True)
+        self.unkeyed, self._keyed = "", self.solved
+        solved = self.solving.frames if self.solving else []
+        after = [pose.part(slice(max(self._keyed - pose.start, 0), None)) for pose in poses]
+        shown = GarmentPose.joined([*solved, *after])
+        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, shown, first, live=True)
+
+    def key_again(self) -> None:
+        """Let keys show what is known by now, as after an undo, which may have brought back those of before."""
+        if self.playback and not self.stale:
+            self._key(self.playback.poses() if self.solved < len(self.placed) else (), self.first)
+
+    def _prepare_solver(self) -> None:
+        """Prepare what solves for frames with the model that was read last, where the level asks for it."""
+        if self.solving and self._solved_with == self._written:
+            return
+        self.close()
+        self.unsolved, self._solved_with = "", self._written
+        if self.level not in SOLVED:
+            return
+        try:
+            garment, armature = self.objects()
+            if not self.ready():
+                raise SetupError(f"'{garment.name}' is not in Object Mode; go there and choose the quality again.")
+            self.solving = Solving(garment, armature, self.model, self.trained, self.level, PRE_ROLL)
+        except SsilkError as error:
+            self.unsolved = str(error)
+
+    def _follow(self) -> None:
+        """Let the solver follow the motion as it is known by now."""
+        self._noticed = None
+        if self.solving and self.free is not None:
+            self.close()
+            self.unsolved = "A garment that is held is played by the network; a bake at this quality solves for it."
+        if self.solving:
+            self.solving.follow(self._motion(self.trained, self.placed))
+            self._keyed = min(self._keyed, self.solved)
 
     def _need_bones(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
         """Check that no bone that is read or written to was deleted or renamed."""
@@ -232,17 +335,20 @@ class Live:
         need_company(garment, armature, take)
         placed, self.hold, free = np.array(take.worlds), garment.ssilk.hold, freedom(garment, take.frames)
         self.free = free if self.hold > 1 or (free < 1).any() else None
+        self.world = world_over(bpy.context.scene, take.frames, scene_rate())
         if is_held(garment):
             need_movable(armature, self.joints.proxies)
         playback, poses = yield from self._rolling(self.trained, placed, READING)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
+        self._prepare_solver()
+        self._follow()
         self._key(poses, self.first)
 
     def _rolling(
         self, trained: TrainedGarment, placed: np.ndarray, done: float
     ) -> Generator[float, None, tuple[Playback, list[GarmentPose]]]:
         """Return what plays joints to the world, (F, J, 4, 4), with all poses; yield the part that is done."""
-        motion, player, poses = _motion(trained, placed), trained.player, []
+        motion, player, poses = self._motion(trained, placed), trained.player, []
         playback, some = player.play(motion, pre_roll=PRE_ROLL, block=BLOCK), None
         if self.free is not None:
             deformer = player.deformer()
@@ -252,6 +358,14 @@ class Live:
             poses.append(pose)
             yield done + (1 - done) * pose.start / len(placed)
         return playback, poses
+
+    def _motion(self, trained: TrainedGarment, placed: np.ndarray) -> Motion:
+        """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
+        player = trained.player
+        motion = motion_of(placed[:, trained.own], player.skeleton.parents, "the timeline")
+        if player.file.config.descriptors != "relative":  # it names the axes of the world, as `ssilk bake` has it
+            return motion
+        return replace(motion, gravity=felt_gravity(self.world, motion, player.file.scene, player.file.fabric))
 
     def _trained(self) -> TrainedGarment:
         """Read the model, and check that the bones move as it says."""
@@ -273,9 +387,11 @@ class Live:
         self.joints = self._joints_now()
         moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
         if len(moved):
-            playback = playback.with_motion(_motion(trained, self.placed), int(moved[0]))
+            playback = playback.with_motion(self._motion(trained, self.placed), int(moved[0]))
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback, self._written = trained, playback, written
+        self._prepare_solver()
+        self._follow()
         self._key(poses, self.first)
 
     def _dressing(self) -> Iterator[float]:
@@ -291,6 +407,7 @@ class Live:
         self.joints = self._joints_now()
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback = trained, None
+        self._prepare_solver()
         yield 0.0
 
     def _joints_now(self) -> Joints:
@@ -309,7 +426,10 @@ class Live:
         if self._is_as_read(placed, index):
             return
         self.placed[index] = placed
-        self.playback, self.stale = self.playback.with_motion(_motion(self.trained, self.placed), index), True
+        self.playback, self.stale = self.playback.with_motion(self._motion(self.trained, self.placed), index), True
+        if self.solving:
+            self.solving.forget_from(index)
+            self._keyed, self._noticed = min(self._keyed, self.solved), time.monotonic()
 
     def _placed(self, armature: bpy.types.Object) -> np.ndarray:
         bones = [armature.pose.bones.find(name) for name in self.joints.character.names]
@@ -336,22 +456,6 @@ def _rolled(player: Player, motion: Motion, first: int, stop: int, step: int) ->
     gravity = None if motion.gravity is None else motion.gravity[seen]
     part = Motion(motion.path, motion.fps / step, motion.rotations[seen], motion.translations[seen], gravity=gravity)
     return player.play(part, pre_roll=PRE_ROLL, block=BLOCK).poses()
-
-
-def _joined(poses: list[GarmentPose]) -> GarmentPose:
-    """Return consecutive poses as one."""
-    moved = [pose.translations for pose in poses]
-    return GarmentPose(
-        poses[0].start,
-        np.concatenate([pose.rotations for pose in poses]),
-        np.concatenate([pose.weights for pose in poses]),
-        None if moved[0] is None else np.concatenate(moved),
-    )
-
-
-def _motion(trained: TrainedGarment, placed: np.ndarray) -> Motion:
-    """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
-    return motion_of(placed[:, trained.own], trained.player.skeleton.parents, "the timeline")
 
 
 def _written(path: Path) -> float:

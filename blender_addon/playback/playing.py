@@ -23,6 +23,7 @@ from .models import job_of, model_of
 
 PATIENCE = 0.3  # seconds after an edit before the motion is read again
 BETWEEN = 0.01  # seconds between two slices of reading, for the artist
+SOLVING = 0.1  # seconds between two looks at what was solved
 _played: dict[int, Live] = {}
 _reasons: dict[int, str] = {}
 _warnings: dict[int, str] = {}  # about frames of the latest render
@@ -51,6 +52,7 @@ def play(garment: bpy.types.Object) -> None:
     Raises:
         SetupError: it cannot be played.
     """
+    _let_go(garment.session_uid)
     _reasons.pop(garment.session_uid, None)
     _outdated.discard(garment.session_uid)
     _played[garment.session_uid] = Live(garment, model_of(garment))
@@ -60,9 +62,17 @@ def play(garment: bpy.types.Object) -> None:
 
 def stop(garment: bpy.types.Object) -> None:
     """Play a garment no longer; it stays as it is."""
-    _played.pop(garment.session_uid, None)
+    _let_go(garment.session_uid)
     remove_live_keys(garment)
     garment.ssilk.live = False
+
+
+def play_otherwise(garment: bpy.types.Object) -> None:
+    """Play a garment at the level of quality that was chosen for it, where it is played."""
+    played = live(garment)
+    if played and played.level != garment.ssilk.live_quality:
+        _attempt(garment.session_uid, played.choose, garment.ssilk.live_quality)
+        _read_soon(0.0)
 
 
 def refresh(garment: bpy.types.Object) -> None:
@@ -113,7 +123,17 @@ def stop_listening() -> None:
         bpy.app.timers.unregister(_read)
 
 
+def _let_go(uid: int) -> Live | None:
+    """Play a garment no longer; return what played it."""
+    played = _played.pop(uid, None)
+    if played:
+        played.close()
+    return played
+
+
 def _forget() -> None:
+    for uid in list(_played):
+        _let_go(uid)
     for known in (_played, _reasons, _warnings, _outdated):
         known.clear()
 
@@ -135,14 +155,19 @@ def _handlers() -> list[tuple[list, object]]:
 def _read_soon(seconds: float) -> None:
     """Read motions a little at a time; all at once where Blender has no window to keep alive."""
     if bpy.app.background:
-        while _read() is not None:
-            pass
+        _read_all()
     elif not bpy.app.timers.is_registered(_read):
         bpy.app.timers.register(_read, first_interval=seconds)
 
 
+def _read_all() -> None:
+    """Read all motions, and wait for what is solved."""
+    while (pause := _read()) is not None:
+        time.sleep(pause if pause == SOLVING else 0.0)
+
+
 def _read() -> float | None:
-    """Read a little of one motion; return when to be called again."""
+    """Read a little of one motion, or take in what was solved; return when to be called again."""
     if _rendering:
         return PATIENCE
     for uid, played in list(_played.items()):
@@ -154,7 +179,26 @@ def _read() -> float | None:
             if not more:
                 _show_all(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
             return BETWEEN
-    return None
+    waits = [_solve(uid, played) for uid, played in list(_played.items())]
+    return SOLVING if any(waits) else None
+
+
+def _solve(uid: int, played: Live) -> bool:
+    """Take in what was solved for a garment, and show it; return whether more will come."""
+    before, scene = played.solved, bpy.context.scene
+    waits = bool(_attempt(uid, played.solve))
+    if not waits or before <= scene.frame_current - played.first < played.solved:
+        _show_all(scene, bpy.context.evaluated_depsgraph_get())
+    _redraw_panels()
+    return waits
+
+
+def _redraw_panels() -> None:
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            for region in area.regions if area.type == "VIEW_3D" else ():
+                if region.type == "UI":
+                    region.tag_redraw()
 
 
 def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-untyped-def]
@@ -162,7 +206,7 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     try:
         return call(*arguments)
     except SsilkError as error:
-        played = _played.pop(uid, None)
+        played = _let_go(uid)
         _reasons[uid] = str(error)
         if played and played.playback and not _rendering:  # else a file's own keys stay, as where it lacks its model
             for garment in (thing for thing in bpy.data.objects if thing.session_uid == uid):
@@ -172,9 +216,10 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
 
 def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     for uid, played in list(_played.items()):
-        waits = played.done is None
+        waits, known = played.done is None, played.noticed
         _attempt(uid, played.show, scene, depsgraph)
-        if waits and played.done is not None:  # it lost its shapes, and is dressed again
+        lost_shapes = waits and played.done is not None  # and is dressed again
+        if lost_shapes or (played.noticed and not known and not bpy.app.background):
             _read_soon(PATIENCE)
 
 
@@ -233,9 +278,13 @@ def _undone(*_: object) -> None:
         if not found:
             continue
         if not found[0].ssilk.live:
-            del _played[uid]
+            _let_go(uid)
         elif played.done is not None or _attempt(uid, played.missing):
             _attempt(uid, played.dress_again)
+        elif played.level != found[0].ssilk.live_quality:
+            _attempt(uid, played.choose, found[0].ssilk.live_quality)
+        elif played.solved:
+            _attempt(uid, played.key_again)
     _read_soon(PATIENCE)
 
 
@@ -257,17 +306,20 @@ def _render_began(scene: bpy.types.Scene, *_: object) -> None:
         if _attempt(uid, played.is_in, scene):
             _outdated.add(uid)
     if threading.current_thread() is threading.main_thread():
-        while _read() is not None:
-            pass
+        _read_all()
     else:  # the main thread reads, by its timer, while the render waits here
         if not bpy.app.timers.is_registered(_read):
             bpy.app.timers.register(_read)
-        while any(uid in _outdated or played.done is not None for uid, played in list(_played.items())):
+        while any(uid in _outdated or played.busy for uid, played in list(_played.items())):
             time.sleep(BETWEEN)
     _rendering = True
-    for played in _played.values():
+    for uid, played in _played.items():
         if played.unkeyed:
             print(f"SSILK: The render lacks what is played live. {played.unkeyed}")
+        if played.wrong:
+            name = played.objects()[0].name
+            _warnings[uid] = f"The render shows the network's motion of '{name}': {played.wrong}"
+            print(f"SSILK: {_warnings[uid]}")
 
 
 @persistent

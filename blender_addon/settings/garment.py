@@ -7,6 +7,7 @@ import bpy
 from bpy.props import (
     BoolProperty,
     CollectionProperty,
+    EnumProperty,
     FloatProperty,
     IntProperty,
     PointerProperty,
@@ -20,6 +21,12 @@ from . import fabric, training
 from .fabric import FabricSettings
 from .training import RELATIVE, SHOTS, TrainingSettings
 
+LIVE_QUALITIES = [
+    ("NETWORK", "Network", "The network's own motion, at once"),
+    ("latent", "Latent", "As Bake solves it: in the Python with ssilk, frame by frame in the background"),
+    ("latent_few", "Latent, Few Elements", "Likewise in a quarter of the time, on a sample of the cloth: less exact"),
+]
+
 
 def _is_armature(_: object, thing: bpy.types.Object) -> bool:
     return thing.type == "ARMATURE"
@@ -29,6 +36,12 @@ def _tighten(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
     garment = settings.id_data
     if garment.type == "MESH" and garment.mode != "EDIT" and not garment.data.library:
         tighten(garment.data, settings.tightness)
+
+
+def _play_otherwise(settings: bpy.types.PropertyGroup, _: bpy.types.Context) -> None:
+    from ..playback import playing
+
+    playing.play_otherwise(settings.id_data)
 
 
 class BoneMatch(bpy.types.PropertyGroup):
@@ -103,6 +116,13 @@ class GarmentSettings(bpy.types.PropertyGroup):
         override={*SHOTS, "USE_INSERTION"},
     )
     live: BoolProperty(description="Whether the garment is played live", options={"HIDDEN"}, override=SHOTS)
+    live_quality: EnumProperty(
+        name="Quality",
+        description="What is played live",
+        items=LIVE_QUALITIES,
+        update=_play_otherwise,
+        override=SHOTS,
+    )
     awaited: BoolProperty(description="Whether it is played as soon as its training has a model", options={"HIDDEN"})
     heat: StringProperty(description="What the heat map shows; empty for none", options={"HIDDEN"}, override=SHOTS)
     heat_told: StringProperty(

@@ -399,6 +399,16 @@ WORDS = {
     "Show Covered Skin": "Verdeckte Haut zeigen",
     "Show the skin under the garment again": "Die Haut unter dem Kleidungsstück wieder zeigen",
     "Live Playback": "Live-Wiedergabe",
+    "What is played live": "Was live gespielt wird",
+    "Network": "Netzwerk",
+    "The network's own motion, at once": "Die Bewegung des Netzwerks selbst, sofort",
+    "As Bake solves it: in the Python with ssilk, frame by frame in the background": (
+        "Wie beim Backen gelöst: im Python mit ssilk, Bild für Bild im Hintergrund"
+    ),
+    "Latent, Few Elements": "Latent, wenige Elemente",
+    "Likewise in a quarter of the time, on a sample of the cloth: less exact": (
+        "Ebenso in einem Viertel der Zeit, auf einer Auswahl des Stoffs: weniger genau"
+    ),
     "Play Live": "Live spielen",
     "Play the trained garment on the armature as it is, frame by frame, without a bake": (
         "Das trainierte Kleidungsstück auf dem Skelett spielen, wie es ist, Bild für Bild, ohne zu backen"

@@ -24,6 +24,7 @@ VERBS = {
     "reduce": "Cut a trained model down to fewer blendshapes, proxy joints and influences, without training again.",
     "export": "Write a trained model's network as ONNX, for engines that play it themselves.",
     "bake": "Bake trained garments over motions as UsdSkel, and verify it by re-skinning the files.",
+    "live": "Solve for a garment while a program plays its character: what live playback in Blender runs.",
     "remove": "Take garments out of the shots of a folder of layers, and write the stages of these shots again.",
     "simulate": "Simulate a garment over motions without a network: slow and accurate, the reference for models.",
     "skin": "Turn a point cache into joints and blendshapes on the character's skeleton, and verify them.",
@@ -50,6 +51,7 @@ EXTRAS = {
     "reduce": "usd",
     "export": "export",
     "bake": "bake",
+    "live": "bake",
     "remove": "usd",
     "simulate": "train",
     "skin": "train",
@@ -66,7 +68,7 @@ OPTIONAL = ("torch", "pxr", "igl", "scipy", "trimesh", "embreex", "imageio_ffmpe
             "onnxscript")  # fmt: skip
 
 
-TRAINING = ("train", "wardrobe", "demo")  # verbs that train
+BESIDE_OTHERS = ("train", "wardrobe", "demo", "live")  # verbs that train, or share their processor with a program
 
 
 def module_of(verb: str) -> ModuleType:
@@ -107,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return its exit code: 0, 2 bad input, 3 not verified, 4 tasks failed, 130 interrupted."""
     words = sys.argv[1:] if arguments is None else list(arguments)
     report: Reporter = JsonReporter() if "--json" in words else TextReporter()
-    if words[:1] and words[0] in TRAINING:
+    if words[:1] and words[0] in BESIDE_OTHERS:
         # PyTorch's threads otherwise keep cores busy while they wait. Those of `physics.loops` then lack them, and
         # beside other programs a step takes several times as long. This is read when PyTorch is imported.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")

@@ -119,7 +119,8 @@ def live(monkeypatch: Any, **fields: Any) -> Callable[[Any], None]:
     def play(garment: Any) -> None:
         from blender_addon.playback import playing
 
-        monkeypatch.setitem(playing._played, garment.session_uid, SimpleNamespace(**fields))
+        played = SimpleNamespace(close=lambda: None, **fields)
+        monkeypatch.setitem(playing._played, garment.session_uid, played)
 
     return play
 
@@ -146,8 +147,16 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
         ("stale", {"stale": True}),
         ("behind", {"behind": True}),
         ("unkeyed", {"unkeyed": "A strip of 'Rig' is being tweaked; leave tweak mode (Tab) first."}),
+        ("not solved", {"wrong": "its process ended with code -9."}),
+        ("starts to solve", {"solving": SimpleNamespace(started=False)}),
+        ("solves", {"solving": SimpleNamespace(started=True, total=9, waits=True), "solved": 0}),
+        ("solved in part", {"solving": SimpleNamespace(started=True, total=9, waits=True), "solved": 4}),
+        ("solved", {"solving": SimpleNamespace(started=True, total=9, waits=False, lost={3}, failed=2), "solved": 9}),
     ):
-        still = {"done": None, "stale": False, "behind": False, "unkeyed": "", "renewed": False}
+        still = {
+            "done": None, "stale": False, "behind": False, "unkeyed": "", "renewed": False, "wrong": "",
+            "solving": None, "first": 1,
+        }  # fmt: skip
         yield name, live(monkeypatch, **(still | fields))
     yield "another drive", lambda garment: setattr(garment.ssilk, "model", __file__)
     yield "no folder", training(folder / "none")

@@ -18,7 +18,8 @@ def run_with_arguments(*arguments: str) -> str:
 
 # Blender, or a command's help, loads these; other modules of their rooms may load what they need.
 LIGHT = ("physics.constants", "physics.skin.hidden_faces", "training.settings", "training.prediction",
-         "network.runtime", "quality.levels", "delivery.gltf.skinned", "authoring.preflight.finding")  # fmt: skip
+         "network.runtime", "quality.levels", "delivery.gltf.skinned", "delivery.live.messages",
+         "authoring.preflight.finding")  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ Open `solver.py` first. Each frame minimises the simulator's energy over the lat
 stored as the network's frames are, as joints and blendshapes.
 """
 
+from .memory import LatentMemory
 from .options import LatentOptions
 from .roller import LatentRoller, frames_to_solve
 from .solver import LatentSolution, LatentSolver
 
-__all__ = ["LatentOptions", "LatentRoller", "LatentSolution", "LatentSolver", "frames_to_solve"]
+__all__ = ["LatentMemory", "LatentOptions", "LatentRoller", "LatentSolution", "LatentSolver", "frames_to_solve"]

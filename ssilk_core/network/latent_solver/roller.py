@@ -15,6 +15,7 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import resample, run_up, split_at_cuts
 from ..model.network import GarmentModel
 from ..rollout import CHUNK, RolloutBlock
+from .memory import LatentMemory
 from .options import LatentOptions
 from .shots import LatentFrame, LatentShots
 
@@ -65,10 +66,12 @@ class LatentRoller:
         model: on the device to use.
         fabric: of its garment.
         pre_roll: the garment starts at rest so many seconds before a span, in the pose of `run_up`.
-        advanced: called after each frame.
+        advanced: called after each frame that is solved.
+        memory: keeps frames, for motions that begin alike; none by default.
+        chunk: frames of a block.
 
     Attributes:
-        tally: of all frames that were solved so far.
+        tally: of all frames so far.
     """
 
     def __init__(
@@ -79,8 +82,11 @@ class LatentRoller:
         *,
         pre_roll: float = 0.0,
         advanced: Callable[[], object] = lambda: None,
+        memory: LatentMemory | None = None,
+        chunk: int = CHUNK,
     ) -> None:
         self.model, self.pre_roll, self.advanced = model, pre_roll, advanced
+        self.memory, self.chunk = memory, chunk
         self.shots = LatentShots(model, fabric, options)
         self.tally = LatentTally()
 
@@ -93,13 +99,18 @@ class LatentRoller:
         frames = self._solved(played)
         for _ in islice(frames, lead):
             pass
-        for start in range(0, span.frame_count, CHUNK):
-            yield self._block(start, list(islice(frames, CHUNK)))
+        for start in range(0, span.frame_count, self.chunk):
+            yield self._block(start, list(islice(frames, self.chunk)))
 
     def _solved(self, motion: Motion) -> Iterator[LatentFrame]:
-        for frame in self.shots.frames([motion]):
+        if self.memory:
+            frames = self.memory.frames(self.shots, motion)
+        else:
+            frames = ((frame, True) for frame in self.shots.frames([motion]))
+        for frame, is_new in frames:
             self.tally.add(frame)
-            self.advanced()
+            if is_new:
+                self.advanced()
             yield frame
 
     @torch.no_grad()

@@ -37,26 +37,12 @@ from .warm_start import Course, FrameDescriptors, NetworkSteps
 LOOK_BACK = 2  # earlier frames that descriptors need
 DESCRIBED, POSED = 256, 16  # frames of each motion at once
 CHOSEN_FROM, CHOSEN_STATES = 8, 32  # motions and states that elements are chosen for, at most
+Sampled = tuple[Simulator, LatentSolver]  # both on few elements
 
 
 @dataclass(frozen=True, eq=False)
-class LatentFrame:
-    """One frame of N shots.
-
-    Attributes:
-        number: of the frame.
-        solution: of each shot; where it was lost, the state that replaces it.
-        lost: whose state was lost, shape (N,).
-    """
-
-    number: int
-    solution: LatentSolution
-    lost: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class _Past:
-    """The previous states of N shots.
+class LatentPast:
+    """The two latest states of N shots, from which the next frame follows.
 
     Attributes:
         before, now: latents two frames and one frame ago, shape (N, m).
@@ -73,16 +59,33 @@ class _Past:
     roots: Tensor
     recovering: Tensor
 
-    def first(self, count: int) -> _Past:
+    def first(self, count: int) -> LatentPast:
         """Return those of the first shots."""
         before, now = (DecodedState(each.output[:count], each.points[..., :count]) for each in self.course)
         own = self.before[:count], self.now[:count], (before, now), self.cloth.first(count)
-        return _Past(*own, self.roots[..., :count], self.recovering[:count])
+        return LatentPast(*own, self.roots[..., :count], self.recovering[:count])
 
     def followed_by(self, poses: PosedCharacters) -> BodyFrames:
         """Return the character in the next frame."""
         bend = poses.root - 2 * self.roots[1] + self.roots[0]
         return BodyFrames(poses.matrices[None], bend[None])
+
+
+@dataclass(frozen=True, eq=False)
+class LatentFrame:
+    """One frame of N shots.
+
+    Attributes:
+        number: of the frame.
+        solution: of each shot; where it was lost, the state that replaces it.
+        lost: whose state was lost, shape (N,).
+        past: what the next frame follows from; None where that is not kept.
+    """
+
+    number: int
+    solution: LatentSolution
+    lost: Tensor
+    past: LatentPast | None
 
 
 class LatentShots:
@@ -109,7 +112,7 @@ class LatentShots:
         self.steps = NetworkSteps(model)
 
     @torch.no_grad()
-    def sampled(self, motions: Sequence[Motion]) -> tuple[Simulator, LatentSolver]:
+    def sampled(self, motions: Sequence[Motion]) -> Sampled:
         """Return a simulator and a solver on few elements, chosen for what the network does in some motions.
 
         States are taken from at most `CHOSEN_FROM` of the motions, `CHOSEN_STATES` in all.
@@ -141,11 +144,15 @@ class LatentShots:
         return torch.where(sound, states, rest)[:, 0]
 
     @torch.no_grad()
-    def frames(self, motions: Sequence[Motion]) -> Iterator[LatentFrame]:
+    def frames(
+        self, motions: Sequence[Motion], after: LatentFrame | None = None, elements: Sampled | None = None
+    ) -> Iterator[LatentFrame]:
         """Yield the frames of motions without cuts, at the model's rate, all motions at once.
 
         Args:
             motions: of decreasing length; a frame holds those that have not ended.
+            after: a frame of motions that are these as far as it; those that follow it are yielded. All by default.
+            elements: as `sampled` returns them, where the options ask for few; chosen for the motions by default.
 
         Raises:
             SsilkError: a motion is not at the model's rate.
@@ -156,41 +163,50 @@ class LatentShots:
         lengths = [motion.frame_count for motion in motions]
         if lengths != sorted(lengths, reverse=True):
             fail("latent solver", "motions of increasing length", "the longest must come first")
-        simulator, solver = self.sampled(motions) if self.options.sampled else (self.simulator, self.solver)
-        past: _Past | None = None
-        for number, (seen, poses) in enumerate(zip(self._descriptors(motions), self._poses(simulator, motions))):
-            running = motions[: len(seen.rest)]
-            past = past and past.first(len(running))
-            inputs = simulator.inputs(poses, past.cloth if past else None)
+        simulator, solver = self.simulator, self.solver
+        if self.options.sampled:
+            simulator, solver = elements or self.sampled(motions)
+        first, past = 0, None
+        if after:
+            first, past = after.number + 1, after.past
+            assert past is not None
+        seen, posed = self._descriptors(motions, first), self._poses(simulator, motions, first)
+        for number, (described, poses) in enumerate(zip(seen, posed), first):
+            past = past and past.first(len(described.rest))
+            inputs, running = simulator.inputs(poses, past.cloth if past else None), motions[: len(described.rest)]
             if any(motion.gravity is not None for motion in running):
                 inputs = replace(inputs, gravity=_gravity(running, number, inputs.gravity))
-            frame, past = self._advance(inputs, solver, number, past, poses, seen)
+            frame = self._advance(inputs, solver, number, past, poses, described)
+            past = frame.past
             yield frame
 
-    def _poses(self, simulator: Simulator, motions: Sequence[Motion]) -> Iterator[PosedCharacters]:
-        """Yield the characters in each frame of the motions that have not ended; some frames are posed at once."""
+    def _poses(self, simulator: Simulator, motions: Sequence[Motion], first: int) -> Iterator[PosedCharacters]:
+        """Yield the characters in each frame from `first` on of the motions that have not ended.
+
+        Some frames are posed at once, the same ones wherever frames begin, so that rounding is the same.
+        """
         device = simulator.gravity.device
-        for start in range(0, motions[0].frame_count, POSED):
+        for start in range(first - first % POSED, motions[0].frame_count, POSED):
             running = [motion for motion in motions if motion.frame_count > start]
             spans = [motion.clip(start, start + POSED) for motion in running]
             counts = torch.tensor([span.frame_count for span in spans], device=device)
             posed = simulator.poser.pose(*(
                 np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
             ))  # fmt: skip
-            first = counts.cumsum(0) - counts
-            for frame in range(spans[0].frame_count):
-                yield posed.select(first[counts > frame] + frame)
+            rows = counts.cumsum(0) - counts
+            for frame in range(max(first - start, 0), spans[0].frame_count):
+                yield posed.select(rows[counts > frame] + frame)
 
-    def _descriptors(self, motions: Sequence[Motion]) -> Iterator[FrameDescriptors]:
-        """Yield what the network sees in each frame of the motions that have not ended."""
-        for start in range(0, motions[0].frame_count, DESCRIBED):
+    def _descriptors(self, motions: Sequence[Motion], first: int) -> Iterator[FrameDescriptors]:
+        """Yield what the network sees in each frame from `first` on of the motions that have not ended."""
+        for start in range(first - first % DESCRIBED, motions[0].frame_count, DESCRIBED):
             stop = start + DESCRIBED
             parts = [
                 self.steps.described(*self._described(motion, start, stop))
                 for motion in motions
                 if motion.frame_count > start
             ]
-            for frame in range(len(parts[0].rest)):
+            for frame in range(max(first - start, 0), len(parts[0].rest)):
                 running = [part for part in parts if len(part.rest) > frame]
                 yield FrameDescriptors(
                     torch.stack([part.rest[frame] for part in running]),
@@ -215,11 +231,11 @@ class LatentShots:
         inputs: StepInputs,
         solver: LatentSolver,
         number: int,
-        past: _Past | None,
+        past: LatentPast | None,
         poses: PosedCharacters,
         seen: FrameDescriptors,
-    ) -> tuple[LatentFrame, _Past]:
-        """Return a frame, and the states for the next one."""
+    ) -> LatentFrame:
+        """Return the frame after those that have passed."""
         rest = seen.rest.to(solver.potential.dtype)
         if past is None:
             starts, iterations = [rest], self.options.first_iterations
@@ -237,7 +253,8 @@ class LatentShots:
         now = self.steps.decoded(found.z, poses.matrices)
         before, earlier, root = (past.now, past.course[1], past.roots[1]) if past else (found.z, now, poses.root)
         roots, recovering = torch.stack([root, poses.root]), (recovering - 1).clamp_min(0)
-        return LatentFrame(number, found, lost), _Past(before, found.z, (earlier, now), cloth, roots, recovering)
+        passed = LatentPast(before, found.z, (earlier, now), cloth, roots, recovering)
+        return LatentFrame(number, found, lost, passed)
 
 
 def _gravity(motions: Sequence[Motion], frame: int, usual: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from .incremental_potential import IncrementalPotential
 from .membrane import Membrane
 
 MAX_STITCHES = 64
+IN_PART = 3  # pairs of faces of a part of the garment, at least
 NO_ELEMENTS: Ints = np.zeros(0, dtype=np.int64)
 OWNED_AT_ONCE = 4096  # vertices whose distances to all chosen ones are in memory
 
@@ -68,7 +69,8 @@ def spread_evenly(count: int, most: int) -> Ints:
 def spread_pairs(scene: Scene, count: int) -> Ints:
     """Return the vertices of about `count` pairs of adjacent faces, far from each other at rest.
 
-    Each island has some, and so has each class of vertices.
+    Each class of vertices has some in each part that hangs together, such as a strip of a fringe: `IN_PART` pairs,
+    fewer where there are many parts. A part without enough of them would move as it likes.
     """
     mesh, groups = scene.garment.mesh, _groups(scene)
     pairs = topology.hinges(mesh.faces)
@@ -81,7 +83,7 @@ def cubature_between(scene: Scene, whole: IncrementalPotential, vertices: Ints) 
 
     Args:
         whole: the potential of the scene's garment.
-        vertices: some of each island and class; those of a few stitches are added.
+        vertices: some of each part, as `spread_pairs` has them; those of a few stitches are added.
     """
     mesh, stitches = scene.garment.mesh, NO_ELEMENTS
     if whole.stitching:
@@ -98,18 +100,21 @@ def cubature_between(scene: Scene, whole: IncrementalPotential, vertices: Ints) 
 
 
 def _groups(scene: Scene) -> Ints:
-    """Return a number of each vertex's class and island, shape (V,)."""
-    mesh = scene.garment.mesh
-    return topology.islands(mesh.faces, mesh.vertex_count) * 4 + scene.classes
+    """Return a number of what each vertex hangs together with in its own class, such as its strip, shape (V,)."""
+    mesh, classes = scene.garment.mesh, scene.classes
+    edges = topology.edges(mesh.faces)
+    return topology.components(edges[classes[edges[:, 0]] == classes[edges[:, 1]]], mesh.vertex_count)
 
 
 def _spread(points: Floats, groups: Ints, count: int) -> Ints:
     """Return about `count` indices of points (E, 3), far from each other, some of each group (E,)."""
     chosen: list[int] = []
-    for number in np.unique(groups):
+    numbers = np.unique(groups)
+    least = max(1, min(IN_PART, 2 * count // len(numbers)))
+    for number in numbers:
         own = np.flatnonzero(groups == number)
         part, apart = [own[0]], np.full(len(own), np.inf)
-        while len(part) < min(len(own), max(1, round(count * len(own) / len(points)))):
+        while len(part) < min(len(own), max(least, round(count * len(own) / len(points)))):
             apart = np.minimum(apart, ((points[own] - points[part[-1]]) ** 2).sum(axis=1))
             part.append(own[apart.argmax()])
         chosen.extend(part)

@@ -60,6 +60,20 @@ class Motion:
     def frame_count(self) -> int:
         return len(self.rotations)
 
+    def same_frames(self, other: Motion) -> int:
+        """Return in how many frames, from the first one on, another motion is the same; in none at another rate."""
+        count = min(self.frame_count, other.frame_count)
+        if self.fps != other.fps or self.rotations.shape[1] != other.rotations.shape[1]:
+            return 0
+        if (self.gravity is None) != (other.gravity is None):
+            return 0
+        turned = (self.rotations[:count] != other.rotations[:count]).any(axis=(1, 2))
+        moved = (self.translations[:count] != other.translations[:count]).any(axis=(1, 2))
+        changed = turned | moved
+        if self.gravity is not None and other.gravity is not None:
+            changed |= (self.gravity[:count] != other.gravity[:count]).any(axis=1)
+        return int(np.append(changed, True).argmax())
+
     def clip(self, start: int, stop: int) -> Motion:
         """Return frames `start` (inclusive) to `stop` (exclusive) as a separate motion."""
         return replace(

@@ -5,20 +5,30 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.network.checkpoint import load_model
 from ssilk_core.network.latent_solver import LatentOptions, elements
 from ssilk_core.network.latent_solver.elements import choose_elements
 from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.simulate.characters import PosedCharacters
-from ssilk_core.physics.simulate.cubature import Cubature, cubature_between, sampled_potential, spread_evenly
-from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.physics.simulate.cubature import (
+    Cubature,
+    cubature_between,
+    sampled_potential,
+    spread_evenly,
+    spread_pairs,
+)
+from ssilk_core.scene.assets import LOOSE, Motion, Scene
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.mesh import topology
 
 pytestmark = pytest.mark.usefixtures("few_contacts")
 
@@ -69,6 +79,24 @@ def whole(
 def error(pair: tuple[Tensor, Tensor]) -> float:
     right, found = pair
     return float((found - right).norm() / right.norm())
+
+
+def test_each_strip_has_elements_and_vertices_that_stand_for_it_alone() -> None:
+    """Strips of a fringe hang side by side: one without elements moves as it likes, as those of the skirt did."""
+    scene = load_model(shipped_path("fringe_skirt")).scene
+    mesh, loose = scene.garment.mesh, scene.classes == LOOSE
+    hung = topology.edges(mesh.faces)
+    strips = topology.components(hung[loose[hung].all(axis=1)], mesh.vertex_count)
+    large = [number for number, size in zip(*np.unique(strips[loose], return_counts=True)) if size > 50]
+    assert len(large) >= 30
+    potential = SimpleNamespace(
+        stitching=None, hinges=None, membrane=SimpleNamespace(area=torch.ones(len(mesh.faces), 1))
+    )  # fmt: skip
+    found = cubature_between(scene, potential, spread_pairs(scene, elements.PAIRS))
+    own = strips[mesh.faces[found.faces]]
+    assert all((own == number).all(axis=1).sum() >= 2 for number in large)
+    stands_for = found.vertices[found.owners]
+    assert all((strips[stands_for[strips == number]] == number).all() for number in large)
 
 
 def test_all_elements_are_the_whole_garment(whole, monkeypatch) -> None:

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ssilk live` on the toy world: a process that is fed with poses answers as a bake does, and ends with its pipe."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.shots.play import Shot
+
+from ssilk_core.delivery.bake import BakeRequest, bake, load_rollout
+from ssilk_core.delivery.bake.latents import solved
+from ssilk_core.delivery.live.messages import LiveMessage, read_message
+from ssilk_core.scene.assets import GarmentPose, Motion
+from ssilk_core.scene.kinematics import deform
+
+FRAMES = 9
+ITERATIONS, PRE_ROLL = 2, 0.1
+PATIENCE = 300  # seconds, on a busy machine
+REQUEST = BakeRequest(
+    model="model.safetensors", stage="rigged.usda", motion="brief.usda", latent_iterations=ITERATIONS,
+    pre_roll=PRE_ROLL,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(toy, tmp_path_factory):
+    folder = toy.copy(tmp_path_factory.mktemp("live"))
+    toy.write_clip(folder / "brief.usda", frames=FRAMES)
+    toy.write_clip(folder / "film.usda", frames=FRAMES, fps=24.0)
+    return folder
+
+
+@pytest.fixture
+def there(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def start(there) -> Iterator[Callable[..., subprocess.Popen]]:
+    """Starts the process in the toy world; kills what a test has left."""
+    started: list[subprocess.Popen] = []
+
+    def begin(*words: str, stage: str = "rigged.usda") -> subprocess.Popen:
+        command = [sys.executable, "-m", "ssilk_core", "live", "model.safetensors", "--stage", stage]
+        process = subprocess.Popen(
+            [*command, "--pre-roll", str(PRE_ROLL), *words],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+        started.append(process)
+        return process
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.wait()
+        for stream in (process.stdin, process.stdout, process.stderr):
+            with suppress(BrokenPipeError):
+                stream.close()
+
+
+def say(process: subprocess.Popen, number: int, motion: Motion) -> None:
+    process.stdin.write(LiveMessage.of_motion(number, motion).to_bytes())
+    process.stdin.flush()
+
+
+def heard(process: subprocess.Popen, number: int) -> tuple[GarmentPose, LiveMessage]:
+    """All frames of a motion, in order, and what is said at its end."""
+    poses: list[GarmentPose] = []
+    while (message := read_message(process.stdout)) is not None:
+        if message.numbers.get("number") != number:
+            continue
+        if message.kind == "done":
+            assert [pose.start for pose in poses] == list(np.cumsum([0, *(p.frame_count for p in poses[:-1])]))
+            return GarmentPose.joined(poses), message
+        poses.append(message.pose())
+    raise AssertionError(process.stderr.read().decode())
+
+
+def motion_of(path: str) -> Motion:
+    rollout = load_rollout(replace(REQUEST, motion=path))
+    return read_motion(path, rollout.deformer.scene.character.skeleton)
+
+
+def same(found: GarmentPose, wanted: GarmentPose, tolerance: float) -> None:
+    for name in ("rotations", "weights", "translations"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("clip", ["brief.usda", "film.usda"])
+def test_it_answers_with_what_a_bake_writes(start, clip):
+    process = start("--latent-iterations", str(ITERATIONS))
+    ready = read_message(process.stdout)
+    assert ready.kind == "ready" and ready.numbers == {"joints": 3, "proxies": 4, "shapes": 5}
+    say(process, 3, motion_of(clip))
+    found, done = heard(process, 3)
+    baking = solved(load_rollout(replace(REQUEST, motion=clip)))
+    same(found, GarmentPose.joined(baking.latents.poses), 1e-6)
+    bake(replace(REQUEST, motion=clip), "shot.usda")
+    shot = Shot("shot.usda")
+    skinned = np.stack([shot.garment_points(time) for time in shot.frame_times])  # by UsdSkel
+    np.testing.assert_allclose(deform(baking.deformer, baking.motion, found), skinned, rtol=0, atol=1e-5)
+    assert np.ptp(found.rotations, axis=0).max() > 1e-3
+    told = baking.latents.summary
+    assert (done.numbers["frames"], done.numbers["failed"]) == (told.frames, told.failed)
+    process.stdin.close()
+    assert process.wait(PATIENCE) == 0 and process.stderr.read() == b""
+
+
+def test_a_motion_that_changes_takes_the_place_of_the_one_before(start):
+    process, motion = start(), motion_of("brief.usda")
+    translations = motion.translations.copy()
+    translations[5:, 0, 0] += 0.1
+    other = replace(motion, translations=translations)
+    say(process, 0, motion)
+    say(process, 1, other)  # before the first one is solved
+    overtaken, _ = heard(process, 1)
+    say(process, 2, motion)
+    before, _ = heard(process, 2)
+    assert np.abs(before.rotations - overtaken.rotations)[5:].max() > 1e-4
+    same(before.part(slice(5)), overtaken.part(slice(5)), 1e-7)
+    for found, wanted in ((overtaken, other), (before, motion)):
+        fresh = start()
+        say(fresh, 0, wanted)
+        same(found, heard(fresh, 0)[0], 1e-6)
+
+
+def test_few_elements_are_chosen_for_the_first_motion(start):
+    process = start("--latent-elements", "few")
+    say(process, 0, motion_of("brief.usda"))
+    found, _ = heard(process, 0)
+    same(found, GarmentPose.joined(solved(load_rollout(replace(REQUEST, latent_elements="few"))).latents.poses), 1e-6)
+
+
+def test_it_ends_with_its_pipes_at_any_time(start):
+    motion = motion_of("brief.usda")
+    early, late, deaf = start(), start(), start()
+    early.stdin.close()
+    assert early.wait(PATIENCE) == 0
+    for process in (late, deaf):
+        assert read_message(process.stdout).kind == "ready"
+        say(process, 0, motion)
+    late.stdin.close()
+    deaf.stdout.close()
+    assert late.wait(PATIENCE) == 0
+    deaf.stdin.close()
+    assert deaf.wait(PATIENCE) == 0
+
+
+@pytest.mark.parametrize(
+    ("said", "complaint"),
+    [
+        (b"GET / HTTP/1.1\r\n\r\n", "error: standard input: a message that cannot be read: it begins with b'GET '"),
+        (LiveMessage("ready", {"joints": 3, "proxies": 4, "shapes": 5}).to_bytes(), "of the kind 'ready'"),
+        (LiveMessage.of_motion(0, Motion("m", 30.0, np.ones((2, 9, 4)), np.ones((2, 9, 3)))).to_bytes(), "9 joints"),
+        (LiveMessage("motion", {"number": 0, "fps": 30.0, "start": 0.0}, {
+            "rotations": np.ones((2, 3, 4)), "translations": np.full((2, 3, 3), np.nan),
+        }).to_bytes(), "NaN or infinity"),
+    ],
+)  # fmt: skip
+def test_what_it_cannot_use_ends_it_with_a_sentence(start, said, complaint):
+    process = start()
+    process.stdin.write(said)
+    process.stdin.flush()
+    assert process.wait(PATIENCE) == 2
+    (line,) = process.stderr.read().decode().splitlines()
+    assert complaint in line
+
+
+def test_a_character_without_a_body_and_events_as_json_are_refused(start, there):
+    from pxr import Usd
+
+    shutil.copy("rigged.usda", "bare.usda")
+    stage = Usd.Stage.Open("bare.usda")
+    stage.RemovePrim("/Hero/Body")
+    stage.GetRootLayer().Save()
+    bare, json = start(stage="bare.usda"), start("--json")
+    assert bare.wait(PATIENCE) == 2 and "body" in bare.stderr.read().decode()
+    assert json.wait(PATIENCE) == 2 and b"messages go there" in json.stdout.read()
