@@ -17,7 +17,7 @@ from torch import Tensor
 from ..files import split_location
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
-from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
+from ..physics.energy.frames import FRAMES_PER_CHUNK, ContactDistances, energy_terms
 from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.figures import INTERSECTION, SelfIntersections
@@ -26,6 +26,7 @@ from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
 from ..scene.assets import Motion, Scene
+from .inner_garments import InnerGarments
 from .motion_bank import LatentModel, MotionBank, roll_states
 from .newton_steps import NewtonSteps
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -87,6 +88,7 @@ class Validator:
         frames: most frames of a clip.
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
         contours: those of the garment, whose energy is a term where training has it.
+        inner: garments beneath, all of which are worn; contact with them is part of that with the body.
     """
 
     def __init__(
@@ -101,13 +103,14 @@ class Validator:
         group: ProcessGroup = SINGLE_PROCESS,
         spans: Sequence[Motion] | None = None,
         contours: IntersectionContours | None = None,
+        inner: InnerGarments | None = None,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
         self.cloth = contours.cloth if contours else ClothIntersections.of(scene) if can_find() else None
-        self.contours = contours
+        self.contours, self.inner = contours, inner
         self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -196,7 +199,7 @@ class Validator:
 
     def _step_errors(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> StepErrors | None:
         """Return what single steps of a model miss; all processes of the group get the same."""
-        if model is None:
+        if model is None or self.inner:  # the solver knows no inner garments
             return None
         energy, square = self.missed_by_steps(model, states, MEASURED_STEPS[self.rest.is_cuda])
         if not len(energy):
@@ -254,6 +257,13 @@ class Validator:
         """Return the states of each clip; a process of a group may have no clips."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
+    def _met(self, clip: range, start: int, count: int) -> ContactDistances:
+        """Return contacts with the body and with inner garments in so many frames of a range of the bank."""
+        if self.inner is None:
+            return self.contacts
+        frames = torch.arange(start, start + count, device=self.rest.device)
+        return self.inner.over(self.contacts, self.inner.held(clip, self.clips, frames, self.down))
+
     @torch.no_grad()
     def _clip_terms(self, clip: range, model: LatentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
@@ -270,7 +280,8 @@ class Validator:
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.pose(character, limbs=False)
-            terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
+            contacts = self._met(clip, start, x.shape[-1])
+            terms = energy_terms(self.energy, x, lbs, contacts, posed, joined, self.fps, self.down)
             if self.contours:
                 terms[INTERSECTION] = self.contours.energy(x)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})

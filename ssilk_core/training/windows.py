@@ -40,6 +40,7 @@ class WindowSampler:
         heading: likewise how a slot is turned about gravity, for absolute descriptors; None for relative ones.
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
+        inner: what inner garments keep from window to window, by name (`InnerGarments.attach`); nothing by default.
     """
 
     def __init__(self, bank: MotionBank, config: TrainConfig, latent: int, generator: torch.Generator) -> None:
@@ -62,6 +63,7 @@ class WindowSampler:
         self.heading = random_headings(self.direction, generator) if bank.is_absolute else None
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
+        self.inner: dict[str, Tensor] = {}
 
     def _fresh(self) -> Tensor:
         pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
@@ -113,7 +115,7 @@ class WindowSampler:
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
         names = ("first", "direction", "latents", "carried", *(() if self.heading is None else ("heading",)))
-        return {name: getattr(self, name) for name in names}
+        return {name: getattr(self, name) for name in names} | self.inner
 
     def state(self) -> dict[str, Tensor]:
         """Return all that a resumed run needs to continue exactly, random state included."""
