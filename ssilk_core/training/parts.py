@@ -139,7 +139,8 @@ def build_parts(
         contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
     inner = None
     if job.over:
-        report(Message(f"{format_count(len(job.over), 'inner garments')} are put beneath"))
+        listed = ", ".join(f"'{one.name}'" for one in job.over)
+        report(Message(f"beneath it are put {listed}, and where it can touch them is found"))
         samples, beside = energy.cloth.samples, (bank, held, joints, kind)
         found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
         inner = found if len(found) else None
