@@ -128,6 +128,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
+                **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
         )

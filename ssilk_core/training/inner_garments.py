@@ -24,6 +24,7 @@ from ..network.model.network import GarmentModel
 from ..physics.collision import Contacts, PosedBody, reachable_cloth
 from ..physics.collision.inner_cloth import InnerCloth, Planes
 from ..physics.collision.samples import ContactSamples
+from ..physics.intersections.layers import ClothLayers, LayerCounts
 from ..scene.assets import Motion, Scene, Skeleton
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .motion_bank import MotionBank, build_bank, roll_states
@@ -113,6 +114,7 @@ class InnerGarments:
 
     Attributes:
         names: of those that the outer garment can touch; others are left out.
+        layers: what counts how the outer garment lies over each.
         vertex_count: of theirs that can be touched.
 
     Args:
@@ -139,6 +141,8 @@ class InnerGarments:
     ) -> None:
         device, skeleton = bank.static.device, scene.character.skeleton
         self.names: list[str] = []
+        self.layers: list[ClothLayers] = []
+        outer, body = scene.garment.mesh, scene.character.merged_body().mesh
         self._garments: list[_Garment] = []
         for each in inner:
             beneath = replace(each.file.scene, character=scene.character)
@@ -160,6 +164,7 @@ class InnerGarments:
                     _sharing(held_bank, held, skeleton, *own, fps, np.inf),
                 )
             self.names.append(each.name)
+            self.layers.append(ClothLayers((outer.path.rpartition("/")[2], each.name), outer, mesh, body))
             self._garments.append(_Garment(model, *banks, cloth))
             self._tell_beneath(each.name, cloth, scene, samples, mesh.points, report)
         self.vertex_count = sum(len(one.cloth.vertices) for one in self._garments)
@@ -249,16 +254,40 @@ class InnerGarments:
             frames: from the clip's start, (N,).
             down: direction of gravity, (3,).
         """
-        positions = []
-        for number, one in enumerate(self._garments):
-            if number not in self._states:
-                self._states[number] = roll_states(one.model, one.held, clips, down)
-            own = self._states[number]
-            first = next(at for at, whole in enumerate(clips) if whole.start <= clip.start < whole.stop)
-            states = own[first][clip.start - clips[first].start + frames]
-            positions.append(one.positions(states, one.held.character(clip.start + frames)))
+        every = enumerate(self._garments)
+        positions = [
+            self._posed(number, clip, clips, frames, down).index_select(0, one.cloth.vertices)
+            for number, one in every
+        ]
         here = torch.ones(len(frames), dtype=torch.bool, device=frames.device)
         return Beneath(positions, [here] * len(self._garments))
+
+    def _posed(self, number: int, clip: range, clips: Sequence[range], frames: Tensor, down: Tensor) -> Tensor:
+        """Return all of an inner garment in frames of a clip to validate on [m], shape (V, 3, N)."""
+        one = self._garments[number]
+        if number not in self._states:
+            self._states[number] = roll_states(one.model, one.held, clips, down)
+        first = next(at for at, whole in enumerate(clips) if whole.start <= clip.start < whole.stop)
+        states = self._states[number][first][clip.start - clips[first].start + frames]
+        return one.model.vertices(states, one.held.character(clip.start + frames))
+
+    @torch.no_grad()
+    def counts(
+        self, x: Tensor, clip: range, clips: Sequence[range], frames: Tensor, down: Tensor, numbers: Sequence[int]
+    ) -> list[LayerCounts]:
+        """Count how an outer garment x (V, 3, N) lies over each inner one in frames of a clip, as `held` takes them.
+
+        Args:
+            numbers: of the frames, by which they are told.
+        """
+
+        def listed(points: Tensor) -> list[np.ndarray]:
+            return list(points.permute(2, 0, 1).double().cpu().numpy())
+
+        return [
+            layers.counts(listed(x), listed(self._posed(number, clip, clips, frames, down)), numbers)
+            for number, layers in enumerate(self.layers)
+        ]
 
     def over(self, contacts: Contacts, beneath: Beneath) -> LayeredContacts:
         """Return contacts with the body and with inner garments."""

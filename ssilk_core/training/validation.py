@@ -20,7 +20,8 @@ from ..physics.energy import TERMS, GarmentEnergy
 from ..physics.energy.frames import FRAMES_PER_CHUNK, ContactDistances, energy_terms
 from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
 from ..physics.intersections.contours import IntersectionContours
-from ..physics.intersections.figures import INTERSECTION, SelfIntersections
+from ..physics.intersections.figures import INTERSECTION, LayerFigures, SelfIntersections
+from ..physics.intersections.layers import LayerCounts
 from ..physics.intersections.pairs import can_find
 from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
@@ -53,6 +54,7 @@ class Score:
             the garment covers nothing.
         intersections: share of the triangles that intersect others, in `CROSSED_FRAMES` spread likewise; None without
             libigl.
+        layers: how the garment lies over each inner one, in the same frames.
         step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
     """
 
@@ -62,6 +64,7 @@ class Score:
     shown_skin: ShownSkin | None = None
     intersections: SelfIntersections | None = None
     step_errors: StepErrors | None = None
+    layers: tuple[LayerFigures, ...] = ()
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
@@ -72,6 +75,7 @@ class Score:
             "shown_skin": shown and ShownSkin(**shown),
             "intersections": crossed and SelfIntersections(**crossed),
             "step_errors": steps and StepErrors(**steps),
+            "layers": tuple(LayerFigures(**each) for each in document.get("layers", ())),
         }
         return cls(**{**document, **parts})
 
@@ -145,7 +149,9 @@ class Validator:
         terms = {name: joined[name] for name in (*TERMS, INTERSECTION) if name in joined}
         shown, crossed = self._shown(model, states), self._crossed(model, states)
         steps = self._step_errors(model, states)
-        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps)
+        return Score(
+            terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps, self._layers(model, states)
+        )
 
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
@@ -164,6 +170,26 @@ class Validator:
             return cloth.counts(list(x.permute(2, 0, 1).double().cpu().numpy()), numbers)
 
         return cloth.figures(self._counted(model, states, CROSSED_FRAMES, count))
+
+    @torch.no_grad()
+    def _layers(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> tuple[LayerFigures, ...]:
+        """Return how the garment lies over each inner one; all processes of the group get the same."""
+        inner = self.inner
+        if inner is None:
+            return ()
+        own, spread = range(self.group.rank, len(self.clips), self.group.size), self._spread(CROSSED_FRAMES)
+        found = dict[int, list[LayerCounts]]()
+        for clip, latents in zip(own, states):
+            if chosen := spread[clip]:
+                numbers = [self.first[clip] + frame for frame in chosen]
+                x, _ = self._posed(model, latents, self.clips[clip], chosen)
+                at = torch.tensor(chosen, device=self.rest.device)
+                found[clip] = inner.counts(x, self.clips[clip], self.clips, at, self.down, numbers)
+        joined = {clip: each for part in self.group.gather(found) for clip, each in part.items()}
+        return tuple(
+            layers.figures([(self.names[clip], joined[clip][number]) for clip in sorted(joined)])
+            for number, layers in enumerate(inner.layers)
+        )
 
     @torch.no_grad()
     def _counted(

@@ -20,6 +20,7 @@ import pytest
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
+from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list
 from ssilk_core.training.wardrobe.panel import ProgressTable, table
@@ -84,6 +85,15 @@ WRONG = {
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, light, final, paper is"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
+    "over": (
+        '[cape]\nstage = "a"\nmotions = "b"\nover = ["shirt"]',
+        "key 'over': no such garment; it is one of cape",
+    ),
+    "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"shirt\"], is needed"),
+    "over twice": (
+        '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
+        "key 'over': a, b are worn over one another",
+    ),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
 
@@ -93,6 +103,14 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
     with pytest.raises(SsilkError) as error:
         listed(tmp_path, text)
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_inner_garments_come_first(tmp_path):
+    text = '[defaults]\nstage = "a"\nmotions = "b"\nover = ["shirt"]\n[coat]\nover = ["vest", "tights.safetensors"]\n'
+    found = listed(tmp_path, text + "[vest]\n[shirt]\n[hat]\nover = []\n")
+    assert [entry.name for entry in found] == ["shirt", "vest", "coat", "hat"]
+    assert [entry.over for entry in found] == [(), ("shirt",), ("vest",), ()]
+    assert found[2].words[-2:] == ("--over", "tights.safetensors")
 
 
 BAD = {
@@ -348,6 +366,37 @@ def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
     assert [event["event"] for event in said] == ["message", "failed"] and "torn.usda" in said[-1]["error"]
     assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())
     assert load_model("out/skirt.safetensors").provenance["train"]["seed"] == 3
+
+
+def test_an_outfit_is_trained_from_the_inside_out(world, capsys):
+    """Inner garments first; what changes within is worn anew by what is over it; a failure stops what lies over it."""
+    short = LIST.replace("iterations = 120", "iterations = 6").partition("[skirt]")[0]
+    outfit = '[coat]\nover = ["skirt"]\n[skirt]\nset = { seed = 3 }\n[cloak]\nover = ["torn"]\n'
+    outfit += '[torn]\nmotions = "torn.usda"\n'
+    Path("list.toml").write_text(short + outfit)
+    command = shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json")
+
+    def states() -> dict[str, str]:
+        main(command)
+        events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+        told = [event["name"] for event in events if event["event"] == "garment"]
+        assert told.index("skirt") < told.index("coat")
+        plans.append([event["said"].get("text") for event in events if event["event"] == "garment"])
+        failures.append([event["said"].get("error") for event in events if event["event"] == "garment"])
+        return {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
+
+    plans: list[list[str]] = []
+    failures: list[list[str]] = []
+    expected = {"skirt": "finished", "coat": "finished", "torn": "failed", "cloak": "failed"}
+    assert states() == expected
+    assert any(error and "it is worn over 'torn', of which there is no model" in error for error in failures[0])
+    assert not Path("out/cloak.log").exists()
+    over = load_model("out/coat.safetensors").provenance["over"]
+    assert over == {"skirt": sha256(Path("out/skirt.safetensors"))}
+    assert states() == expected and plans[1].count("finished before; skipped") == 2
+    Path("list.toml").write_text(short + outfit.replace("seed = 3", "seed = 4"))
+    assert states() == expected and "finished before; skipped" not in plans[2]
+    assert load_model("out/coat.safetensors").provenance["over"] != over
 
 
 def test_two_processes_train_one_garment_and_one_of_them_speaks(world, toy):

@@ -68,7 +68,7 @@ class InnerCloth:
         *,
         device: torch.device,
     ) -> None:
-        faces = _turned_away(inner, scene.character.merged_body().mesh)
+        faces = turned_away(inner, scene.character.merged_body().mesh)
         faces = faces[touched[inner.faces].any(axis=1)]
         used = np.unique(faces)
         place = np.full(inner.vertex_count, -1)
@@ -159,7 +159,7 @@ class InnerCloth:
         return self.contact_distance(x, y) + self.half
 
 
-def _turned_away(inner: Mesh, body: Mesh) -> Ints:
+def turned_away(inner: Mesh, body: Mesh) -> Ints:
     """Return the triangles of an inner garment, counter-clockwise as seen from outside the body, shape (F, 3)."""
     import igl
 

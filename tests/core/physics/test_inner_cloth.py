@@ -10,7 +10,7 @@ import trimesh
 
 from ssilk_core.physics.collision import nearest_planes, reachable_cloth
 from ssilk_core.physics.collision.contacts import no_planes
-from ssilk_core.physics.collision.inner_cloth import DEEPEST, InnerCloth, _turned_away
+from ssilk_core.physics.collision.inner_cloth import DEEPEST, InnerCloth, turned_away
 from ssilk_core.physics.collision.samples import vertex_samples
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.scene.assets import Mesh
@@ -109,7 +109,7 @@ def test_cloth_is_turned_away_from_the_body_whatever_its_winding(scene, flipped)
     mixed = kept.copy()
     mixed[::3] = mixed[::3, ::-1]
     faces = mixed[:, ::-1] if flipped else mixed
-    found = _turned_away(Mesh("/shirt", ball.vertices + [0, 1.15, 0], faces), scene.character.merged_body().mesh)
+    found = turned_away(Mesh("/shirt", ball.vertices + [0, 1.15, 0], faces), scene.character.merged_body().mesh)
     corners = ball.vertices[found]
     out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert ((out * corners.mean(axis=1)).sum(axis=1) > 0).all()
@@ -122,7 +122,7 @@ def test_both_layers_of_a_fold_are_turned_away(scene):
     joint = np.array([[last + k, 81 + last + k, last + k + 1] for k in range(count - 1)])
     upper_faces = upper.faces[:, ::-1] + under.vertex_count  # goes on around the fold, as one piece of cloth
     folded = Mesh("/hood", np.r_[under.points, upper.points], np.r_[under.faces, upper_faces, joint])
-    found = _turned_away(folded, scene.character.merged_body().mesh)[: 2 * len(under.faces)]
+    found = turned_away(folded, scene.character.merged_body().mesh)[: 2 * len(under.faces)]
     corners = folded.points[found]
     out = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (out[:, 1] > 0).all()

@@ -26,8 +26,9 @@ from ssilk_core.training.state import learned_tensors, load_state, state_path
 pytestmark = pytest.mark.usefixtures("few_contacts")
 CPU = torch.device("cpu")
 SHORT = TrainConfig(
-    iterations=10, static_fraction=0.3, recombinations=0, perturbations=0, pretraining_batch=6, batch=3, static_batch=4,
-    window=5, state_reuse=0.8, learning_rate_warmup=2, ema_decay=0.9, validate_every=5, valid_frames=12, seed=7,
+    iterations=10, static_fraction=0.3, recombinations=0, perturbations=0, pretraining_batch=6, batch=3,
+    static_batch=4, window=5, state_reuse=0.8, learning_rate_warmup=2, ema_decay=0.9,
+    validate_every=5, valid_frames=12, seed=7,
 )  # fmt: skip
 
 
@@ -48,7 +49,8 @@ def inner(scene, toy_model, tmp_path_factory) -> InnerModel:
 def asked(scene, toy_motion, inner, tmp_path) -> TrainJob:
     motions = [toy_motion(scene, 60, path="/a"), toy_motion(scene, 45, speed=1.7, path="/b")]
     return TrainJob(
-        scene=moved(scene, [0, 0, -0.012]), motions=motions, held_out=[toy_motion(scene, 40, speed=1.3, path="/held")],
+        scene=moved(scene, [0, 0, -0.012]), motions=motions,
+        held_out=[toy_motion(scene, 40, speed=1.3, path="/held")],
         model=ModelConfig(latent=6, widths=(16,), shapes=3), train=SHORT, fabric=Fabric("toy", bending=1e-4),
         output=tmp_path / "coat.safetensors", device="cpu", over=[inner],
     )  # fmt: skip
@@ -65,9 +67,10 @@ def test_inner_garments_roll_along_as_they_play_alone(asked, inner):
     down = torch.tensor([0.0, -1.0, 0.0])
     expected = [
         one.positions(z[:20], one.bank.character(torch.arange(start, start + 20)))
-        for z, start in zip(roll_states(one.model, one.bank, [range(0, 60), range(60, 105)], down), (0, 60))
+        for z, start in zip(roll_states(one.model, one.bank, [range(60), range(60, 105)], down), (0, 60))
     ]
     frames, direction = torch.tensor([7]), down[None]
+    worn = None
     for at in (0, 3, 6, 9):
         found = parts.inner.window(sampler, frames, direction)
         moving = found.positions[0][..., :-1].unflatten(2, (3, 2))
@@ -75,10 +78,11 @@ def test_inner_garments_roll_along_as_they_play_alone(asked, inner):
             torch.testing.assert_close(moving[..., slot], expected[slot][..., at + 2 : at + 5], atol=1e-5, rtol=0)
         still = one.model.initial(one.bank.static_descriptor(frames, direction))
         torch.testing.assert_close(found.positions[0][..., -1:], one.positions(still, one.bank.character(frames)))
-        worn = sampler.inner["inner.0.worn"].clone()
+        kept = sampler.inner["inner.0.worn"].clone()
+        assert worn is None or torch.equal(kept, worn)
+        worn = kept
         sampler.advance(sampler.latents)
-        assert sampler.carried.all() and (at == 0 or torch.equal(worn, before))
-        before = worn
+        assert sampler.carried.all()
 
 
 def test_a_garment_learns_with_and_without_what_is_beneath(asked, monkeypatch):
@@ -155,7 +159,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(asked, tmp_path):
 def test_a_model_says_what_it_was_trained_over(asked, inner):
     train(asked, silent)
     assert load_model(asked.output).provenance["over"] == {"shirt": inner.sha256}
-    with pytest.raises(SsilkError, match="another over|another shirt"):
+    with pytest.raises(SsilkError, match="another shirt"):
         train(replace(asked, resume=True, over=[replace(inner, sha256="0" * 64)]), silent)
 
 
