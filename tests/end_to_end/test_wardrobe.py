@@ -89,7 +89,7 @@ WRONG = {
         '[cape]\nstage = "a"\nmotions = "b"\nover = ["shirt"]',
         "key 'over': no such garment; it is one of cape",
     ),
-    "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"shirt\"], is needed"),
+    "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"a\"], is needed"),
     "over twice": (
         '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
         "key 'over': a, b are worn over one another",
@@ -369,7 +369,7 @@ def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
 
 
 def test_an_outfit_is_trained_from_the_inside_out(world, capsys):
-    """Inner garments first; what changes within is worn anew by what is over it; a failure stops what lies over it."""
+    """Inner garments come first; what lies over one that changed is trained anew, and over one that failed not at all."""
     short = LIST.replace("iterations = 120", "iterations = 6").partition("[skirt]")[0]
     outfit = '[coat]\nover = ["skirt"]\n[skirt]\nset = { seed = 3 }\n[cloak]\nover = ["torn"]\n'
     outfit += '[torn]\nmotions = "torn.usda"\n'

@@ -16,6 +16,7 @@ from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
+from .layers import LayersMeter, layers_section
 from .page import Section, figure, table
 from .player import played
 from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
@@ -47,16 +48,22 @@ def shot_sections(
         garments: those to measure.
         bodies: the meshes that garments collide with, at rest, by their index in the player.
     """
-    meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
+    whole = joined(list(bodies.values()))
+    meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps) for each in garments]
+    named = {each.index: (player.meshes[each.index].name, each.mesh) for each in garments}
+    layers = LayersMeter(named, whole)
     told = Countdown(len(player.frame_times), report)
     for time in player.frame_times:
         points = player.points(time)
         body = np.concatenate([points[index] for index in bodies]) if bodies else None
         for each, meter in zip(garments, meters):
             meter.add(points[each.index], body, time)
+        layers.add(points, time)
         told()
     first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
-    return [first, Section("The shot", played([player]), plays=True), *others]
+    over = layers.figures("the shot")
+    between = [layers_section(over)] if over else []
+    return [first, Section("The shot", played([player]), plays=True), *between, *others]
 
 
 def joined(meshes: Sequence[Mesh]) -> Mesh | None:

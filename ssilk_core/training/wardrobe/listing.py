@@ -62,7 +62,7 @@ KEYS = {
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
-    "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["shirt"],'),
+    "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["a"],'),
 }
 MODEL = ".safetensors"  # what 'over' names that ends so is a file; all else is a garment of the list
 NEEDED = ("stage", "motions")
