@@ -63,4 +63,3 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     other = baked(capsys, "coat.safetensors tights.safetensors", "other")
     (text,) = [text for text in told(other) if "trained over" in text]
     assert "walk/coat: it was trained over 'skirt', and tights of this shot is another model" in text
-

@@ -80,7 +80,7 @@ def _counted(folder: Path, shot: str, outer: str, inner: str) -> LayerFigures:
     from ssilk_usd.shots.play import Shot
 
     from ...physics.intersections.layers import ClothLayers
-    from ..report.shots import joined
+    from ...scene.mesh.joined import joined
 
     over, under = (_Layer(Shot(Layout(folder, name, shot).animation)) for name in (outer, inner))
     cloth = ClothLayers((outer, inner), over.rest, under.rest, joined([*over.bodies, *under.bodies]))

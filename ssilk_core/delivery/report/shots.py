@@ -12,6 +12,7 @@ from ...events import Countdown, Reporter, silent
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
 from ...scene.fabrics import Fabric
+from ...scene.mesh.joined import joined
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
 from ..view.render import Image, render
@@ -64,15 +65,6 @@ def shot_sections(
     over = layers.figures("the shot")
     between = [layers_section(over)] if over else []
     return [first, Section("The shot", played([player]), plays=True), *between, *others]
-
-
-def joined(meshes: Sequence[Mesh]) -> Mesh | None:
-    """Return meshes as one, in their order; None for none."""
-    if not meshes:
-        return None
-    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
-    return Mesh(meshes[0].path, np.concatenate([mesh.points for mesh in meshes]), faces)
 
 
 def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
