@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..delivery.bake import BakeTask, LayerFolder, plan_layers
+from ..delivery.bake.layered import tell_layers
 from ..delivery.farm.job import FarmJob, submitted
 from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
@@ -93,6 +94,9 @@ def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporte
     layers = LayerFolder(options.output)
     layers.remove_unfinished(tasks)
     layers.write_stages([outcome.task for outcome in ended if outcome.result], report)
+    fresh = (outcome.task.shot for outcome in ended if outcome.result and not outcome.result.current)
+    for shot in dict.fromkeys(fresh):
+        tell_layers(layers.path, shot, report)
     results = [outcome.result for outcome in ended if outcome.result]
     current, failed = sum(result.current for result in results), len(ended) - len(results)
     report(Result("farm", {"baked": len(results) - current, "current": current, "failed": failed}))

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result, Started
 from ..files import replacing
-from ..physics.intersections.figures import SelfIntersections
+from ..physics.intersections.figures import LAYERS, LayerFigures, SelfIntersections
 from ..physics.skin.figures import ShownSkin
 from ..scene.fabrics import Fabric
 from .options import check_output
@@ -66,7 +66,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _told(figures: dict[str, Any]) -> dict[str, object]:
     """Return the figures of each garment in words."""
     found: dict[str, object] = {}
+    over = figures.get(LAYERS, {})
+    for outer, inner in over.items():
+        found |= {f"{outer} over {each['inner']}": str(LayerFigures(**each)) for each in inner}
     for name, own in figures.items():
+        if own is over:
+            continue
         skin = own.get("shown_skin")
         found[name] = str(ShownSkin(**skin)) if skin else "it covers no skin"
         if crossed := own.get("intersections"):

@@ -69,6 +69,15 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="keep the initialiser and decoder of a trained model of this scene, and train its stepper on, or a new "
         "one where it steps otherwise: for other motion, in a third of the time",
     )
+    verb.add_argument(
+        "--over",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="MODEL",
+        help="a trained garment that is worn beneath this one, on the same character (repeatable): it plays along "
+        "while this one learns to lie on it, and to be worn without",
+    )
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
@@ -119,6 +128,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
+                **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
         )
@@ -139,6 +149,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
 
     from ..files import sha256
     from ..network.checkpoint import load_model
+    from ..training.inner_garments import InnerModel
     from ..training.job import TrainJob, split_motions
 
     if not options.preset:
@@ -162,8 +173,10 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     base = load_model(trained) if trained else None
     if base:
         _need_settings_of(base.config, model, train, options)
+    over = [InnerModel.load(path) for path in options.over]
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
+    files |= {*options.over}
     return TrainJob(
         scene=scene,
         motions=motions,
@@ -178,6 +191,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         minutes=options.minutes,
         base=base,
         whole=options.start_from is not None,
+        over=over,
     )
 
 

@@ -12,7 +12,15 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     garment = "cape.usdc"
     set = { iterations = 100000 }
 
-Other keys are valid, fabric and material. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
+    [skirt]
+    garment = "skirt.usdc"
+    over = ["tights"]
+
+    [tights]
+    garment = "tights.usdc"
+
+Other keys are valid, fabric and material. Garments named by 'over' are trained first, and worn beneath; a name that
+ends in .safetensors is a model file. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
 command, given again, skips what is finished and resumes what was interrupted; a garment whose entry or inputs have
 changed is trained again. Ctrl-C stops all trainings after their current step, a second Ctrl-C at once. A garment that
 fails does not stop the others.
@@ -22,7 +30,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..devices import default_preset
@@ -31,7 +39,7 @@ from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, T
 from ..files import need_writable, sha256
 from ..training.wardrobe.listing import WardrobeEntry, read_list
 from ..training.wardrobe.panel import ProgressTable, table
-from ..training.wardrobe.queue import End, Queue, Slot
+from ..training.wardrobe.queue import CommandTask, End, Queue, Slot
 from ..training.wardrobe.training import GarmentTraining
 from ..work_record import request_key
 from . import options as shared
@@ -59,8 +67,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
-    requests = [_request(options.parser, entry, options.list, device) for entry in entries]
-    trainings = [GarmentTraining(entry, options.output, request) for entry, request in zip(entries, requests)]
+    requests, known = dict[str, str](), dict[str, GarmentTraining]()
+    for entry in entries:
+        requests[entry.name] = _request(options.parser, entry, options.list, device, requests)
+    for entry in entries:
+        known[entry.name] = GarmentTraining(entry, options.output, requests[entry.name], known)
+    trainings = [*known.values()]
     options.output.mkdir(parents=True, exist_ok=True)
     show = report if options.json else ProgressTable([entry.name for entry in entries])
     show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
@@ -95,8 +107,22 @@ def _train(
         if training.plan:
             tell(name, Message(training.plan))
     with stop_on_signals(show) as stop:
-        tasks = (training.begin(source, device) for training in trainings if training.state == "waiting")
-        Queue(slots, tell, ended).run(lambda: next(tasks, None), stop)
+        left = [training for training in trainings if training.state == "waiting"]
+
+        def take() -> CommandTask | None:
+            """Return the next training of which the inner garments are there."""
+            for training in [*left]:
+                failed = [inner.entry.name for inner in training.inner if inner.state == "failed"]
+                if failed:
+                    left.remove(training)
+                    training.skip(failed[0])
+                    show(GarmentEvent(training.entry.name, Failed(training.error)))
+                elif all(inner.state == "finished" for inner in training.inner):
+                    left.remove(training)
+                    return training.begin(source, device)
+            return None
+
+        Queue(slots, tell, ended).run(take, stop)
 
 
 def _slots(device: str, jobs: int | None) -> tuple[str, list[Slot]]:
@@ -119,8 +145,13 @@ def _visible_gpus() -> list[str]:
     return [name.strip() for name in visible.split(",")][:count] if visible else [str(n) for n in range(count)]
 
 
-def _request(parser: argparse.ArgumentParser, entry: WardrobeEntry, path: Path, device: str) -> str:
+def _request(
+    parser: argparse.ArgumentParser, entry: WardrobeEntry, path: Path, device: str, inner: Mapping[str, str]
+) -> str:
     """Return a hash of what is asked for a garment of the list at `path`, with the preset that a device stands for.
+
+    Args:
+        inner: the hashes of the garments that it may be worn over, by name.
 
     Raises:
         SsilkError: there is no such file, or 'ssilk train' would not take it.
@@ -136,7 +167,8 @@ def _request(parser: argparse.ArgumentParser, entry: WardrobeEntry, path: Path, 
         if not file.is_file():
             fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
     words = entry.words if options.preset else [*entry.words, "--preset", default_preset(device)]
-    return request_key(words, [(file.name, sha256(file)) for file in files])
+    over = [(f"over {name}", inner[name]) for name in entry.over]
+    return request_key(words, [*((file.name, sha256(file)) for file in files), *over])
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
@@ -144,4 +176,5 @@ def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
-    return [folder / options.stage, folder / shared.wardrobe(options)[0], *motions]
+    inner = [folder / model for model in options.over]
+    return [folder / options.stage, folder / shared.wardrobe(options)[0], *motions, *inner]

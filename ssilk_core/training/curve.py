@@ -59,7 +59,8 @@ def summary(score: Score) -> dict[str, Any]:
         "intersections": score.intersections,
         "step_errors": score.step_errors,
     }
-    measured = {name: asdict(part) for name, part in parts.items() if part}
+    measured: dict[str, Any] = {name: asdict(part) for name, part in parts.items() if part}
+    measured |= {"layers": [asdict(part) for part in score.layers]} if score.layers else {}
     return {
         **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **measured
     }  # fmt: skip

@@ -17,6 +17,7 @@ from ..network.settings import ModelConfig
 from ..scene.assets import LOOSE, PINNED, Motion, Scene
 from ..scene.fabrics import Fabric
 from ..scene.mesh.stitches import find_stitches
+from .inner_garments import InnerModel, need_wearable
 from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .settings import TrainConfig
@@ -46,6 +47,7 @@ class TrainJob:
         base: a trained model of the same scene that training goes on from; None to train anew.
         whole: whether all networks of `base` learn, with its settings. Otherwise its initialiser and decoder stay as
             they are while a new stepper learns.
+        over: trained garments that are worn beneath this one, in some of the windows.
     """
 
     scene: Scene
@@ -61,8 +63,10 @@ class TrainJob:
     minutes: float | None = None
     base: ModelFile | None = None
     whole: bool = False
+    over: Sequence[InnerModel] = ()
 
     def __post_init__(self) -> None:
+        need_wearable(self.over, self.scene, self.model.fps)
         if self.base:
             _need_same_scene(self.base, self.scene)
         if self.base and self.whole:
@@ -139,6 +143,7 @@ class TrainJob:
                 "held out": _frames(self.held_out),
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
+                **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
             }
         )
 

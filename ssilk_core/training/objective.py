@@ -15,6 +15,7 @@ from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.figures import INTERSECTION
 from ..physics.skinning import Skinning
 from ..scene.assets import SkinWeights
+from .inner_garments import Beneath, InnerGarments
 from .latent_regularization import LATENT_SCALE, latent_distortion
 from .motion_bank import MotionBank
 from .newton_distance import NewtonDistance
@@ -36,6 +37,7 @@ class Objective:
         newton_weight: see `NewtonDistance`; zero for the energy alone.
         clearance, patches: see `settings.TrainConfig`; `patches` is `contact_patches`.
         contours: those of the garment; None for cloth that does not know of cloth.
+        inner: garments beneath, which the garment lies on as on the body; none by default.
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
     """
@@ -52,10 +54,11 @@ class Objective:
         buried: Tensor | None = None,
         patches: bool = True,
         contours: IntersectionContours | None = None,
+        inner: InnerGarments | None = None,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface, self.clearance, self.buried = surface, clearance, buried
-        self.contours = contours
+        self.contours, self.inner = contours, inner
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
@@ -77,16 +80,24 @@ class Objective:
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
-    def quasi_static_terms(self, x: Tensor, down: Tensor, character: Tensor, buried: Tensor | None = None) -> Terms:
+    def quasi_static_terms(
+        self,
+        x: Tensor,
+        down: Tensor,
+        character: Tensor,
+        buried: Tensor | None = None,
+        beneath: Beneath | None = None,
+    ) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity and wind (N, 3) [g].
 
         Args:
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
+            beneath: inner garments in these frames, where there are any.
         """
         energy, root = self.energy, character[self.hub, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
-        planes = self._planes(sampled.detach(), character, buried)
+        planes = self._planes(sampled.detach(), character, buried, beneath)
         gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * down.T, sampled, *planes)
         if self.newton:
             self.newton.planes = planes
@@ -97,25 +108,35 @@ class Objective:
             terms["stitch"] = energy.stitch(x)
         return terms
 
-    def _planes(self, x: Tensor, character: Tensor, buried: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def _planes(
+        self, x: Tensor, character: Tensor, buried: Tensor | None, beneath: Beneath | None
+    ) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
 
         Returns:
             Normals (S, 3, N) and offsets (S, N).
         """
         if self.body is None:
-            return no_planes(x)
-        normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
+            normal, offset = no_planes(x)
+        else:
+            normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
+        if self.inner and beneath:
+            normal, offset = self.inner.deeper((normal, offset), x, beneath)
         return normal, offset + self.clearance
 
     def _buried(self, frames: Tensor) -> Tensor | None:
         return None if self.buried is None else self.buried[:, frames]
 
-    def static(self, frames: Tensor, down: Tensor) -> Terms:
-        """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1)."""
+    def static(self, frames: Tensor, down: Tensor, beneath: Beneath | None = None) -> Terms:
+        """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1).
+
+        Args:
+            beneath: inner garments in these poses, where there are any.
+        """
         z = self.model.initial(self.bank.static_descriptor(frames, down))
         character = self.bank.character(frames)
-        return self.quasi_static_terms(self._vertices(z, character, 0), down, character, self._buried(frames))
+        x = self._vertices(z, character, 0)
+        return self.quasi_static_terms(x, down, character, self._buried(frames), beneath)
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -165,9 +186,9 @@ class Objective:
         asked = torch.cat([times[2 * batch :], frames])
         character = bank.character(asked)
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
-        terms = self.quasi_static_terms(
-            x, torch.cat([down[2 * batch :], single_down]), character, self._buried(asked)
-        )
+        beneath = self.inner.window(sampler, frames, single_down) if self.inner else None
+        pulled = torch.cat([down[2 * batch :], single_down])
+        terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath)
         if self.contours:
             terms[INTERSECTION] = self.contours.energy(x)
         count = (length - 2) * batch

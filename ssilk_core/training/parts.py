@@ -19,6 +19,7 @@ from ..physics.intersections.cloth import ClothIntersections
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
 from ..scene.kinematics import MAX_JOINT_SPEED
+from .inner_garments import InnerGarments
 from .job import TrainJob
 from .memory import searches_contours
 from .motion_bank import MotionBank, build_bank, usable_spans
@@ -41,6 +42,7 @@ class TrainingParts:
     Attributes:
         bank: the motions to train on.
         body: the part of the body that the garment can touch, with `reached` vertices; None for nothing.
+        inner: garments beneath; None where there are none that the garment can touch.
     """
 
     model: GarmentModel
@@ -52,6 +54,7 @@ class TrainingParts:
     device: torch.device
     group: ProcessGroup = SINGLE_PROCESS
     smoothing: ShapeSmoothing | None = None
+    inner: InnerGarments | None = None
 
     @cached_property
     def buried(self) -> Tensor | None:
@@ -71,6 +74,7 @@ class TrainingParts:
             "blendshapes": self.model.config.shapes,
             "joints in view": len(self.model.joints),
             "body vertices": self.reached,
+            **({"over": ", ".join(self.inner.names)} if self.inner else {}),
             "parameters": sum(value.numel() for value in self.model.parameters()),
             "device": str(self.device),
             "processes": self.group.size,
@@ -84,8 +88,10 @@ class TrainingParts:
         surface = config.closest_point == "triangles"
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
-            self.buried if surface else None, config.contact_patches, self.validator.contours,
+            self.buried if surface else None, config.contact_patches, self.validator.contours, self.inner,
         )  # fmt: skip
+        if self.inner:
+            self.inner.attach(sampler)
         average = group.average if group.size > 1 else None
         return Stepper(self.model, objective, sampler, own, average, self.smoothing)
 
@@ -99,7 +105,7 @@ def build_parts(
         SsilkError: the motions are too short, or libigl is missing where `intersection_weight` needs it.
     """
     scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
-    if job.train.intersection_weight:
+    if job.train.intersection_weight or job.over:
         need_predicates()
     motions, extra = job.training_motions(), job.extra_motions()
     if extra != (job.train.recombinations, job.train.perturbations):
@@ -132,11 +138,19 @@ def build_parts(
     if searches_contours(scene, job.train):
         tension = job.train.intersection_weight * GRAVITY * float(energy.mass.sum())
         contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours)
+    inner = None
+    if job.over:
+        listed = ", ".join(f"'{one.name}'" for one in job.over)
+        report(Message(f"beneath it are put {listed}, and where it can touch them is found"))
+        samples, beside = energy.cloth.samples, (bank, held, joints, kind)
+        found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
+        inner = found if len(found) else None
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
-    return TrainingParts(model, bank, energy, touched, validator, len(reach.vertices), device, group, smoothing)
+    reached = len(reach.vertices)
+    return TrainingParts(model, bank, energy, touched, validator, reached, device, group, smoothing, inner)
 
 
 def _take_over(model: GarmentModel, base: ModelFile) -> bool:

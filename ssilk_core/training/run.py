@@ -127,6 +127,7 @@ class TrainingRun:
         """
         job, config = self.job, self.config
         body = job.scene.character.merged_body().mesh.vertex_count
+        body += 2 * sum(one.file.scene.garment.mesh.vertex_count for one in job.over)
         memory = StepMemory.of(job.scene, job.model, config, job.fabric, body)
         batch, poses = memory.fitting_batch(config, free_memory(self.device))
         fitting = replace(config, batch=batch, pretraining_batch=poses)
@@ -209,7 +210,9 @@ class TrainingRun:
         energy = self.parts.energy
         samples, stitches = len(energy.cloth.samples.area), len(energy.stitching or ())
         contours = self.parts.validator.contours is not None
-        return StepMemory(self.job.scene, self.job.model, self.parts.reached, samples, stitches, contours=contours)
+        # Normals of cloth are computed anew in each frame, from its triangles.
+        met = self.parts.reached + (2 * self.parts.inner.vertex_count if self.parts.inner else 0)
+        return StepMemory(self.job.scene, self.job.model, met, samples, stitches, contours=contours)
 
     def _reduce_batch(self, found: str, batch: int, pretraining_batch: int) -> None:
         before, lowered = self.config, self.state.lowered

@@ -94,7 +94,9 @@ class Stepper:
     def static_step(self) -> None:
         """Do a step of static training: P and D on single random poses."""
         frames, direction = self.sampler.poses(self.config.pretraining_batch)
-        terms = self.objective.static(frames, direction)
+        inner = self.objective.inner
+        beneath = inner.poses(frames, direction, self.sampler.generator) if inner else None
+        terms = self.objective.static(frames, direction, beneath)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(total(terms, self._half), means, {"frames": frames, "directions": direction})
 

@@ -17,15 +17,17 @@ from torch import Tensor
 from ..files import split_location
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
-from ..physics.energy.frames import FRAMES_PER_CHUNK, energy_terms
+from ..physics.energy.frames import FRAMES_PER_CHUNK, ContactDistances, energy_terms
 from ..physics.intersections.cloth import ClothIntersections, IntersectionCounts
 from ..physics.intersections.contours import IntersectionContours
-from ..physics.intersections.figures import INTERSECTION, SelfIntersections
+from ..physics.intersections.figures import INTERSECTION, LayerFigures, SelfIntersections
+from ..physics.intersections.layers import LayerCounts
 from ..physics.intersections.pairs import can_find
 from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
 from ..scene.assets import Motion, Scene
+from .inner_garments import InnerGarments
 from .motion_bank import LatentModel, MotionBank, roll_states
 from .newton_steps import NewtonSteps
 from .parallel import SINGLE_PROCESS, ProcessGroup
@@ -52,6 +54,7 @@ class Score:
             the garment covers nothing.
         intersections: share of the triangles that intersect others, in `CROSSED_FRAMES` spread likewise; None without
             libigl.
+        layers: how the garment lies over each inner one, in the same frames.
         step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
     """
 
@@ -61,6 +64,7 @@ class Score:
     shown_skin: ShownSkin | None = None
     intersections: SelfIntersections | None = None
     step_errors: StepErrors | None = None
+    layers: tuple[LayerFigures, ...] = ()
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
@@ -71,6 +75,7 @@ class Score:
             "shown_skin": shown and ShownSkin(**shown),
             "intersections": crossed and SelfIntersections(**crossed),
             "step_errors": steps and StepErrors(**steps),
+            "layers": tuple(LayerFigures(**each) for each in document.get("layers", ())),
         }
         return cls(**{**document, **parts})
 
@@ -87,6 +92,7 @@ class Validator:
         frames: most frames of a clip.
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
         contours: those of the garment, whose energy is a term where training has it.
+        inner: garments beneath, all of which are worn; contact with them is part of that with the body.
     """
 
     def __init__(
@@ -101,13 +107,14 @@ class Validator:
         group: ProcessGroup = SINGLE_PROCESS,
         spans: Sequence[Motion] | None = None,
         contours: IntersectionContours | None = None,
+        inner: InnerGarments | None = None,
     ) -> None:
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
         self.covered = CoveredSkin(scene, device=rest.device)
         self.cloth = contours.cloth if contours else ClothIntersections.of(scene) if can_find() else None
-        self.contours = contours
+        self.contours, self.inner = contours, inner
         self.rest, self.scene = rest, scene
         self.clips = [
             range(int(start), min(int(stop), int(start) + frames)) for start, stop in zip(bank.starts, bank.stops)
@@ -142,7 +149,9 @@ class Validator:
         terms = {name: joined[name] for name in (*TERMS, INTERSECTION) if name in joined}
         shown, crossed = self._shown(model, states), self._crossed(model, states)
         steps = self._step_errors(model, states)
-        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps)
+        return Score(
+            terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps, self._layers(model, states)
+        )
 
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
@@ -161,6 +170,26 @@ class Validator:
             return cloth.counts(list(x.permute(2, 0, 1).double().cpu().numpy()), numbers)
 
         return cloth.figures(self._counted(model, states, CROSSED_FRAMES, count))
+
+    @torch.no_grad()
+    def _layers(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> tuple[LayerFigures, ...]:
+        """Return how the garment lies over each inner one; all processes of the group get the same."""
+        inner = self.inner
+        if inner is None:
+            return ()
+        own, spread = range(self.group.rank, len(self.clips), self.group.size), self._spread(CROSSED_FRAMES)
+        found = dict[int, list[LayerCounts]]()
+        for clip, latents in zip(own, states):
+            if chosen := spread[clip]:
+                numbers = [self.first[clip] + frame for frame in chosen]
+                x, _ = self._posed(model, latents, self.clips[clip], chosen)
+                at = torch.tensor(chosen, device=self.rest.device)
+                found[clip] = inner.counts(x, self.clips[clip], self.clips, at, self.down, numbers)
+        joined = {clip: each for part in self.group.gather(found) for clip, each in part.items()}
+        return tuple(
+            layers.figures([(self.names[clip], joined[clip][number]) for clip in sorted(joined)])
+            for number, layers in enumerate(inner.layers)
+        )
 
     @torch.no_grad()
     def _counted(
@@ -196,7 +225,7 @@ class Validator:
 
     def _step_errors(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> StepErrors | None:
         """Return what single steps of a model miss; all processes of the group get the same."""
-        if model is None:
+        if model is None or self.inner:  # the solver knows no inner garments
             return None
         energy, square = self.missed_by_steps(model, states, MEASURED_STEPS[self.rest.is_cuda])
         if not len(energy):
@@ -254,6 +283,13 @@ class Validator:
         """Return the states of each clip; a process of a group may have no clips."""
         return roll_states(model, self.bank, clips, self.down) if model and clips else [None] * len(clips)
 
+    def _met(self, clip: range, start: int, count: int) -> ContactDistances:
+        """Return contacts with the body and with inner garments in so many frames of a range of the bank."""
+        if self.inner is None:
+            return self.contacts
+        frames = torch.arange(start, start + count, device=self.rest.device)
+        return self.inner.over(self.contacts, self.inner.held(clip, self.clips, frames, self.down))
+
     @torch.no_grad()
     def _clip_terms(self, clip: range, model: LatentModel | None, states: Tensor | None) -> dict[str, Tensor]:
         frames = torch.arange(clip.start, clip.stop, device=self.rest.device)
@@ -270,7 +306,8 @@ class Validator:
                 still = model.vertices(quiet, character)
             joined = x if tail is None else torch.cat([tail, x], dim=-1)
             posed = self.body.pose(character, limbs=False)
-            terms = energy_terms(self.energy, x, lbs, self.contacts, posed, joined, self.fps, self.down)
+            contacts = self._met(clip, start, x.shape[-1])
+            terms = energy_terms(self.energy, x, lbs, contacts, posed, joined, self.fps, self.down)
             if self.contours:
                 terms[INTERSECTION] = self.contours.energy(x)
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})

@@ -88,7 +88,9 @@ def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) ->
         f"validation at {iteration}: total {score.total:.4g} J, "
         f"{percent(share)} {'under' if share >= 0 else 'above'} linear blend skinning's {lbs.total:.4g} J "
         f"({terms}), collisions {score.collisions:.2%}, motion of its own {score.dynamics * 1000:.0f} mm"
-        + "".join(f", {part}" for part in (score.shown_skin, score.intersections, score.step_errors) if part)
+        + "".join(
+            f", {part}" for part in (score.shown_skin, score.intersections, score.step_errors, *score.layers) if part
+        )
     )
     if score.dynamics < NO_DYNAMICS and moves:
         return Message(f"{text}; {ADVICE}", "warning")

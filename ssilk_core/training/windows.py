@@ -54,6 +54,7 @@ class WindowSampler:
         heading: likewise how a slot is turned about gravity, for absolute descriptors; None for relative ones.
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
+        inner: what inner garments keep from window to window, by name (`InnerGarments.attach`); nothing by default.
     """
 
     def __init__(self, bank: MotionBank, config: TrainConfig, latent: int, generator: torch.Generator) -> None:
@@ -77,6 +78,7 @@ class WindowSampler:
         self.heading = random_headings(self.direction, generator) if bank.is_absolute else None
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
+        self.inner: dict[str, Tensor] = {}
 
     def _fresh(self) -> Tensor:
         pick = torch.rand(self.config.batch, generator=self.generator, device=self.candidates.device)
@@ -147,7 +149,7 @@ class WindowSampler:
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
         names = ("first", "direction", "latents", "carried", "heading", "pull")
-        return {name: value for name in names if (value := getattr(self, name)) is not None}
+        return {name: value for name in names if (value := getattr(self, name)) is not None} | self.inner
 
     def state(self) -> dict[str, Tensor]:
         """Return all that a resumed run needs to continue exactly, random state included."""

@@ -20,6 +20,7 @@ import pytest
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
+from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list
 from ssilk_core.training.wardrobe.panel import ProgressTable, table
@@ -84,6 +85,15 @@ WRONG = {
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, light, final, paper is"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
+    "over": (
+        '[cape]\nstage = "a"\nmotions = "b"\nover = ["shirt"]',
+        "key 'over': no such garment; it is one of cape",
+    ),
+    "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"a\"], is needed"),
+    "over twice": (
+        '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
+        "key 'over': a, b are worn over one another",
+    ),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
 
@@ -93,6 +103,14 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
     with pytest.raises(SsilkError) as error:
         listed(tmp_path, text)
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_inner_garments_come_first(tmp_path):
+    text = '[defaults]\nstage = "a"\nmotions = "b"\nover = ["shirt"]\n[coat]\nover = ["vest", "tights.safetensors"]\n'
+    found = listed(tmp_path, text + "[vest]\n[shirt]\n[hat]\nover = []\n")
+    assert [entry.name for entry in found] == ["shirt", "vest", "coat", "hat"]
+    assert [entry.over for entry in found] == [(), ("shirt",), ("vest",), ()]
+    assert found[2].words[-2:] == ("--over", "tights.safetensors")
 
 
 BAD = {
@@ -247,6 +265,32 @@ def test_what_is_finished_is_skipped_unless_something_else_is_asked(tmp_path):
         GarmentTraining(entry, tmp_path, "request")
 
 
+def test_what_lies_over_a_garment_is_trained_again_with_it(tmp_path):
+    over = WardrobeEntry("coat", ("stage.usda",), ("shirt",))
+
+    def trained(name: str) -> GarmentTraining:
+        known: dict[str, GarmentTraining] = {}
+        for entry in (WardrobeEntry("shirt", ("stage.usda",)), over):
+            known[entry.name] = GarmentTraining(entry, tmp_path, "request", known)
+        return known[name]
+
+    def finish(name: str, contents: bytes) -> list[str]:
+        training = trained(name)
+        command = list(training.begin(tmp_path, "cpu").command)
+        (tmp_path / f"{name}.safetensors").write_bytes(contents)
+        training.end(End(0, 1.0, None))
+        return command
+
+    finish("shirt", b"a shirt")
+    assert finish("coat", b"a coat")[4:7] == ["stage.usda", "--over", str(tmp_path / "shirt.safetensors")]
+    assert trained("coat").state == trained("shirt").state == "finished"
+    (tmp_path / "coat.resume.safetensors").touch()
+    finish("shirt", b"another shirt")
+    again = trained("coat")
+    assert again.state == "waiting" and "what it is worn over is trained again" in again.plan
+    assert "--resume" not in again.begin(tmp_path, "cpu").command  # its state is of the shirt before
+
+
 # --- what is shown ------------------------------------------------------------------------------------------------
 
 
@@ -348,6 +392,24 @@ def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
     assert [event["event"] for event in said] == ["message", "failed"] and "torn.usda" in said[-1]["error"]
     assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())
     assert load_model("out/skirt.safetensors").provenance["train"]["seed"] == 3
+
+
+def test_an_outfit_is_trained_from_the_inside_out(world, capsys):
+    """Inner garments come first, and what lies over one that failed is not trained."""
+    short = LIST.replace("iterations = 120", "iterations = 6").partition("[skirt]")[0]
+    outfit = '[coat]\nover = ["skirt"]\n[skirt]\n[cloak]\nover = ["torn"]\n[torn]\nmotions = "torn.usda"\n'
+    Path("list.toml").write_text(short + outfit)
+    main(shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json"))
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    states = {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
+    assert states == {"skirt": "finished", "coat": "finished", "torn": "failed", "cloak": "failed"}
+    said = [(event["name"], event["said"]) for event in events if event["event"] == "garment"]
+    ended = next(k for k, (name, event) in enumerate(said) if name == "skirt" and event.get("text") == "finished")
+    assert [name for name, _ in said].index("coat") > ended
+    (error,) = [event["error"] for name, event in said if name == "cloak"]
+    assert "it is worn over 'torn', of which there is no model" in error and not Path("out/cloak.log").exists()
+    over = load_model("out/coat.safetensors").provenance["over"]
+    assert over == {"skirt": sha256(Path("out/skirt.safetensors"))}
 
 
 def test_two_processes_train_one_garment_and_one_of_them_speaks(world, toy):

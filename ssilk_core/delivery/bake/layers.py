@@ -18,6 +18,7 @@ from .counted import state_rollout_counts
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
+from .layered import tell_layers, tell_other_layers
 from .levels import need_levels
 from .load import LoadedGarment, load_garment
 from .names_used import GarmentUse, UsedNames, need_distinct_case, says, write_use
@@ -85,6 +86,8 @@ def bake_layers(
             report(Message(str(error), "warning"))
         raise
     layers.write_stages(tasks, report)
+    for shot in dict.fromkeys(task.shot for task, result in zip(tasks, results) if not result.current):
+        tell_layers(layers.path, shot, report)
     return results
 
 
@@ -191,8 +194,9 @@ class LayerFolder:
         result, files = _write_layer(layout, asset.asset, rollout, task, report)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
         record = TaskRecord(
-            key=key, files=written, result=result, inputs=inputs, root=request.root, level_of=task.level_of
-        )
+            key=key, files=written, result=result, inputs=inputs, root=request.root, level_of=task.level_of,
+            over=garment.over_models,
+        )  # fmt: skip
         write_record(home, record)
         return result
 
@@ -235,6 +239,7 @@ class LayerFolder:
                 write_shot_stage(self.path, shot, report, needed=garments, replaced=replaced.get(shot, ()))
             except SsilkError as error:
                 errors.append(error)
+            tell_other_layers(self.path, shot, report)
         for layout in {layout.garment: layout for layout in layouts}.values():
             outdated = list(_outdated_shots(layout, known[layout.garment]))
             if outdated:

@@ -78,6 +78,11 @@ class LoadedGarment:
     record: GarmentRecord
     info: AssetInfo
 
+    @property
+    def over_models(self) -> dict[str, str]:
+        """SHA-256 of the models that the garment was trained over, by name."""
+        return dict(self.file.provenance.get("over", {}))
+
     def over(self, motion: str, *, range: str | None = None, handles: int = 0) -> BakeRollout:
         """Return the garment over a motion, "file[:/Prim/Path]"; range and handles are those of a request.
 
@@ -206,7 +211,11 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         units=units,
         model_held=model_held,
         stage_held=stage_held,
-        provenance={"model_sha256": model_held.digest, "training": file.provenance.get("ssilk", "")},
+        provenance={
+            "model_sha256": model_held.digest,
+            "training": file.provenance.get("ssilk", ""),
+            **({"trained_over": dict(over)} if (over := file.provenance.get("over")) else {}),
+        },
         record=_record(file, model_held.digest),
         info=_info(request, model_held.digest),
     )

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from ... import __version__, work_record
@@ -41,6 +41,7 @@ class TaskRecord:
         inputs: what was in each of the request's `INPUTS`, and where it was.
         root: SkelRoot of the character, where one was named.
         level_of: the garment of its shot that it is a level of, where it is one.
+        over: SHA-256 of the models that its own was trained over, by name.
     """
 
     key: str
@@ -49,6 +50,7 @@ class TaskRecord:
     inputs: Mapping[str, RecordedInput]
     root: str | None
     level_of: str | None = None
+    over: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def wearer(self) -> tuple[str, str | None]:
@@ -98,6 +100,7 @@ def write_record(folder: Path, record: TaskRecord) -> None:
     inputs = {name: asdict(each) for name, each in record.inputs.items()}
     detail = {**_portable(record.result), "inputs": inputs, "root": record.root}
     detail |= {"level_of": record.level_of} if record.level_of else {}
+    detail |= {"over": dict(record.over)} if record.over else {}
     written = WorkRecord(key=record.key, files=dict(record.files), detail=detail)
     work_record.write_record(folder / RECORD, written)
 
@@ -115,10 +118,11 @@ def read_record(folder: Path) -> TaskRecord | None:
             return None
         detail = {**found.detail, "path": folder / found.detail["path"]}
         told, root, level_of = detail.pop("inputs"), detail.pop("root"), detail.pop("level_of", None)
+        over = {str(name): str(digest) for name, digest in detail.pop("over", {}).items()}
         inputs = {name: from_plain(RecordedInput, told[name]) for name in INPUTS}
         result = from_plain(BakeResult, detail)
         return TaskRecord(
-            key=found.key, files=found.files, result=result, inputs=inputs, root=root, level_of=level_of
+            key=found.key, files=found.files, result=result, inputs=inputs, root=root, level_of=level_of, over=over
         )
     except (SsilkError, ValueError, TypeError, KeyError, AttributeError):
         return None

@@ -12,10 +12,12 @@ from ...events import Countdown, Reporter, silent
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
 from ...scene.fabrics import Fabric
+from ...scene.mesh.joined import joined
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
+from .layers import LayersMeter, layers_section
 from .page import Section, figure, table
 from .player import played
 from .terms import BARE, SHARE, SHOWN, UNITS, TermsMeter, worst_frames
@@ -47,25 +49,22 @@ def shot_sections(
         garments: those to measure.
         bodies: the meshes that garments collide with, at rest, by their index in the player.
     """
-    meters = [TermsMeter(each.mesh, joined(list(bodies.values())), each.fabric, player.fps) for each in garments]
+    whole = joined(list(bodies.values()))
+    meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps) for each in garments]
+    named = {each.index: (player.meshes[each.index].name, each.mesh) for each in garments}
+    layers = LayersMeter(named, whole)
     told = Countdown(len(player.frame_times), report)
     for time in player.frame_times:
         points = player.points(time)
         body = np.concatenate([points[index] for index in bodies]) if bodies else None
         for each, meter in zip(garments, meters):
             meter.add(points[each.index], body, time)
+        layers.add(points, time)
         told()
     first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
-    return [first, Section("The shot", played([player]), plays=True), *others]
-
-
-def joined(meshes: Sequence[Mesh]) -> Mesh | None:
-    """Return meshes as one, in their order; None for none."""
-    if not meshes:
-        return None
-    starts = np.cumsum([0, *(mesh.vertex_count for mesh in meshes)])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)])
-    return Mesh(meshes[0].path, np.concatenate([mesh.points for mesh in meshes]), faces)
+    over = layers.figures("the shot")
+    between = [layers_section(over)] if over else []
+    return [first, Section("The shot", played([player]), plays=True), *between, *others]
 
 
 def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:

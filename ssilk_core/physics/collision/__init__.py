@@ -12,6 +12,8 @@ Positions have the shape (V, 3, N): vertices, coordinates, frames. A garment mee
 5. `pierced`: where the axis of a limb (`limb_axes`) crosses loose cloth (`ray_casting`), it replaces the planes by
    ones that push the cloth off the limb's tip.
 
+`inner_cloth` does the same for garments beneath a garment: a sample meets whatever it lies deepest in.
+
 The energy of contact with these planes is in `energy/collision.py`. After refinement `refine/clearing.py` lifts cloth
 off skin that still shows. `winding_number` tells whether a point lies inside the body.
 """
@@ -21,7 +23,7 @@ from .contacts import Contacts
 from .distance import Patches, PosedBody, nearest_planes, signed_distance, signed_distance_to_planes, smoothed_planes
 from .limb_axes import LimbAxes, PosedLimbs, limb_axes
 from .ray_casting import RayCaster, RayHits
-from .reach import ReachableBody, reachable_body
+from .reach import ReachableBody, reachable_body, reachable_cloth
 from .smoothed_distance import SmoothedDistance
 
 __all__ = [
@@ -38,6 +40,7 @@ __all__ = [
     "limb_axes",
     "nearest_planes",
     "reachable_body",
+    "reachable_cloth",
     "signed_distance",
     "signed_distance_to_planes",
     "smoothed_planes",

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...scene.assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene
+from ...scene.assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene, SkinWeights
 from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
 from ...scene.mesh import topology
 from ...scene.mesh.geodesic import edge_graph
@@ -53,20 +54,65 @@ def reachable_body(scene: Scene, motions: Sequence[Motion]) -> ReachableBody:
     return ReachableBody(vertices, joints)
 
 
+def reachable_cloth(scene: Scene, inner: Scene, motions: Sequence[Motion]) -> NDArray[np.bool_]:
+    """Tell which vertices of an inner garment the garment of a scene can touch, in the poses of `reachable_body`.
+
+    Both hang as a garment does there, so that each has its own reach. Pinned vertices of the inner garment can be
+    touched, those of the outer one touch nothing.
+
+    Args:
+        scene, inner: the outer and the inner garment on one character.
+
+    Returns:
+        Shape (W,).
+    """
+    from scipy.spatial import cKDTree
+    from scipy.spatial.distance import cdist
+
+    skeleton, (anchors, lengths) = scene.character.skeleton, _tethers(scene)
+    tight = np.flatnonzero(scene.classes == TIGHT)
+    source, hangs = _hangs_from(inner)
+    hung = inner.garment.mesh.points[source]
+    skin = SkinWeights(inner.lbs_skin.path, inner.lbs_skin.indices[source], inner.lbs_skin.weights[source])
+    reach, reached = hangs + 2 * REACH_MARGIN, np.zeros(len(hung), dtype=bool)
+    for frame in _spread_frames(motions) if len(tight) or len(anchors) else ():
+        matrices = skinning_matrices(motion_transforms(frame, skeleton.parents), skeleton.bind_transforms)
+        left = np.flatnonzero(~reached)
+        posed = skin_points(hung, skin, matrices)[0][left]
+        lbs = skin_points(scene.garment.mesh.points, scene.lbs_skin, matrices)[0]
+        near = (cdist(lbs[anchors], posed) < lengths[:, None] + reach[left]).any(axis=0)
+        if len(tight):
+            near |= cKDTree(lbs[tight]).query(posed)[0] < reach[left]
+        reached[left[near]] = True
+        if reached.all():
+            break
+    return reached
+
+
+def _hangs_from(scene: Scene) -> tuple[Ints, Floats]:
+    """Return the anchor of each vertex (V,), and how far along the cloth it hangs from it [m].
+
+    Pinned and tight vertices are their own, at zero. So are loose ones that nothing holds, at infinity.
+    """
+    from scipy.sparse.csgraph import dijkstra
+
+    mesh, held = scene.garment.mesh, np.flatnonzero(scene.classes != LOOSE)
+    source, distance = np.arange(mesh.vertex_count), np.where(scene.classes == LOOSE, np.inf, 0.0)
+    if len(held) and len(held) < mesh.vertex_count:
+        graph = edge_graph(mesh.points, topology.edges(joined_mesh(mesh, find_stitches(mesh)).faces))
+        along, _, found = dijkstra(graph, directed=False, indices=held, min_only=True, return_predecessors=True)
+        tied = np.isfinite(along)
+        source[tied], distance[tied] = found[tied], along[tied]
+    return source, distance
+
+
 def _tethers(scene: Scene) -> tuple[Ints, Floats]:
     """Return anchors (A,) and for each the longest distance along the cloth to a loose vertex that hangs from it [m].
 
     Paths follow edges and are never shorter than the geodesic, so that no reachable vertex is missed.
     """
-    from scipy.sparse.csgraph import dijkstra
-
-    mesh = scene.garment.mesh
-    held, loose = np.flatnonzero(scene.classes != LOOSE), np.flatnonzero(scene.classes == LOOSE)
-    if not len(held) or not len(loose):
-        return np.zeros(0, dtype=int), np.zeros(0)
-    graph = edge_graph(mesh.points, topology.edges(joined_mesh(mesh, find_stitches(mesh)).faces))
-    distance, _, source = dijkstra(graph, directed=False, indices=held, min_only=True, return_predecessors=True)
-    tied = loose[np.isfinite(distance[loose])]
+    source, distance = _hangs_from(scene)
+    tied = (scene.classes == LOOSE) & (scene.classes[source] != LOOSE)
     anchors, group = np.unique(source[tied], return_inverse=True)
     longest = np.zeros(len(anchors))
     np.maximum.at(longest, group, distance[tied])

@@ -3,21 +3,29 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
 
-from ..collision import Contacts, PosedBody
+from ..collision import PosedBody
 from ..constants import GRAVITY
 from .garment import GarmentEnergy
 
 FRAMES_PER_CHUNK = 256  # frames in memory at once
 
 
+class ContactDistances(Protocol):
+    """What tells distances to what a garment lies on, as `Contacts` does."""
+
+    def distances(self, x: Tensor, body: PosedBody, /) -> tuple[Tensor, Tensor]: ...
+
+
 def energy_terms(
     energy: GarmentEnergy,
     x: Tensor,
     lbs: Tensor,
-    contacts: Contacts,
+    contacts: ContactDistances,
     body: PosedBody,
     joined: Tensor,
     fps: float,

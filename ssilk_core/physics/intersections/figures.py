@@ -10,6 +10,7 @@ LIBIGL = "2.6.3"  # the first version with the predicates that find what interse
 
 INTERSECTION = "intersection"  # the term of contours in a training that has their weight
 SHARE = "triangles that intersect others"
+LAYERS = "layers"  # what is told of garments over others, under this name
 NOT_COUNTED = f"not counted, as libigl {LIBIGL} or newer was missing"  # in place of figures
 
 
@@ -62,3 +63,49 @@ class SelfIntersections:
         worst = f"{self.clip}, frame {self.frame:g}" + (f"; most at {self.where}" if self.where else "")
         most = f", {self.worst:.2%} in the worst of {self.frames} frames ({worst})" if self.worst else ""
         return f"{self.mean:.3%} of the triangles intersect others{most}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayerFigures:
+    """How a garment lies over another one, over frames.
+
+    Attributes:
+        outer, inner: the garments.
+        frames: that were counted, as those of `SelfIntersections`.
+        triangles: of the outer garment.
+        mean, worst: share of these that intersect the inner garment, over the frames and in the worst one.
+        clip, frame: the worst frame, of several equal ones the first.
+        shown, worst_shown: share of the inner cloth, as far as the outer covers it in the bind pose, that shows
+            through; None where it covers none.
+    """
+
+    outer: str
+    inner: str
+    frames: int
+    triangles: int
+    mean: float
+    worst: float
+    clip: str
+    frame: float
+    shown: float | None = None
+    worst_shown: float | None = None
+
+    def summary(self, clock: str = "frame") -> dict[str, str]:
+        """Return figures for people; `clock` is what `frame` counts."""
+        worst = f", {self.worst:.2%} in {self.clip} at {clock} {self.frame:g}" if self.worst else ""
+        told = {f"triangles that intersect {self.inner}": f"{self.mean:.3%}{worst}"}
+        if self.shown is not None:
+            told[f"{self.inner} that shows through"] = f"{self.shown:.3%}, {self.worst_shown:.2%} at most"
+        return told
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return figures of four digits, as a shot stores them."""
+        known = {name: value for name, value in vars(self).items() if value is not None}
+        return {name: float(f"{value:.4g}") if isinstance(value, float) else value for name, value in known.items()}
+
+    def __str__(self) -> str:
+        worst = f", {self.worst:.2%} in the worst of {self.frames} frames ({self.clip}, frame {self.frame:g})"
+        text = f"{self.mean:.3%} of the triangles intersect {self.inner}{worst if self.worst else ''}"
+        if self.shown is None:
+            return text
+        return f"{text}; {self.shown:.3%} of {self.inner} shows through, {self.worst_shown:.2%} at most"

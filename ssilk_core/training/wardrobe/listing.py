@@ -20,10 +20,16 @@ TABLES = ("material", "set")  # keys whose values are merged with those of the d
 
 @dataclass(frozen=True)
 class WardrobeEntry:
-    """A garment of a list: its name, and its arguments for 'ssilk train'."""
+    """A garment of a list.
+
+    Attributes:
+        words: its arguments for 'ssilk train', without the garments of the list that it is worn over.
+        over: names of these.
+    """
 
     name: str
     words: tuple[str, ...]
+    over: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -56,12 +62,16 @@ KEYS = {
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
+    "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["a"],'),
 }
+MODEL = ".safetensors"  # what 'over' names that ends so is a file; all else is a garment of the list
 NEEDED = ("stage", "motions")
 
 
 def read_list(path: Path) -> list[WardrobeEntry]:
-    """Read the garments of a list, in order; paths in it are relative to its folder.
+    """Read the garments of a list, inner ones before those that are worn over them, else in its own order.
+
+    Paths in it are relative to its folder.
 
     Raises:
         SsilkError: the file is missing or not TOML, or an entry is wrong.
@@ -77,7 +87,35 @@ def read_list(path: Path) -> list[WardrobeEntry]:
     defaults = tables.pop(DEFAULTS, {})
     if not tables:
         fail(str(path), "no garment in it", "a list holds one table for each garment", "add [name]")
-    return [WardrobeEntry(name, _words(path, name, _joined(defaults, table))) for name, table in tables.items()]
+    entries = [_entry(path, name, _joined(defaults, table)) for name, table in tables.items()]
+    for entry in entries:
+        for inner in entry.over:
+            if inner not in tables:
+                fail_unknown(f"{path}: table '{entry.name}', key 'over'", "no such garment", inner, tables)
+    return _in_order(path, entries)
+
+
+def _entry(path: Path, name: str, table: dict[str, Any]) -> WardrobeEntry:
+    over = [inner for inner in table.get("over", ()) if inner != name]  # of [defaults], which all inherit
+    files = [inner for inner in over if inner.endswith(MODEL)]
+    words = _words(path, name, {key: value for key, value in table.items() if key != "over"})
+    given = tuple(word for file in files for word in ("--over", file))
+    return WardrobeEntry(name, words + given, tuple(inner for inner in over if inner not in files))
+
+
+def _in_order(path: Path, entries: list[WardrobeEntry]) -> list[WardrobeEntry]:
+    """Return entries after those that they are worn over; raise `SsilkError` where they are over one another."""
+    left, found = list(entries), list[WardrobeEntry]()
+    while left:
+        done = {entry.name for entry in found}
+        ready = next((entry for entry in left if set(entry.over) <= done), None)
+        if ready is None:
+            names = ", ".join(entry.name for entry in left)
+            allowed = "of two garments one is the inner one"
+            fail(f"{path}: key 'over'", f"{names} are worn over one another", allowed, "remove one of these")
+        found.append(ready)
+        left.remove(ready)
+    return found
 
 
 def _need_table(path: Path, name: str, table: Any) -> None:

@@ -13,7 +13,7 @@ import trimesh
 from ssilk_core.cli.report import _told
 from ssilk_core.delivery.report.figures import learning_of, section_of
 from ssilk_core.delivery.report.page import Section, facts, figure, flattened, page, table
-from ssilk_core.delivery.report.shots import ShotGarment, joined, shot_sections
+from ssilk_core.delivery.report.shots import ShotGarment, shot_sections
 from ssilk_core.delivery.report.terms import BARE, SHARE, SHOWN, STRETCH, TermsMeter, worst_frames
 from ssilk_core.delivery.report.verdict import verdict
 from ssilk_core.errors import SsilkError
@@ -23,6 +23,7 @@ from ssilk_core.quality.charts import ChartPanel, svg_chart
 from ssilk_core.quality.kept_rows import UNFINISHED
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.mesh.joined import joined
 
 CLOTH = Fabric("toy", density=0.2, contact_model="vertex", margin=0.0, thickness=0.0, collision=7.0)
 

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments of a shot that were trained over others: whether these lie beneath, and how one lies over the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ...events import Message, Reporter, Result
+from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
+from ...physics.intersections.pairs import can_find
+from ...scene.assets import Floats
+from .record import TaskRecord
+from .shots import finished
+
+if TYPE_CHECKING:
+    from ssilk_usd.shots.play import Shot
+
+FRAMES_AT_ONCE = 32
+
+
+def tell_other_layers(folder: Path, shot: str, report: Reporter) -> None:
+    """Warn of garments of a shot that were trained over others than lie beneath them there."""
+    found = _whole(finished(folder, shot))
+    for name, record in found.items():
+        beside = _beside(found, name)
+        known = {*record.over.values(), record.inputs["model"].sha256}
+        others = [
+            other
+            for other, own in beside.items()
+            if own.inputs["model"].sha256 not in known and record.inputs["model"].sha256 not in own.over.values()
+        ]
+        if record.over and others:
+            listed = ", ".join(f"'{each}'" for each in record.over)
+            text = f"it was trained over {listed}, and {', '.join(others)} of this shot is another model"
+            todo = "train it over what it is worn with ('ssilk train --over'), or cloth may pass through cloth"
+            report(Message(f"{shot}/{name}: {text}; {todo}", "warning"))
+
+
+def tell_layers(folder: Path, shot: str, report: Reporter) -> list[LayerFigures]:
+    """Count how garments of a shot lie over those that they were trained over, and report it.
+
+    Returns:
+        The figures of each pair, in the order of the outer garments; none without libigl, which is told.
+
+    Raises:
+        SsilkError: a layer cannot be read.
+    """
+    found = _whole(finished(folder, shot))
+    pairs = [
+        (name, other)
+        for name, record in found.items()
+        for other, own in _beside(found, name).items()
+        if own.inputs["model"].sha256 in record.over.values()
+    ]
+    if pairs and not can_find():
+        report(Message(f"{folder / 'shots' / shot}: cloth through other garments is {NOT_COUNTED}", "warning"))
+        return []
+    counted = [_counted(folder, shot, *pair) for pair in pairs]
+    for each in counted:
+        named = {"shot": shot, "garment": each.outer, "over": each.inner}
+        report(Result("bake", {**named, **each.summary("time code")}))
+    return counted
+
+
+def _whole(found: Mapping[str, TaskRecord | None]) -> dict[str, TaskRecord]:
+    """Return the records that can be read, without levels of quality of other garments."""
+    return {name: record for name, record in found.items() if record and not record.level_of}
+
+
+def _beside(found: Mapping[str, TaskRecord], name: str) -> dict[str, TaskRecord]:
+    """Return the other garments on the character that wears one."""
+    return {other: own for other, own in found.items() if other != name and own.wearer == found[name].wearer}
+
+
+def _counted(folder: Path, shot: str, outer: str, inner: str) -> LayerFigures:
+    """Count in every `EVERY`-th frame that both garments have, as their layers play it."""
+    from ssilk_usd.shots.layers import Layout
+    from ssilk_usd.shots.play import Shot
+
+    from ...physics.intersections.layers import ClothLayers
+    from ...scene.mesh.joined import joined
+
+    over, under = (_Layer(Shot(Layout(folder, name, shot).animation)) for name in (outer, inner))
+    cloth = ClothLayers((outer, inner), over.rest, under.rest, joined([*over.bodies, *under.bodies]))
+    both = set(under.shot.frame_times)
+    times = [time for time in over.shot.frame_times if time in both][::EVERY]
+    parts = []
+    for first in range(0, len(times), FRAMES_AT_ONCE):
+        some = times[first : first + FRAMES_AT_ONCE]
+        parts.append((shot, cloth.counts(over.points(some), under.points(some), some)))
+    return cloth.figures(parts)
+
+
+class _Layer:
+    """A garment in a layer of its own.
+
+    Attributes:
+        rest: its mesh in the bind pose.
+        bodies: those of its character that are there.
+    """
+
+    def __init__(self, shot: Shot) -> None:
+        from ssilk_usd.shots.read import read_parts
+
+        self.shot, meshes = shot, [part.mesh for part in read_parts(shot)]
+        self._place = next(place for place, mesh in enumerate(shot.meshes) if mesh.is_garment)
+        self.rest = meshes[self._place]
+        self.bodies = [mesh for mesh, own in zip(meshes, shot.meshes) if not own.is_garment]
+
+    def points(self, times: Sequence[float]) -> list[Floats]:
+        """Return positions of the garment at some frame times [m], each (V, 3)."""
+        return [self.shot.points(time)[self._place] for time in times]
