@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
+from ssilk_core.scene.assets import Mesh
+
 from ..arrays.joints import Joints, identifiers
 from ..scene.garment import armature_of, bodies_of, rest_world
-from ..scene.gather import SKELETON, read_body
+from ..scene.gather import SKELETON, evaluated, read_body
 from ..scene.modifiers import reshapes
 from ..scene.objects import scene_units
 from ..scene.shapes import mixed_points
@@ -38,6 +41,17 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
     meshes = {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}
     armature = armature_of(garment)
     things = [garment, *bodies_of(garment, armature)]
+    with evaluated(things):
+        return _first_off(things, armature, joints, meshes, back)
+
+
+def _first_off(
+    things: Sequence[bpy.types.Object],
+    armature: bpy.types.Object,
+    joints: Joints,
+    meshes: Mapping[str, Mesh],
+    back: np.ndarray,
+) -> str:
     for thing, name in list(zip(things, identifiers((each.name for each in things), taken=(SKELETON,))))[1:]:
         mesh = meshes.get(name)
         if mesh is None:
