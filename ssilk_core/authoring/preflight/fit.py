@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...events import format_count
-from ...scene.assets import Character, Floats, Ints, Mesh
+from ...scene.assets import Character, Floats, Ints, Mesh, is_carried_by, moved_by_joints
 from ...scene.fabrics import FABRICS
 from ...scene.mesh.topology import edge_use, is_inside_out, merged_places, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
@@ -171,6 +171,27 @@ def body_inside_out(body: Mesh) -> Findings:
             fix="flip the normals of the body",
             elements="faces",
         )
+
+
+def roots_of_their_own(character: Character) -> Findings:
+    """Yield a warning where limbs hang from no joint that carries the body."""
+    skeleton = character.skeleton
+    moved = [moved_by_joints(body.mesh.points, body.skin.dense(skeleton.joint_count)) for body in character.bodies]
+    if is_carried_by(moved, skeleton.parents, skeleton.hub):
+        return
+    roots = np.flatnonzero(skeleton.parents < 0)
+    yield Finding(
+        severity="warning",
+        code="several-roots",
+        prim=skeleton.path,
+        count=len(roots),
+        found=f"the bodies hang from {len(roots)} root joints; {skeleton.joint_names[skeleton.hub]} is taken to "
+        "carry them",
+        why="the network sees how the others are tilted and sped up, and not where they are",
+        fix="parent the others to it, as an export for games does, or expect limbs that cloth misses",
+        elements="joints",
+        indices=index_tuple(roots),
+    )
 
 
 def penetration(mesh: Mesh, body: Mesh) -> Findings:
