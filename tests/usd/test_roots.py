@@ -11,7 +11,8 @@ import ssilk_usd
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.reading.character import read_character
 
-from ssilk_core.authoring.preflight.fit import roots_of_their_own
+from ssilk_core.authoring.preflight.fit import carried_by_no_joint
+from ssilk_core.scene.assets import carrying_joint, is_carried_by
 
 DEMO = Path(ssilk_usd.__file__).parent / "stages" / "demo_body.usdc"
 
@@ -61,16 +62,34 @@ def test_without_any_parents_the_joint_in_the_middle_carries_the_body(order):
     character = read_character(reordered(orders[order], ("",)))
     assert (character.skeleton.parents < 0).all()
     assert character.skeleton.joint_names[character.skeleton.hub] == "Spine"
-    (finding,) = roots_of_their_own(character)
-    assert finding.code == "several-roots" and finding.count == count
+    (finding,) = carried_by_no_joint(character)
+    assert finding.count > count / 2 and "Spine is taken to" in finding.found
 
 
-def test_limbs_with_roots_of_their_own_leave_the_torso_to_carry_the_body():
+def test_limbs_with_carried_by_no_joint_leave_the_torso_to_carry_the_body():
     character = read_character(reordered(None, ("LeftUpLeg", "RightUpLeg", "LeftArm", "RightArm")))
     assert np.count_nonzero(character.skeleton.parents < 0) == 5
     assert character.skeleton.joint_names[character.skeleton.hub] == "Hips"
-    assert [finding.count for finding in roots_of_their_own(character)] == [5]
+    (finding,) = carried_by_no_joint(character)
+    legs_and_arms = {character.skeleton.joint_names[joint].split("/")[0] for joint in finding.indices}
+    assert legs_and_arms == {"LeftUpLeg", "RightUpLeg", "LeftArm", "RightArm"}
 
 
 def test_a_body_that_hangs_from_one_root_is_no_finding():
-    assert not list(roots_of_their_own(read_character(str(DEMO))))
+    assert not list(carried_by_no_joint(read_character(str(DEMO))))
+
+
+STILL = ("root", "root/pelvis", "root/pelvis/chest", "root/bow", "root/bow/top", "root/bow/bottom")
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_beneath_a_still_root_the_largest_of_several_bodies_is_carried(backwards):
+    """An archer whose bow bends beside the hips, as horse and rider do: air that stood with the root were wind."""
+    paths = STILL[:1] + (STILL[3:] + STILL[1:3] if backwards else STILL[1:])
+    parents = np.array(UsdSkel.Topology(paths).GetParentIndices())
+    archer, bow = (np.array([float(path in bodies) for path in paths]) for bodies in (STILL[1:3], STILL[3:]))
+    hub = carrying_joint([2.0 * bow, 5.0 * archer], parents, np.zeros((6, 3)))
+    assert paths[hub] == "root/pelvis"
+    assert not is_carried_by([2.0 * bow, 5.0 * archer], parents, hub)
+    whole = archer + np.array([float(path == "root") for path in paths])  # the root moves cloth itself
+    assert carrying_joint([2.0 * bow, 5.0 * whole], parents, np.zeros((6, 3))) == 0

@@ -173,25 +173,35 @@ def body_inside_out(body: Mesh) -> Findings:
         )
 
 
-def roots_of_their_own(character: Character) -> Findings:
-    """Yield a warning where limbs hang from no joint that carries the body."""
+def carried_by_no_joint(character: Character) -> Findings:
+    """Yield a warning where bodies hang from no joint that is taken to carry them."""
     skeleton = character.skeleton
-    moved = [moved_by_joints(body.mesh.points, body.skin.dense(skeleton.joint_count)) for body in character.bodies]
+    weights = [body.skin.dense(skeleton.joint_count) for body in character.bodies]
+    moved = [moved_by_joints(body.mesh.points, each) for body, each in zip(character.bodies, weights)]
     if is_carried_by(moved, skeleton.parents, skeleton.hub):
         return
-    roots = np.flatnonzero(skeleton.parents < 0)
+    moving = np.flatnonzero(np.sum(moved, axis=0) > 0)
+    apart = [joint for joint in moving.tolist() if skeleton.hub not in _above(joint, skeleton.parents)]
     yield Finding(
         severity="warning",
-        code="several-roots",
+        code="carried-by-no-joint",
         prim=skeleton.path,
-        count=len(roots),
-        found=f"the bodies hang from {len(roots)} root joints; {skeleton.joint_names[skeleton.hub]} is taken to "
-        "carry them",
-        why="the network sees how the others are tilted and sped up, and not where they are",
-        fix="parent the others to it, as an export for games does, or expect limbs that cloth misses",
+        count=len(apart),
+        found=f"no joint that moves with the bodies carries all of them; {skeleton.joint_names[skeleton.hub]} is "
+        f"taken to, and {len(apart)} of {len(moving)} joints do not hang from it",
+        why="the network sees how these are tilted and sped up, and not where they are",
+        fix="parent them to it, as exports for games do, or expect limbs that cloth misses",
         elements="joints",
-        indices=index_tuple(roots),
+        indices=tuple(apart),
     )
+
+
+def _above(joint: int, parents: Ints) -> list[int]:
+    """Return a joint and those above it."""
+    found = [joint]
+    while parents[found[-1]] >= 0:
+        found.append(int(parents[found[-1]]))
+    return found
 
 
 def penetration(mesh: Mesh, body: Mesh) -> Findings:

@@ -91,6 +91,7 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
     Game skeletons have joints above the hips, which may stand still while the character runs, and joints beside the
     hips for what hands hold. Bodies that one joint moves as a whole, such as props and shadows, do not count beside
     others. Where limbs have roots of their own, as deforming bones of control rigs have, it is the root amid them.
+    Where bodies of their own, as horse and rider, hang from a joint that moves none itself, it is the largest body's.
 
     Args:
         moved: `moved_by_joints` of each body.
@@ -102,7 +103,10 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
         return 0
     held = np.flatnonzero(below >= (1 - _STRAY) * own.sum())
     if len(held):
-        return int(held[-1])
+        bending = _bending(moved)
+        if own[held[-1]] > 0 or len(bending) < 2:
+            return int(held[-1])
+        return carrying_joint([max(bending, key=np.sum)], parents, places)
     roots = np.flatnonzero((parents < 0) & (below > 0))
     away = np.linalg.norm(places[roots, None] - places, axis=-1) @ own
     return int(roots[away.argmin()])
@@ -114,10 +118,14 @@ def is_carried_by(moved: Sequence[Floats], parents: Ints, joint: int) -> bool:
     return bool(below[joint] >= (1 - _STRAY) * own.sum())
 
 
+def _bending(moved: Sequence[Floats]) -> list[Floats]:
+    """Return what joints move of those bodies that no joint moves as a whole."""
+    return [each for each in moved if each.max() < _WHOLE * each.sum()]
+
+
 def _hanging(moved: Sequence[Floats], parents: Ints) -> tuple[Floats, Floats]:
     """Return how much of the bodies each joint moves, and with all joints below it, shapes (J,)."""
-    bending = [each for each in moved if each.max() < _WHOLE * each.sum()]
-    own = np.sum([np.zeros(len(parents)), *(bending or moved)], axis=0)
+    own = np.sum([np.zeros(len(parents)), *(_bending(moved) or moved)], axis=0)
     below = own.copy()
     for joint in range(len(parents) - 1, -1, -1):
         if parents[joint] >= 0:
