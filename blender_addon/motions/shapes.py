@@ -7,12 +7,13 @@ from collections.abc import Iterator, Sequence
 
 import bpy
 
+from ..scene.armature import leader_of
 from ..scene.garment import armature_of, bodies_of, no_meshes
 from ..scene.meshes import PREFIX
 from ..scene.modifiers import bones_place, reshapes, shown_or_rendered_alone, unmet_modifiers
 from .bodies import look_at
 from .keys import changing_paths
-from .sources import TIMELINE, Source
+from .sources import TIMELINE, Source, playing
 
 
 def changing_shapes(thing: bpy.types.Object) -> list[str]:
@@ -48,6 +49,15 @@ def tell_changing_shapes(
         operator.report({"WARNING"}, text)
 
 
+def _changing_in(
+    motions: Sequence[Source], armature: bpy.types.Object, things: Sequence[bpy.types.Object]
+) -> Iterator[str]:
+    """Yield the shape keys that change now, or in actions that have slots for them, with whose they are."""
+    for source in (Source(TIMELINE, "Timeline"), *motions):
+        with playing(leader_of(armature), source):
+            yield from (f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing))
+
+
 def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str]:
     armature = armature_of(garment)
     bodies = bodies_of(garment, armature)
@@ -76,8 +86,7 @@ def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str
                 f"({where}); cloth meets it where these have it. Look at its modifiers, its parent, keys of its own, "
                 "and envelopes of bones."
             )
-    things = [*bodies, garment]
-    names = [f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing)]
+    names = list(dict.fromkeys(_changing_in(motions, armature, [*bodies, garment])))
     if names:
         more = f" and {len(names) - 1} more change" if len(names) > 1 else " changes"
         text = f"The shape key {names[0]}{more} over time, which is not followed; the shape of frame {frame} is met"

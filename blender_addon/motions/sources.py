@@ -138,12 +138,12 @@ def _companions(armature: bpy.types.Object, source: Source) -> list[tuple[bpy.ty
     if source.kind != ACTION or not SLOTS:
         return []
     action, found = _action(source), []
-    for thing in (*bpy.data.objects, *bpy.data.armatures):
+    for thing in (*bpy.data.objects, *bpy.data.armatures, *bpy.data.shape_keys):
         animation = thing.animation_data
         if thing == armature or animation is None or thing.library:
             continue
         slots = [slot for slot in action.slots if slot.target_id_type == thing.id_type]
-        for wanted in (animation.last_slot_identifier, f"{'OB' if thing.id_type == 'OBJECT' else 'AR'}{thing.name}"):
+        for wanted in (animation.last_slot_identifier, f"{thing.id_type[:2]}{thing.name}"):
             own = next((slot for slot in slots if slot.identifier == wanted), None)
             if own:
                 need_no_tweaking(thing)
@@ -153,17 +153,37 @@ def _companions(armature: bpy.types.Object, source: Source) -> list[tuple[bpy.ty
 
 
 def mixed_motions(armature: bpy.types.Object, motions: Iterable[Source]) -> str:
-    """Return in words which actions are played while others' animation moves an armature, too; empty if none is."""
-    moving = [thing for thing in _leant_on(leader_of(armature)) if changing_paths(_animation_of(thing))]
+    """Return in words which motion is played while what else moves an armature plays another; empty if none is."""
+    leader = leader_of(armature)
+    leant = _leant_on(leader)
     for source in motions:
-        own = [thing for thing, _ in _companions(leader_of(armature), source)]
-        others = [thing for thing in moving if thing not in own] if source.kind == ACTION else []
-        if others:
+        if source.kind == TIMELINE:
+            continue
+        own = [thing for thing, _ in _companions(leader, source)]
+        for thing in leant:
+            animation = None if thing in own else _animation_of(thing)
+            if changing_paths(animation) and (source.kind == ACTION or animation.action):
+                return (
+                    f"'{thing.name}' moves '{armature.name}', too: while '{source.name}' is sampled, it moves as on "
+                    "the timeline. Where both belong together, choose the timeline or give both one action."
+                )
+        free = [thing for thing in leant if isinstance(thing, bpy.types.Object) and thing not in own]
+        if free and (slot := _unplayed_slot(leader, source)):
             return (
-                f"'{others[0].name}' moves '{armature.name}', too: while the action '{source.name}' is sampled, it "
-                "moves as on the timeline. Where both belong together, choose the timeline or give both one action."
+                f"The slot '{slot}' of the action '{source.name}' is played by nothing, and '{armature.name}' leans "
+                f"on '{free[0].name}'; give that object the action and its slot once, if it belongs to it."
             )
     return ""
+
+
+def _unplayed_slot(armature: bpy.types.Object, source: Source) -> str:
+    """Return the name of a slot for an object without bones that nothing plays here; empty without one."""
+    if source.kind != ACTION or not SLOTS:
+        return ""
+    action, played = _action(source), [slot for _, slot in _companions(armature, source)]
+    slots = [slot for slot in action.slots if slot.target_id_type == "OBJECT" and slot not in played]
+    bare = [slot for slot in slots if not any(_bone(curve.data_path) for curve in curves_of(action, slot))]
+    return next((slot.name_display for slot in bare if not slot.users()), "")
 
 
 def _animation_of(thing: bpy.types.ID) -> bpy.types.AnimData | None:

@@ -312,7 +312,7 @@ def test_what_moves_a_rig_by_an_action_of_its_own_is_told(bpy, controlled):
         action.slots.remove(action.slots[mine])
     assert mixed_motions(rig, [Source(TIMELINE, "Timeline")]) == ""
     told = mixed_motions(rig, [Source(ACTION, "Walk")])
-    assert told.startswith(f"'{control.name}' moves 'Rig', too: while the action 'Walk' is sampled, it moves as on")
+    assert told.startswith(f"'{control.name}' moves 'Rig', too: while 'Walk' is sampled, it moves as on")
     control.animation_data_clear()
     assert mixed_motions(rig, [Source(ACTION, "Walk")]) == ""
 
@@ -368,3 +368,58 @@ def test_an_action_of_a_bone_whose_name_has_quotes_is_found(bpy, cast):
     hero, _villain, action = cast
     hero.data.bones["Spine"].name = 'Bip01 "Spine"'
     assert [source.name for source in sources(hero)] == ["Timeline", action.name]
+
+
+@pytest.mark.parametrize("controlled", [above], indirect=True)
+def test_a_slot_that_nothing_plays_is_told(bpy, controlled):
+    """The action came from another file, where the empty above had another name."""
+    from blender_addon.motions.sources import ACTION, Source, mixed_motions
+
+    rig, root = controlled
+    assert mixed_motions(rig, [Source(ACTION, "Walk")]) == ""
+    root.animation_data_clear()
+    root.name = "Hero root"
+    told = mixed_motions(rig, [Source(ACTION, "Walk")])
+    assert told.startswith(
+        "The slot 'Root' of the action 'Walk' is played by nothing, and 'Rig' leans on 'Hero root';"
+    )
+    rig.parent = None
+    assert mixed_motions(rig, [Source(ACTION, "Walk")]) == ""
+
+
+@pytest.mark.parametrize("controlled", [above], indirect=True)
+def test_a_strip_beside_an_action_of_the_empty_above_is_told(bpy, controlled):
+    from blender_addon.motions.sources import STRIP, Source, mixed_motions
+
+    rig, root = controlled
+    strip = rig.animation_data.nla_tracks.new().strips.new("Walk", 1, bpy.data.actions["Walk"])
+    source = Source(STRIP, strip.name, rig.animation_data.nla_tracks[0].name)
+    assert mixed_motions(rig, [source]).startswith("'Root' moves 'Rig', too: while")
+    root.animation_data.nla_tracks.new().strips.new("Walk", 1, bpy.data.actions["Walk"])
+    root.animation_data.action = None
+    assert mixed_motions(rig, [source]) == ""  # its strips play along
+
+
+def test_shape_keys_that_change_in_the_action_that_is_chosen_are_told(bpy, cast):
+    from types import SimpleNamespace
+
+    from blender_addon.motions.shapes import tell_changing_shapes
+    from blender_addon.motions.sources import ACTION, Source
+
+    hero, _villain, action = cast
+    pillar, said = bpy.data.objects["Pillar"], []
+    bpy.data.objects["Skirt"].ssilk.armature = hero
+    pillar.shape_key_add(name="Basis")
+    breath, keys = pillar.shape_key_add(name="Breath"), pillar.data.shape_keys
+    keys.animation_data_create().action = action
+    keys.animation_data.action_slot = action.slots.new("KEY", keys.name)
+    for frame, breath.value in ((1, 0.0), (12, 1.0)):
+        breath.keyframe_insert("value", frame=frame)
+    keys.animation_data.action = None
+    operator = SimpleNamespace(report=lambda kind, text: said.append(text))
+    tell_changing_shapes(operator, bpy.data.objects["Skirt"])
+    assert not said
+    tell_changing_shapes(operator, bpy.data.objects["Skirt"], [Source(ACTION, action.name)])
+    (told,) = said
+    assert told.startswith("The shape key 'Breath' of 'Pillar' changes over time")
+    assert keys.animation_data.action is None
