@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import bpy
 
 from ..scene.armature import leader_of
-from ..scene.garment import armature_of, bodies_of, no_meshes
+from ..scene.garment import armature_of, bodies_of, need_left, no_meshes
 from ..scene.meshes import PREFIX
 from ..scene.modifiers import bones_place, reshapes, shown_or_rendered_alone, unmet_modifiers
 from .bodies import look_at
@@ -44,6 +44,9 @@ def tell_changing_shapes(
 
     Args:
         motions: those in which bodies are looked at; the timeline without any.
+
+    Raises:
+        SetupError: a body is being edited.
     """
     for text in _unmet(garment, motions or [Source(TIMELINE, "Timeline")]):
         operator.report({"WARNING"}, text)
@@ -74,6 +77,8 @@ def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str
         if body.hide_render:
             text = f"'{body.name}' is not rendered, and cloth meets it all the same"
             yield f"{text}; to leave it out, put the other bodies in a collection, and choose that as Bodies."
+    for body in bodies:
+        need_left(body)
     looked = look_at(armature, bodies, motions)
     for body, found in zip(bodies, looked):
         if not changing_shapes(body) and (found.changes or _changing_modifiers(body)):

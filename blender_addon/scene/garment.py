@@ -226,6 +226,12 @@ def need_own_mesh(thing: bpy.types.Object) -> None:
         )
 
 
+def need_left(thing: bpy.types.Object) -> None:
+    """Raise `SetupError` if an object is being edited: its mesh is as it was before."""
+    if thing.mode == "EDIT":
+        raise SetupError(f"'{thing.name}' is in Edit Mode; leave it first (Tab), so that what you changed counts.")
+
+
 def need_plain_parent(thing: bpy.types.Object) -> None:
     """Raise `SetupError` if an object's parent deforms it beside its modifiers, as armatures did in old files."""
     if thing.parent and thing.parent.type == "ARMATURE" and thing.parent_type == "ARMATURE":

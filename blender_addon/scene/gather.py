@@ -17,7 +17,16 @@ from ..arrays.joints import Joints, identifiers
 from ..errors import SetupError
 from .armature import leader_of, read_joints
 from .classes import current_classes
-from .garment import armature_of, bodies_of, carried_weights, is_carried, need_linear, need_plain_parent, rest_world
+from .garment import (
+    armature_of,
+    bodies_of,
+    carried_weights,
+    is_carried,
+    need_left,
+    need_linear,
+    need_plain_parent,
+    rest_world,
+)
 from .masks import unmasked
 from .modifiers import need_plain_modifiers, reshapes
 from .objects import scene_units
@@ -149,8 +158,10 @@ def read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joint
     """Return a body at rest; evaluated where modifiers shape it before its armature does.
 
     Raises:
-        SetupError: Blender deforms it otherwise than by linear blend skinning, or vertices have no weight.
+        SetupError: Blender deforms it otherwise than by linear blend skinning, vertices have no weight, or it is
+            being edited.
     """
+    need_left(thing)
     need_linear(thing, armature)
     if not reshapes(thing):
         return _bound(thing, thing.data, armature, joints, path, worn_points(thing))

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
 
-from .conftest import add_armature, add_mesh, tube
+from .conftest import activate, add_armature, add_mesh, tube
 from .scenes import animate
 from .test_shapes import fuller, shown_at_rest
 
@@ -277,3 +277,15 @@ def test_a_cage_that_is_not_rendered_is_told(bpy, moving):
     bodies.objects.link(cage)
     moving.ssilk.bodies = bodies
     assert not said_of(moving)  # it was chosen
+
+
+def test_a_body_that_is_being_edited_is_refused(bpy, moving):
+    from blender_addon.errors import SetupError
+    from blender_addon.scene.gather import gather
+
+    activate(bpy, bpy.data.objects["Pillar"])
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.context.view_layer.objects.active = moving
+    for use in (lambda: gather(moving, classes=False, proxies=False), lambda: said_of(moving)):
+        with pytest.raises(SetupError, match="'Pillar' is in Edit Mode; leave it first"):
+            use()
