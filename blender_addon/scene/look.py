@@ -52,7 +52,8 @@ def _on_top(thing: bpy.types.Object) -> list[str]:
     """Return the names of modifiers that are seen, and not in the mesh that is handed over."""
     place = bones_place(thing)
     after = thing.modifiers[place + 1 :] if place is not None else [] if reshapes(thing) else thing.modifiers
-    return [each.name for each in after if each.show_render and each.type not in (HARMLESS | {"ARMATURE"})]
+    unseen = HARMLESS - {"PARTICLE_SYSTEM"} | {"ARMATURE"}
+    return [each.name for each in after if each.show_render and each.type not in unseen]
 
 
 def _shading(mesh: bpy.types.Mesh) -> list[str]:

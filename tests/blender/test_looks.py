@@ -21,6 +21,10 @@ def solid(thing: Any) -> None:
     thing.modifiers.new("Finer", "SUBSURF").show_render = False
 
 
+def hairy(thing: Any) -> None:
+    thing.modifiers.new("Fur", "PARTICLE_SYSTEM")
+
+
 def property_of_its_own(thing: Any) -> None:
     thing["asset_id"] = "cape_0042"
 
@@ -29,6 +33,7 @@ CASES: dict[str, Callable[[Any], Any]] = {
     "the attribute 'wet'": lambda thing: attribute(thing, "wet", "FLOAT", "POINT", 0.5),
     "the custom property 'asset_id'": property_of_its_own,
     "the modifier 'Solid'": solid,
+    "the modifier 'Fur'": hairy,
     "its flat or sharp shading": lambda thing: attribute(thing, "sharp_edge", "BOOLEAN", "EDGE", True),
     "its creases": lambda thing: attribute(thing, "crease_edge", "FLOAT", "EDGE", 0.7),
 }
