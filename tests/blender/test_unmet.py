@@ -289,3 +289,17 @@ def test_a_body_that_is_being_edited_is_refused(bpy, moving):
     for use in (lambda: gather(moving, classes=False, proxies=False), lambda: said_of(moving)):
         with pytest.raises(SetupError, match="'Pillar' is in Edit Mode; leave it first"):
             use()
+
+
+@pytest.mark.parametrize("hide", [disabled, in_a_disabled_collection])
+@pytest.mark.parametrize("kind", ["PENETRATION", "SKIN"])
+def test_heat_maps_refuse_a_body_that_blender_does_not_move(bpy, moving, hide, kind):
+    from blender_addon.errors import SetupError
+    from blender_addon.quality import heat
+
+    list(heat.measuring(moving, getattr(heat, kind), bpy.context.evaluated_depsgraph_get()))
+    hide(bpy, bpy.data.objects["Pillar"])
+    with pytest.raises(
+        SetupError, match="'Pillar' is disabled in viewports, and Blender does not move it; enable it"
+    ):
+        list(heat.measuring(moving, getattr(heat, kind), bpy.context.evaluated_depsgraph_get()))
