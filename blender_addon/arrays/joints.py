@@ -69,7 +69,7 @@ class Joints:
         own = self.character
         count = len(own.names)
         moved = [moved_by_joints(body.mesh.points, body.skin.dense(count)) for body in bodies]
-        hub = carrying_joint(moved, own.parents)
+        hub = carrying_joint(moved, own.parents, own.binds[:, :3, 3])
         return Skeleton(path, own.paths, own.parents, own.binds, local_transforms(own.binds, own.parents), hub)
 
 

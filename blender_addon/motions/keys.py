@@ -20,6 +20,7 @@ from ..scene.objects import scene_step
 OWNER = "ssilk_garment"  # custom property of an action that was baked: the garment object
 LIVE = "ssilk_live"  # custom property of one that stands for live playback, until that ends
 SLOTS = hasattr(bpy.types, "ActionSlot")  # since Blender 4.4
+STEADY = 1e-6  # of a key's value: rounding
 LINEAR = bpy.types.Keyframe.bl_rna.properties["interpolation"].enum_items["LINEAR"].value
 
 
@@ -70,6 +71,26 @@ def curves_of(action: bpy.types.Action, slot: Any = None) -> Iterator[bpy.types.
             for bag in strip.channelbags:
                 if slot is None or bag.slot_handle == slot.handle:
                     yield from bag.fcurves
+
+
+def changing_paths(animation: bpy.types.AnimData | None) -> set[str]:
+    """Return which properties drivers move now, or keys whose values differ."""
+    if animation is None:
+        return set()
+    strips = strips_in(animation.nla_tracks if animation.use_nla else ())
+    players: list[Any] = [animation, *(strip for strip, muted in strips if not muted)]
+    curves: list[Any] = list(animation.drivers)
+    for player in players:
+        if player.action and not (SLOTS and player.action_slot is None):
+            played = curves_of(player.action, player.action_slot if SLOTS else None)
+            curves += [curve for curve in played if not _is_constant(curve)]
+    return {curve.data_path for curve in curves if not curve.mute}
+
+
+def _is_constant(curve: bpy.types.FCurve) -> bool:
+    """Return whether a curve keeps one value, as where an artist keyed a shape once."""
+    values = {value for key in curve.keyframe_points for value in (key.co.y, key.handle_left.y, key.handle_right.y)}
+    return bool(values) and max(values) - min(values) < STEADY and not curve.modifiers
 
 
 def strips_in(tracks: Iterable[bpy.types.NlaTrack]) -> Iterator[tuple[bpy.types.NlaStrip, bool]]:

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import bpy
 
 from ..errors import SetupError
-from .keys import SLOTS, curves_of, is_baked, need_no_tweaking, strips_in
+from ..scene.armature import leader_of
+from .keys import SLOTS, changing_paths, curves_of, is_baked, need_no_tweaking, strips_in
 
 TIMELINE, ACTION, STRIP, FILE = "TIMELINE", "ACTION", "STRIP", "FILE"
 KINDS = [
@@ -106,12 +109,17 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
     need_no_tweaking(armature)
     names = ("action", "action_slot", "use_nla") if SLOTS else ("action", "use_nla")
     mutes = [(item, "mute") for track in animation.nla_tracks for item in (track, *track.strips)]
-    kept = [(item, name, getattr(item, name)) for item, name in [*((animation, name) for name in names), *mutes]]
+    solos = [(track, "is_solo") for track in animation.nla_tracks]
+    played = [(animation, slot_of(armature, _action(source)))] if source.kind == ACTION else []
+    played += [(thing.animation_data, slot) for thing, slot in _companions(armature, source)]
+    players = {item.id_data: item for item in (animation, *(item for item, _ in played))}.values()
+    properties = [*((item, name) for item in players for name in names), *mutes, *solos]
+    kept = [(item, name, getattr(item, name)) for item, name in properties]
     try:
-        if source.kind == ACTION:
-            animation.use_nla = False
-            assign(animation, _action(source), slot_of(armature, _action(source)))
-        else:
+        for item, slot in played:
+            item.use_nla = False
+            assign(item, _action(source), slot)
+        if source.kind == STRIP:
             _play_alone(animation, _strip(armature, source))
         yield
     finally:
@@ -120,6 +128,88 @@ def playing(armature: bpy.types.Object, source: Source) -> Iterator[None]:
                 setattr(item, name, value)
         if bare:
             armature.animation_data_clear()
+
+
+def _companions(armature: bpy.types.Object, source: Source) -> list[tuple[bpy.types.ID, Any]]:
+    """Return what has a slot in the action of a motion besides an armature, as its controls have, each with its slot.
+
+    Blender itself tells whose a slot is by the one that was played last, then by the name.
+    """
+    if source.kind != ACTION or not SLOTS:
+        return []
+    action, found = _action(source), []
+    for thing in (*bpy.data.objects, *bpy.data.armatures, *bpy.data.shape_keys):
+        animation = thing.animation_data
+        if thing == armature or animation is None or thing.library:
+            continue
+        slots = [slot for slot in action.slots if slot.target_id_type == thing.id_type]
+        for wanted in (animation.last_slot_identifier, f"{thing.id_type[:2]}{thing.name}"):
+            own = next((slot for slot in slots if slot.identifier == wanted), None)
+            if own:
+                need_no_tweaking(thing)
+                found.append((thing, own))
+                break
+    return found
+
+
+def mixed_motions(armature: bpy.types.Object, motions: Iterable[Source]) -> str:
+    """Return in words which motion is played while what else moves an armature plays another; empty if none is."""
+    leader = leader_of(armature)
+    leant = _leant_on(leader)
+    for source in motions:
+        if source.kind == TIMELINE:
+            continue
+        own = [thing for thing, _ in _companions(leader, source)]
+        for thing in leant:
+            animation = None if thing in own else _animation_of(thing)
+            if changing_paths(animation) and (source.kind == ACTION or animation.action):
+                return (
+                    f"'{thing.name}' moves '{armature.name}', too: while '{source.name}' is sampled, it moves as on "
+                    "the timeline. Where both belong together, choose the timeline or give both one action."
+                )
+        free = [thing for thing in leant if isinstance(thing, bpy.types.Object) and thing not in own]
+        if free and (slot := _unplayed_slot(leader, source)):
+            return (
+                f"The slot '{slot}' of the action '{source.name}' is played by nothing, and '{armature.name}' leans "
+                f"on '{free[0].name}'; give that object the action and its slot once, if it belongs to it."
+            )
+    return ""
+
+
+def _unplayed_slot(armature: bpy.types.Object, source: Source) -> str:
+    """Return the name of a slot for an object without bones that nothing plays here; empty without one."""
+    if source.kind != ACTION or not SLOTS:
+        return ""
+    action, played = _action(source), [slot for _, slot in _companions(armature, source)]
+    slots = [slot for slot in action.slots if slot.target_id_type == "OBJECT" and slot not in played]
+    bare = [slot for slot in slots if not any(_bone(curve.data_path) for curve in curves_of(action, slot))]
+    return next((slot.name_display for slot in bare if not slot.users()), "")
+
+
+def _animation_of(thing: bpy.types.ID) -> bpy.types.AnimData | None:
+    return getattr(thing, "animation_data", None)  # collections and images have none
+
+
+def _leant_on(thing: bpy.types.Object) -> list[bpy.types.ID]:
+    """Return what an object's place and pose depend on besides its own animation, and the data of all that."""
+    found: list[bpy.types.ID] = []
+    waiting: list[bpy.types.ID | None] = [thing.data, thing]
+    while waiting:
+        item = waiting.pop()
+        if item is None or item in found:
+            continue
+        found.append(item)
+        animation = _animation_of(item)
+        for curve in animation.drivers if animation else ():
+            waiting += [target.id for variable in curve.driver.variables for target in variable.targets]
+        if isinstance(item, bpy.types.Object):
+            waiting += [item.parent, item.data]
+            bones = item.pose.bones if item.pose else ()
+            constraints = chain(item.constraints, *(bone.constraints for bone in bones))
+            for constraint in (each for each in constraints if not each.mute):
+                waiting += [getattr(constraint, name, None) for name in ("target", "pole_target")]
+                waiting += [target.target for target in getattr(constraint, "targets", ())]
+    return [item for item in found if item != thing]
 
 
 def slot_of(armature: bpy.types.Object, action: bpy.types.Action) -> Any:
@@ -217,7 +307,8 @@ def _plays_as_it_is(armature: bpy.types.Object, strip: bpy.types.NlaStrip) -> bo
 
 def _bone(path: str) -> str:
     """Return the name of the bone that an F-curve moves; empty if it moves none."""
-    return path.split('"')[1] if path.startswith('pose.bones["') else ""
+    found = re.match(r'pose\.bones\["((?:[^"\\]|\\.)*)"\]', path)
+    return bpy.utils.unescape_identifier(found[1]) if found else ""
 
 
 def _action(source: Source) -> bpy.types.Action:
@@ -245,9 +336,10 @@ def assign(animation: bpy.types.AnimData, action: bpy.types.Action, slot: Any = 
 
 
 def _play_alone(animation: bpy.types.AnimData, strip: bpy.types.NlaStrip) -> None:
-    """Mute everything but one strip."""
+    """Mute everything but one strip, and but those that it leads from and to."""
     animation.action, animation.use_nla = None, True
     for track in animation.nla_tracks:
+        track.is_solo = False
         track.mute = strip.name not in track.strips or track.strips[strip.name] != strip
         for other in track.strips:
-            other.mute = other != strip
+            other.mute = other != strip and (track.mute or strip.type != "TRANSITION")

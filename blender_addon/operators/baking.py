@@ -32,9 +32,9 @@ from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
-from ..playback.bodies import reshaped
+from ..playback.bodies import corrected, reshaped
 from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
-from ..playback.overrides import told
+from ..playback.overrides import overriding, told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
 from ..scene.classes import current_classes
@@ -42,7 +42,7 @@ from ..scene.garment import armature_of, bodies_of, unplayable_here
 from ..scene.gather import ROOT, gather
 from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.linked import is_override
-from ..scene.look import lost_looks
+from ..scene.look import left_behind, lost_looks
 from ..scene.objects import Pair, scene_rate
 from ..scene.weights import has_trained_weights
 from ..settings.training import RELATIVE
@@ -177,10 +177,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         tell_changing_shapes(self, garment)
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
-        lost = lost_looks([garment, *bodies_of(garment, armature)]) if self.to_usd else []
-        if lost:
-            text = f"{'; '.join(lost)}. Bake to the timeline and use Blender's own export to keep these"
-            self.report({"WARNING"}, f"In USD {text}.")
+        if self.to_usd:
+            self.tell_lost(garment, armature)
         self.python = interpreter(preferences(context))
         self.bones, self.character = joints.bones, joints.character
         self.inputs = inputs_folder(garment, self.model)
@@ -190,6 +188,18 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
             rephrase=self.rephrase,
         )  # fmt: skip
+
+    def tell_lost(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
+        """Report what a shot in USD lacks of what Blender shows."""
+        written = [garment, *bodies_of(garment, armature)]
+        if looks := lost_looks(written):
+            text = f"{'; '.join(looks)}. Bake to the timeline and use Blender's own export to keep these"
+            self.report({"WARNING"}, f"In USD {text}.")
+        if parts := left_behind(armature, written):
+            self.report({"WARNING"}, f"The shot in USD holds the garment and its bodies alone, without {parts}.")
+        if over := overriding(garment, armature):
+            text = "The shot in USD holds the network's own motion, without what stands over it in Blender"
+            self.report({"WARNING"}, f"{text}: {'; '.join(over)}.")
 
     def known_joints(self, garment: bpy.types.Object, armature: bpy.types.Object) -> Joints:
         """Return the joints under the names that the model knows; raise `SsilkError` where it cannot be read."""
@@ -224,7 +234,10 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if hold > 1 or (free < 1).any():
             write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold)
         stage = self.model.parent / STAGE
-        self.reshaped = reshaped(self.pair.objects()[0], self.character, stage) if stage.exists() else ""
+        garment, _ = self.pair.objects()
+        self.reshaped = reshaped(garment, self.character, stage) if stage.exists() else ""
+        if self.to_usd and stage.exists():
+            self.reshaped += corrected(garment, self.character, stage)
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write the inputs of the bake; return the command."""

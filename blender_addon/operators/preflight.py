@@ -16,6 +16,7 @@ from ..arrays.findings import PUSHED, Clip, read_findings
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
 from ..motions.shapes import tell_changing_shapes
+from ..motions.sources import Source, mixed_motions
 from ..outside.wording import reworded
 from ..outside.work import Work
 from ..preferences import interpreter, preferences, unready
@@ -39,14 +40,16 @@ class InspectOperator(RigOperator):
 
     Attributes:
         doing: what is done with the garment.
+        motions: in which its bodies are looked at; the timeline without any.
     """
 
     doing = ""
+    motions: Sequence[Source] = ()
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
         self.pair, self.scene = Pair.of(garment, armature_of(garment)), gather(garment)
-        tell_changing_shapes(self, garment)
+        tell_changing_shapes(self, garment, self.motions)
         self.python = interpreter(preferences(context))
         return Work(
             f"{self.doing} '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(),
@@ -84,6 +87,9 @@ class Inspect(InspectOperator, bpy.types.Operator):
         for finding in findings:
             raise SetupError(f"'{finding.prim}': {finding.found}; {finding.fix}.")
         self.chosen, self.preset = ChosenMotions.of(garment, armature_of(garment)), garment.ssilk.training.preset
+        self.motions = [take.source for take in self.chosen.takes]
+        if mixed := mixed_motions(armature_of(garment), self.motions):
+            self.report({"WARNING"}, mixed)
         return super().prepare(context)
 
     def steps(self) -> Iterator[float]:

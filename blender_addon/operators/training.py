@@ -17,7 +17,7 @@ from ..arrays.joints import identifiers
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
 from ..motions.shapes import tell_changing_shapes
-from ..motions.sources import FILE, TIMELINE, Source, sources
+from ..motions.sources import FILE, TIMELINE, Source, mixed_motions, sources
 from ..outside import jobs
 from ..outside.wording import BONES, remember
 from ..outside.work import Work
@@ -170,9 +170,12 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
             raise SetupError(f"'{garment.name}' has a budget in iterations and in minutes; set one of them to zero.")
         choose_preset(garment)
         self.scene = gather(garment)
-        tell_changing_shapes(self, garment)
         need_trainable(garment, armature, self.scene)
         self.chosen = ChosenMotions.of(garment, armature)
+        played = [take.source for take in self.chosen.takes]
+        tell_changing_shapes(self, garment, played)
+        if mixed := mixed_motions(armature, played):
+            self.report({"WARNING"}, mixed)
         self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)

@@ -3,19 +3,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
+from ssilk_core.scene.assets import Character, Mesh
+
 from ..arrays.joints import Joints, identifiers
 from ..scene.garment import armature_of, bodies_of, rest_world
-from ..scene.gather import SKELETON, read_body
+from ..scene.gather import SKELETON, evaluated, read_body
 from ..scene.modifiers import reshapes
 from ..scene.objects import scene_units
 from ..scene.shapes import mixed_points
 
 SAME = 1e-3  # [m] that nobody sees
+
+
+def corrected(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
+    """Return in words how far shape keys move a garment at rest from its shape in training; empty if they do not.
+
+    Args:
+        joints, stage: as for `reshaped`.
+    """
+    from ssilk_usd.reading.garment import read_garment
+
+    trained, back = _trained(garment, joints, stage)
+    if back is None or not garment.data.shape_keys:
+        return ""
+    mesh = read_garment(str(stage), trained.skeleton).mesh
+    points = _at_rest_now(garment)
+    if len(points) != mesh.vertex_count:
+        return ""
+    away = np.linalg.norm(points @ back[:3, :3].T + back[:3, 3] - mesh.points, axis=1).max()
+    if away <= SAME:
+        return ""
+    return f" (shape keys that correct '{garment.name}' by up to {1000 * away:.0f} mm in Blender are not in the shot)"
 
 
 def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
@@ -27,17 +51,42 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
         joints: the character's, by the paths that the garment knows.
         stage: what was handed over for the training.
     """
+    trained, back = _trained(garment, joints, stage)
+    if back is None:
+        return ""
+    meshes = {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}
+    armature = armature_of(garment)
+    things = [garment, *bodies_of(garment, armature)]
+    with evaluated(things):
+        return _first_off(things, armature, joints, meshes, back)
+
+
+def _trained(garment: bpy.types.Object, joints: Joints, stage: Path) -> tuple[Character, np.ndarray | None]:
+    """Return the character of a stage, and what moves the scene to where it was then, (4, 4), or None."""
     from ssilk_usd.reading.character import read_character
 
     trained = read_character(str(stage), garment=identifiers([garment.name], taken=(SKELETON,))[0])
     order = {path: index for index, path in enumerate(trained.skeleton.joint_names)}
     shared = next((joint for joint, path in enumerate(joints.paths) if path in order), None)
     if shared is None:
-        return ""
-    back = trained.skeleton.bind_transforms[order[joints.paths[shared]]] @ np.linalg.inv(joints.binds[shared])
-    meshes = {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}
-    armature = armature_of(garment)
-    things = [garment, *bodies_of(garment, armature)]
+        return trained, None
+    now = np.linalg.inv(joints.binds[shared])
+    return trained, trained.skeleton.bind_transforms[order[joints.paths[shared]]] @ now
+
+
+def _at_rest_now(thing: bpy.types.Object) -> np.ndarray:
+    """Return where the artist's keys have the points of an object at rest [m], shape (V, 3)."""
+    world = np.array(rest_world(thing))
+    return scene_units().points_to_core(mixed_points(thing, baked=False) @ world[:3, :3].T + world[:3, 3])
+
+
+def _first_off(
+    things: Sequence[bpy.types.Object],
+    armature: bpy.types.Object,
+    joints: Joints,
+    meshes: Mapping[str, Mesh],
+    back: np.ndarray,
+) -> str:
     for thing, name in list(zip(things, identifiers((each.name for each in things), taken=(SKELETON,))))[1:]:
         mesh = meshes.get(name)
         if mesh is None:
@@ -45,8 +94,7 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
         if reshapes(thing):
             points = read_body(thing, armature, joints, thing.name).mesh.points
         else:
-            world = np.array(rest_world(thing))
-            points = scene_units().points_to_core(mixed_points(thing, baked=False) @ world[:3, :3].T + world[:3, 3])
+            points = _at_rest_now(thing)
         if len(points) != mesh.vertex_count:
             continue
         away = np.linalg.norm(points @ back[:3, :3].T + back[:3, 3] - mesh.points, axis=1).max()

@@ -153,6 +153,7 @@ def _listed(names: Sequence[str], what: str) -> str:
 def _probe(garment: bpy.types.Object) -> Iterator[bpy.types.Object]:
     """Yield a copy of a garment that shape keys and bones move alone, without modifiers that refine it."""
     probe = local_copy(garment)
+    probe.hide_viewport = False  # Blender does not evaluate what is disabled
     try:
         for modifier in list(probe.modifiers):
             if modifier.type != "ARMATURE":

@@ -24,6 +24,7 @@ from ..scene.linked import give_own_mesh, is_override, need_local
 from ..scene.masks import need_unmasked
 from ..scene.meshes import rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
+from ..scene.objects import need_enabled
 from ..scene.shapes import mixed_points, worn_points
 from .intersections import crossing_triangles
 from .repairs import displacements
@@ -101,8 +102,8 @@ def measuring(
     All that it needs of the frame is read before the first yield.
 
     Raises:
-        SetupError: it has no body or one with hidden skin, was not pushed out, or modifiers change how many vertices
-            there are before bones move them.
+        SetupError: it has no body, one with hidden skin, or one that is disabled in viewports, was not pushed out,
+            or modifiers change how many vertices there are before bones move them.
     """
     if kind == PUSHED_OUT:
         return HeatMap(kind, displacements(garment))
@@ -121,6 +122,7 @@ def measuring(
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
     bodies = bodies_of(garment, armature_of(garment))
     need_unmasked(bodies)
+    need_enabled(bodies)
     surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies]
     for surface in surfaces:
         depths.append((yield from scaled(_depths(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
@@ -235,6 +237,7 @@ def _shown(garment: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> Generat
     """Find how far beneath the skin the cloth is where skin shows [m], as `heat.shown_depths`, of all bodies."""
     bodies, scale = bodies_of(garment, armature_of(garment)), bpy.context.scene.unit_settings.scale_length
     need_unmasked(bodies)
+    need_enabled(bodies)
     cloth, triangles = _cage(garment, depsgraph)
     trees = [
         BVHTree.FromPolygons(points.tolist(), triangles.tolist(), all_triangles=True)

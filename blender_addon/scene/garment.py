@@ -7,6 +7,8 @@ would move them twice.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import bpy
 import numpy as np
 from mathutils import Matrix
@@ -109,10 +111,11 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     Raises:
         SetupError: there is none, or one that was chosen is not bound to the armature.
     """
-    chosen = garment.ssilk.bodies
-    things = chosen.all_objects if chosen else bpy.context.view_layer.objects
+    chosen, things, wearers = garment.ssilk.bodies, _around(garment), (armature, leader_of(armature))
     meshes = [thing for thing in things if thing.type == "MESH" and thing != garment]
-    wearers = (armature, leader_of(armature))
+    for thing in meshes:
+        if chosen or (thing.parent in wearers and not is_garment(thing)):
+            need_plain_parent(thing)
     bound = [thing for thing in meshes if _modifier_armature(thing) in wearers]
     carried = [thing for thing in meshes if is_carried(thing, wearers)]
     if chosen:
@@ -128,11 +131,30 @@ def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy
     return bound
 
 
+def _around(garment: bpy.types.Object) -> Iterable[bpy.types.Object]:
+    """Return the objects of which some may be bodies of a garment."""
+    return garment.ssilk.bodies.all_objects if garment.ssilk.bodies else bpy.context.view_layer.objects
+
+
+def no_meshes(garment: bpy.types.Object, armature: bpy.types.Object) -> list[str]:
+    """Return in words what looks like a body, and is none since it is no mesh: it was chosen, or bones move it."""
+    said, wearers = [], (armature, leader_of(armature))
+    for thing in _around(garment):
+        is_meant = bool(garment.ssilk.bodies) or _modifier_armature(thing) in wearers
+        if is_meant and thing.type in SURFACES:
+            said.append(f"'{thing.name}' is no mesh, and cloth does not meet it; convert it (Object > Convert)")
+        elif is_meant and thing.instance_type == "COLLECTION" and thing.instance_collection:
+            text = f"'{thing.name}' is an instance of a collection, and cloth does not meet it; make it real"
+            said.append(f"{text} (Object > Apply > Make Instances Real) and bind it")
+    return said
+
+
 def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:
     bound = (modifier.object for modifier in thing.modifiers if modifier.type == "ARMATURE")
     return next(filter(None, bound), None)
 
 
+SURFACES = ("CURVE", "SURFACE", "FONT", "META")  # kinds of objects that have a surface, and no mesh of their own
 Carrier = tuple[bpy.types.Object, bpy.types.Bone]
 
 
@@ -204,12 +226,28 @@ def need_own_mesh(thing: bpy.types.Object) -> None:
         )
 
 
+def need_left(thing: bpy.types.Object) -> None:
+    """Raise `SetupError` if an object is being edited: its mesh is as it was before."""
+    if thing.mode == "EDIT":
+        raise SetupError(f"'{thing.name}' is in Edit Mode; leave it first (Tab), so that what you changed counts.")
+
+
+def need_plain_parent(thing: bpy.types.Object) -> None:
+    """Raise `SetupError` if an object's parent deforms it beside its modifiers, as armatures did in old files."""
+    if thing.parent and thing.parent.type == "ARMATURE" and thing.parent_type == "ARMATURE":
+        raise SetupError(
+            f"'{thing.name}' is deformed by its parent '{thing.parent.name}' beside its modifiers; set Relations > "
+            "Parent Type to Object in its object properties, and give it an Armature modifier if it has none."
+        )
+
+
 def need_linear(thing: bpy.types.Object, armature: bpy.types.Object) -> bool:
     """Return whether an Armature modifier lets an armature move an object, which it must do by linear blend skinning.
 
     Raises:
-        SetupError: an option of the modifier is in the way.
+        SetupError: an option of the modifier is in the way, or its parent deforms the object as well.
     """
+    need_plain_parent(thing)
     for modifier in thing.modifiers:
         if modifier.type != "ARMATURE" or modifier.object not in (armature, leader_of(armature)):
             continue

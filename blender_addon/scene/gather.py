@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -17,7 +17,16 @@ from ..arrays.joints import Joints, identifiers
 from ..errors import SetupError
 from .armature import leader_of, read_joints
 from .classes import current_classes
-from .garment import armature_of, bodies_of, carried_weights, is_carried, need_linear, rest_world
+from .garment import (
+    armature_of,
+    bodies_of,
+    carried_weights,
+    is_carried,
+    need_left,
+    need_linear,
+    need_plain_parent,
+    rest_world,
+)
 from .masks import unmasked
 from .modifiers import need_plain_modifiers, reshapes
 from .objects import scene_units
@@ -66,11 +75,20 @@ def gather(
     Raises:
         SetupError: something is missing or cannot be used; the sentence names the object.
     """
-    bpy.context.view_layer.update()  # drivers of shape keys of what was just linked have not run yet
+    bpy.context.view_layer.update()  # what was just linked is in no list of the view layer yet
     armature = armature_of(garment)
     need_plain_modifiers(garment, simulated=simulated)
+    need_plain_parent(garment)
     joints = joints or read_joints(armature, garment)
     things = [garment, *bodies_of(garment, armature)]
+    with evaluated(things):
+        return _gathered(things, armature, joints, classes=classes, proxies=proxies)
+
+
+def _gathered(
+    things: Sequence[bpy.types.Object], armature: bpy.types.Object, joints: Joints, *, classes: bool, proxies: bool
+) -> GatheredScene:
+    garment = things[0]
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
     lbs = own_weights(armature, garment, joints)
     mesh = read_mesh(garment, garment.data, paths[0], worn_points(garment))
@@ -140,8 +158,10 @@ def read_body(thing: bpy.types.Object, armature: bpy.types.Object, joints: Joint
     """Return a body at rest; evaluated where modifiers shape it before its armature does.
 
     Raises:
-        SetupError: Blender deforms it otherwise than by linear blend skinning, or vertices have no weight.
+        SetupError: Blender deforms it otherwise than by linear blend skinning, vertices have no weight, or it is
+            being edited.
     """
+    need_left(thing)
     need_linear(thing, armature)
     if not reshapes(thing):
         return _bound(thing, thing.data, armature, joints, path, worn_points(thing))
@@ -169,6 +189,30 @@ def _bound(
     if bare:
         raise SetupError(f"{bare} of {len(weights)} vertices of '{thing.name}' have no bone's weight; paint these.")
     return Body(read_mesh(thing, mesh, path, points), SkinWeights.from_dense(path, weights))
+
+
+@contextmanager
+def evaluated(things: Sequence[bpy.types.Object]) -> Iterator[None]:
+    """Let Blender evaluate objects, those too that are disabled in viewports, themselves or with their collections.
+
+    It passes them over otherwise, and their modifiers and drivers do nothing.
+    """
+    own = bpy.context.scene.collection
+    hidden = [thing for thing in things if not thing.library and thing.hide_viewport]
+    away = [thing for thing in things if all(group.hide_viewport for group in thing.users_collection)]
+    lent = [thing for thing in away if thing.name not in own.objects]
+    try:
+        for thing in hidden:
+            thing.hide_viewport = False
+        for thing in lent:
+            own.objects.link(thing)
+        bpy.context.view_layer.update()
+        yield
+    finally:
+        for thing in hidden:
+            thing.hide_viewport = True
+        for thing in lent:
+            own.objects.unlink(thing)
 
 
 @contextmanager

@@ -46,6 +46,21 @@ class Objection:
     todo: str
 
 
+def reweighs(modifier: bpy.types.Modifier) -> bool:
+    """Return whether a modifier may change the weights by which bones move a mesh, if it stands before them."""
+    if modifier.type == "DATA_TRANSFER":
+        return modifier.use_vert_data and "VGROUP_WEIGHTS" in modifier.data_types_verts
+    if modifier.type == "VERTEX_WEIGHT_MIX":
+        return bool(modifier.vertex_group_a)
+    return modifier.type in ("VERTEX_WEIGHT_EDIT", "VERTEX_WEIGHT_PROXIMITY") and bool(modifier.vertex_group)
+
+
+def _reweighs_bones(modifier: bpy.types.Modifier, armature: bpy.types.Object) -> bool:
+    """Return whether a modifier changes weights of an armature's bones; else its group only masks something."""
+    group = getattr(modifier, "vertex_group_a", "") or getattr(modifier, "vertex_group", "")
+    return reweighs(modifier) and (modifier.type == "DATA_TRANSFER" or group in armature.data.bones)
+
+
 def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Objection]:
     """Return what is wrong with a garment's modifiers that are switched on, in viewports or renders.
 
@@ -55,11 +70,16 @@ def objections(garment: bpy.types.Object, *, simulated: bool = False) -> list[Ob
     used = [modifier for modifier in garment.modifiers if modifier.show_viewport or modifier.show_render]
     deforms = [modifier.type == "ARMATURE" and modifier.object is not None for modifier in used]
     bones = deforms.index(True) if any(deforms) else -1
-    judged = (
+    judged = [
         (modifier, _objection(modifier, after=0 <= bones < place, bound=bones >= 0, simulated=simulated))
         for place, modifier in enumerate(used)
         if place != bones
-    )
+    ]
+    judged += [
+        (modifier, ("changes its weights before bones use them", f"apply it, or {BELOW}"))
+        for modifier in used[: max(bones, 0)]
+        if _reweighs_bones(modifier, used[bones].object)
+    ]
     return [Objection(modifier.name, *said) for modifier, said in judged if said]
 
 
@@ -108,10 +128,13 @@ def need_plain_modifiers(garment: bpy.types.Object, *, simulated: bool = False) 
 
 
 def reshapes(thing: bpy.types.Object) -> bool:
-    """Return whether modifiers shape a body before its armature deforms it; it is then taken as they shape it."""
+    """Return whether modifiers shape or weigh a body before its armature deforms it; it is then taken as they do."""
     place = bones_place(thing)
     passed = HARMLESS | {"ARMATURE"} | (REFINING if place is None else set())
-    return any(modifier.show_viewport and modifier.type not in passed for modifier in thing.modifiers[:place])
+    return any(
+        modifier.show_viewport and (modifier.type not in passed or reweighs(modifier))
+        for modifier in thing.modifiers[:place]
+    )
 
 
 def bones_place(thing: bpy.types.Object) -> int | None:
@@ -126,6 +149,18 @@ def unmet_modifiers(body: bpy.types.Object) -> list[str]:
     after = [] if place is None else body.modifiers[place + 1 :]
     passed = HARMLESS | REFINING | {"ARMATURE"}  # a second Armature is refused
     return [modifier.name for modifier in after if modifier.show_viewport and modifier.type not in passed]
+
+
+def shown_or_rendered_alone(body: bpy.types.Object) -> list[str]:
+    """Return the names of modifiers that shape a body in viewports alone, or in renders alone."""
+    passed = HARMLESS | REFINING
+    return [
+        each.name
+        for each in body.modifiers
+        if each.show_viewport != each.show_render
+        and (each.type not in passed or reweighs(each))
+        and not (each.type == "ARMATURE" and each.show_render)  # by which cloth meets the body all the same
+    ]
 
 
 def is_refined(thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> bool:

@@ -28,6 +28,20 @@ def found_again(uid: int, name: str) -> bpy.types.Object:
     return thing
 
 
+def is_disabled(thing: bpy.types.Object) -> bool:
+    """Return whether an object is disabled in viewports, itself or by collections: Blender does not evaluate it."""
+    return thing.hide_viewport or all(group.hide_viewport for group in thing.users_collection)
+
+
+def need_enabled(things: Sequence[bpy.types.Object]) -> None:
+    """Raise `SetupError` if an object is disabled in viewports, so that it is not where its bones are."""
+    disabled = next((thing.name for thing in things if is_disabled(thing)), None)
+    if disabled:
+        raise SetupError(
+            f"'{disabled}' is disabled in viewports, and Blender does not move it; enable it to measure."
+        )
+
+
 @dataclass(frozen=True)
 class Pair:
     """A garment and its armature, by session_uid, with the names that they had."""

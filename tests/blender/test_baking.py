@@ -14,8 +14,9 @@ pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-b
 
 from blender_addon.playback.models import model_of
 
-from .conftest import activate
-from .scenes import decoded, shown
+from .conftest import activate, add_mesh, tube
+from .scenes import decoded, proxies_of, shown
+from .test_shapes import fuller
 
 EXACT = 1e-5  # [m]
 FRAMES = range(1, 41)
@@ -305,6 +306,8 @@ def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
 
 def test_what_usd_does_not_get_of_a_look_is_named(ready, trained, capfd):
     pillar = ready.data.objects["Pillar"]
+    for thing in (trained, pillar):
+        thing.data.shade_smooth()
     for name in ("UVMap", "Light"):
         trained.data.uv_layers.new(name=name)
     bake(ready, trained, to_timeline=False, to_usd=True)
@@ -319,6 +322,33 @@ def test_what_usd_does_not_get_of_a_look_is_named(ready, trained, capfd):
         "In USD 'Skirt' loses the material 'Linen', the material 'Hem', the UV map 'Light'; "
         "'Pillar' loses the material 'Skin', the colours 'Dye'. Bake"
     ) in capfd.readouterr().out
+
+
+def test_what_a_shot_in_usd_lacks_of_what_blender_shows_is_named(ready, trained, capfd):
+    rig, pillar = ready.data.objects["Rig"], ready.data.objects["Pillar"]
+    for thing in (trained, pillar):
+        thing.data.shade_smooth()
+    bake(ready, trained, to_timeline=True, to_usd=False)
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    assert "in USD" not in capfd.readouterr().out
+    eye = add_mesh(ready, "Eye", *tube(8, 3, (1.6, 1.7), (0.05, 0.05)))
+    eye.parent, eye.parent_type, eye.parent_bone = rig, "BONE", "Head"
+    hair = ready.data.objects.new("Hair", ready.data.hair_curves.new("Hair"))
+    ready.context.collection.objects.link(hair)
+    hair.parent = pillar
+    pillar.parent = rig
+    key = fuller(trained, 1.0)
+    proxy = rig.pose.bones[proxies_of(ready)[0]]
+    proxy.keyframe_insert("location", frame=3)
+    ready.context.view_layer.update()
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    told = capfd.readouterr().out
+    assert "The shot in USD holds the garment and its bodies alone, without 'Eye', 'Hair' of 'Rig'." in told
+    assert "without what stands over it in Blender: keys of the action" in told
+    assert "(shape keys that correct 'Skirt' by up to 100 mm in Blender are not in the shot)" in told
+    key.value = 0.0
+    bake(ready, trained, to_timeline=False, to_usd=True)
+    assert "shape keys that correct" not in capfd.readouterr().out
 
 
 def test_a_single_frame_is_baked(ready, trained, tmp_path, ssilk_python):

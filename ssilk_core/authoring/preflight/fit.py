@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...events import format_count
-from ...scene.assets import Character, Floats, Ints, Mesh
+from ...scene.assets import Character, Floats, Ints, Mesh, is_carried_by, moved_by_joints
 from ...scene.fabrics import FABRICS
 from ...scene.mesh.topology import edge_use, is_inside_out, merged_places, vertex_mask
 from ..setup.surface import closest_on_surface, is_enclosed
@@ -171,6 +171,37 @@ def body_inside_out(body: Mesh) -> Findings:
             fix="flip the normals of the body",
             elements="faces",
         )
+
+
+def carried_by_no_joint(character: Character) -> Findings:
+    """Yield a warning where bodies hang from no joint that is taken to carry them."""
+    skeleton = character.skeleton
+    weights = [body.skin.dense(skeleton.joint_count) for body in character.bodies]
+    moved = [moved_by_joints(body.mesh.points, each) for body, each in zip(character.bodies, weights)]
+    if is_carried_by(moved, skeleton.parents, skeleton.hub):
+        return
+    moving = np.flatnonzero(np.sum(moved, axis=0) > 0)
+    apart = [joint for joint in moving.tolist() if skeleton.hub not in _above(joint, skeleton.parents)]
+    yield Finding(
+        severity="warning",
+        code="carried-by-no-joint",
+        prim=skeleton.path,
+        count=len(apart),
+        found=f"no joint that moves with the bodies carries all of them; {skeleton.joint_names[skeleton.hub]} is "
+        f"taken to, and {len(apart)} of {len(moving)} joints do not hang from it",
+        why="the network sees how these are tilted and sped up, and not where they are",
+        fix="parent them to it, as exports for games do, or expect limbs that cloth misses",
+        elements="joints",
+        indices=tuple(apart),
+    )
+
+
+def _above(joint: int, parents: Ints) -> list[int]:
+    """Return a joint and those above it."""
+    found = [joint]
+    while parents[found[-1]] >= 0:
+        found.append(int(parents[found[-1]]))
+    return found
 
 
 def penetration(mesh: Mesh, body: Mesh) -> Findings:

@@ -97,6 +97,7 @@ def _on_fit(inputs: PreflightInput) -> Findings:
     mesh, body, file = inputs.garment.mesh, inputs.character.merged_body().mesh, inputs.garment_units
     yield from fit.body_holes(body)
     yield from fit.body_inside_out(body)
+    yield from fit.carried_by_no_joint(inputs.character)
     free = file != inputs.character_units and file.allows(fit.find_unit_correction(mesh, body))
     misplaced = list(fit.alignment(mesh, body, fixable=free))
     yield from misplaced

@@ -14,7 +14,7 @@ from .mesh import Mesh
 from .motion import Motion
 from .rig import ProxyRig
 from .scene import Scene
-from .skeleton import Skeleton, carrying_joint, check_rigid, moved_by_joints
+from .skeleton import Skeleton, carrying_joint, check_rigid, is_carried_by, moved_by_joints
 from .skin import SkinWeights
 from .surface import PLATE_THICKNESS, SurfaceMaterial
 from .world import Air, Collider, ShotWorld
@@ -46,5 +46,6 @@ __all__ = [
     "carrying_joint",
     "check_rigid",
     "classes_at",
+    "is_carried_by",
     "moved_by_joints",
 ]  # fmt: skip

@@ -85,25 +85,52 @@ class Skeleton:
         return tuple(path)
 
 
-def carrying_joint(moved: Sequence[Floats], parents: Ints) -> int:
+def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> int:
     """Return the joint that carries the body, a hub: the lowest that all bodies hang from, but for `_STRAY` of them.
 
     Game skeletons have joints above the hips, which may stand still while the character runs, and joints beside the
     hips for what hands hold. Bodies that one joint moves as a whole, such as props and shadows, do not count beside
-    others.
+    others. Where limbs have roots of their own, as deforming bones of control rigs have, it is the root amid them.
+    Where bodies of their own, as horse and rider, hang from a joint that moves none itself, it is the largest body's.
 
     Args:
         moved: `moved_by_joints` of each body.
         parents: as a skeleton has them, shape (J,).
+        places: of the joints in the bind pose [m], shape (J, 3).
     """
-    bending = [each for each in moved if each.max() < _WHOLE * each.sum()]
-    below = np.sum([np.zeros(len(parents)), *(bending or moved)], axis=0)
-    whole = (1 - _STRAY) * below.sum()
+    own, below = _hanging(moved, parents)
+    if not own.sum() > 0:  # nor where it is no number, which others refuse
+        return 0
+    held = np.flatnonzero(below >= (1 - _STRAY) * own.sum())
+    if len(held):
+        bending = _bending(moved)
+        if own[held[-1]] > 0 or len(bending) < 2:
+            return int(held[-1])
+        return carrying_joint([max(bending, key=np.sum)], parents, places)
+    roots = np.flatnonzero((parents < 0) & (below > 0))
+    away = np.linalg.norm(places[roots, None] - places, axis=-1) @ own
+    return int(roots[away.argmin()])
+
+
+def is_carried_by(moved: Sequence[Floats], parents: Ints, joint: int) -> bool:
+    """Return whether all bodies hang from a joint, as `carrying_joint` counts them."""
+    own, below = _hanging(moved, parents)
+    return bool(below[joint] >= (1 - _STRAY) * own.sum())
+
+
+def _bending(moved: Sequence[Floats]) -> list[Floats]:
+    """Return what joints move of those bodies that no joint moves as a whole."""
+    return [each for each in moved if each.max() < _WHOLE * each.sum()]
+
+
+def _hanging(moved: Sequence[Floats], parents: Ints) -> tuple[Floats, Floats]:
+    """Return how much of the bodies each joint moves, and with all joints below it, shapes (J,)."""
+    own = np.sum([np.zeros(len(parents)), *(_bending(moved) or moved)], axis=0)
+    below = own.copy()
     for joint in range(len(parents) - 1, -1, -1):
         if parents[joint] >= 0:
             below[parents[joint]] += below[joint]
-    held = np.flatnonzero(below >= whole) if whole > 0 else np.zeros(1, dtype=np.int64)
-    return int(held[-1]) if len(held) else 0
+    return own, below
 
 
 def moved_by_joints(points: Floats, weights: Floats) -> Floats:

@@ -112,8 +112,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     parents = position[source.parents[kept]]
     rest = joints_to_core(source.rest[kept], parents, source.placement, source.units)
     names = tuple(source.joints[index] for index in kept)
-    hub = carrying_joint([moved[kept] for moved in _moved(source)], parents)
     binds, world = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
+    hub = carrying_joint([moved[kept] for moved in _moved(source)], parents, binds[:, :3, 3])
     return Skeleton(location(source.prim), names, parents, binds, rest, hub, world)
 
 

@@ -24,6 +24,7 @@ from ..reading.skin import leaf
 from ..units import StageUnits
 from .asset_info import AssetInfo, author_asset_info
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
+from .left_behind import left_behind
 from .look import copy_looks
 
 
@@ -37,7 +38,8 @@ class Asset:
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
         bodies, body_paths: the bodies whose meshes were written, and the prims of these.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
-        left_out: what the meshes lose of their looks, for messages; empty where nothing.
+        left_out: what the meshes lose of their looks, and the character of its parts, for messages; empty where
+            nothing.
     """
 
     root: Sdf.Path
@@ -98,6 +100,8 @@ def define_asset(
     written = [scene.garment.mesh, *(body.mesh for body in bodies)]
     source = split_location(scene.character.path)[0]
     left = copy_looks(stage, root.GetPath(), source, list(zip(written, paths[2:])), output)
+    if bodies:  # without any, the garment alone is asked for
+        left.add(root.GetPrim().GetName(), *left_behind(scene.character, written))
     if hidden_polygons is not None:
         hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
     return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes, str(left))

@@ -24,6 +24,7 @@ from ..opening.stage import EARLIEST, PRIMS, location, open_stage
 from ..reading.mesh import is_garment, kept_faces, polygons
 from .body_faces import face_kind
 from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
+from .look_spaces import keep_colour_space, move_spaces
 
 LOOKS = "Looks"  # scope of materials beneath the root
 _OTHERS = {
@@ -69,6 +70,19 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
     A garment that was trained from another file is found by its polygons, those marked as garments and those of its
     name first.
     """
+    return next(_look_sources(mesh, stage), None)
+
+
+def _twin(mesh: Mesh, look: LookSource, stage: Usd.Stage) -> Usd.Prim | None:
+    """Return another mesh that is as much like one as the mesh whose look it is given; None where its path tells."""
+    path = split_location(mesh.path)[1] or "/"
+    if str(look.prim.GetPath()) == path or look.prim.GetName() == path.rpartition("/")[2]:
+        return None
+    others = (found.prim for found in _look_sources(mesh, stage) if found.prim != look.prim)
+    return next((prim for prim in others if is_garment(prim) == is_garment(look.prim)), None)
+
+
+def _look_sources(mesh: Mesh, stage: Usd.Stage) -> Iterator[LookSource]:
     path = split_location(mesh.path)[1] or "/"
     meshes = [prim for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS) if prim.IsA(UsdGeom.Mesh)]
     name = path.rpartition("/")[2]
@@ -86,8 +100,7 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
             continue
         corners, kept, faces = kept_faces(prim, own)
         if np.array_equal(kept, counts) and np.array_equal(indices[corners], mesh.indices_of_corners):
-            return LookSource(prim, corners, faces)
-    return None
+            yield LookSource(prim, corners, faces)
 
 
 def copy_looks(
@@ -109,6 +122,9 @@ def copy_looks(
     for mesh, _, look in found:
         if look is None:
             left.add(mesh.path.rpartition("/")[2], f"its look, since {source} has no mesh of its polygons")
+        elif twin := _twin(mesh, look, opened):
+            text = f"its look, unless it is that of {look.prim.GetPath()}: {twin.GetPath()} has the same polygons"
+            left.add(mesh.path.rpartition("/")[2], text)
     looks = [(path, look) for _, path, look in found if look is not None]
     flat = _flattened(opened, [look.prim for _, look in looks], stage.GetTimeCodesPerSecond())
     layer = stage.GetEditTarget().GetLayer()
@@ -121,6 +137,9 @@ def copy_looks(
         for variants in map(variants_of, above):
             left.add(path.name, *variants)
         _copy_meaning(look, UsdGeom.Mesh(stage.GetPrimAtPath(path)))
+        stayed = move_spaces(layer, look.prim, stage.GetPrimAtPath(path), EARLIEST)
+        left.add(path.name, *(f"the place of {name}, which is of another shape" for name in stayed))
+        keep_colour_space(look.prim, stage.GetPrimAtPath(path))
         _copy_subsets(flat, stage, look, path, left)
         _bind_materials(flat, stage, root, look, path, materials, left)
         _keep_stand_in(stage, look, path, looks)
@@ -396,6 +415,7 @@ def _copy_material(
     name = next(each for each in (own, *(f"{own}_{copy}" for copy in range(2, len(taken) + 3))) if each not in taken)
     to = scope.AppendChild(name)
     Sdf.CopySpec(flat, material.GetPath(), layer, to)
+    keep_colour_space(material.GetPrim(), stage.GetPrimAtPath(to))
     above = [material.GetPrim().GetStage().GetPrimAtPath(prefix) for prefix in material.GetPath().GetPrefixes()]
     for prim in (*above[:-1], *Usd.PrimRange(material.GetPrim(), PRIMS)):
         if not look.prim.GetPath().HasPrefix(prim.GetPath()):  # those above the mesh are told of it
