@@ -257,7 +257,7 @@ def test_the_process_ends_with_what_it_solves_for(ready, trained, windowed, how)
 
 
 KILLED = """
-    import os, signal, sys
+    import os, signal, sys, time
     sys.path[:0] = [{root!r}, {usd!r}]
     import bpy, addon_utils
     addon_utils.enable("blender_addon", default_set=True)
@@ -272,8 +272,8 @@ KILLED = """
     garment.ssilk.live_quality = "latent"
     bpy.ops.ssilk.play_live()
     live = playing.live(garment)
-    while not live.solved:
-        playing._read()
+    while not live.solved and not live.wrong:
+        time.sleep(playing._read() or 0.01)
     print("PID", live.solving.pid, flush=True)
     os.kill(os.getpid(), signal.SIGKILL)
 """
