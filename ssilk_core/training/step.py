@@ -105,6 +105,7 @@ class Stepper:
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
         if self.config.initial_loss:
             poses = self.sampler.with_initial(*poses)
+        inner = {name: value.clone() for name, value in self.sampler.inner.items()}  # the window changes them
         dynamic, static, latents = self.objective.window(self.sampler, noise, *poses)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
@@ -112,7 +113,7 @@ class Stepper:
         means = {name: value.mean() for name, value in dynamic.items()}
         beside = {f"static {name}": value.mean() for name, value in static.items()}
         drawn = {"noise": noise, "static frames": poses[0], "static directions": poses[1]}
-        self._descend(loss, means, {**self.sampler.window(), **drawn}, beside)
+        self._descend(loss, means, {**self.sampler.window(), **inner, **drawn}, beside)
         self.sampler.advance(latents)
 
     def _descend(

@@ -39,8 +39,9 @@ class GarmentTraining:
         there = read_record(self._file(".json"))
         same = there is not None and there.key == request
         self.record = there if there is not None and same else WorkRecord(key=request)
-        finished = self.record.is_done(folder) and self._over_same()
-        self.resumed = same and not finished and self._file(".resume.safetensors").exists()
+        done = self.record.is_done(folder)
+        finished = done and self._over_same()
+        self.resumed = same and not done and self._file(".resume.safetensors").exists()
         self.state, self.code = ("finished", EXIT_OK) if finished else ("waiting", EXIT_INTERRUPTED)
         detail = self.record.detail
         if not isinstance(detail.get("seconds", 0.0), int | float) or (finished and "result" not in detail):
@@ -58,7 +59,7 @@ class GarmentTraining:
             "finished before; skipped" if finished
             else "resumes where it stopped" if self.resumed
             else "its entry or inputs have changed; trains again" if there is not None and not same
-            else "what it is worn over is trained again, and so is it" if self.record.is_done(folder)
+            else "what it is worn over is trained again, and so is it" if done
             else "its model was changed or removed; trains again" if there is not None and there.files
             else ""
         )  # fmt: skip

@@ -174,6 +174,17 @@ def test_inner_garments_stay_as_they_are(asked, inner):
     assert not any("inner" in name for name in learned_tensors(stepper))
 
 
+def test_a_skipped_step_is_kept_with_the_inner_states_that_it_began_with(asked, monkeypatch):
+    stepper = build_parts(asked, CPU).stepper(SHORT, 0)
+    stepper.run(SHORT.static_iterations)
+    before = {name: value.clone() for name, value in stepper.sampler.inner.items()}
+    monkeypatch.setattr(stepper, "_half", float("nan"))
+    stepper.run(SHORT.static_iterations + 1)
+    assert int(stepper.skipped.count) == 1
+    assert all(torch.equal(stepper.skipped.window[name], value) for name, value in before.items())
+    assert not torch.equal(stepper.sampler.inner["inner.0.latents"], before["inner.0.latents"])
+
+
 @pytest.mark.parametrize("case", ["rate", "joints", "binds", "twice"])
 def test_inner_models_that_do_not_fit_are_refused(asked, inner, case):
     file, skeleton = inner.file, inner.file.scene.character.skeleton
