@@ -520,10 +520,10 @@ def limited(monkeypatch: pytest.MonkeyPatch, windows: int, poses: int) -> None:
             raise torch.OutOfMemoryError("injected")
         return window(self, sampler, *drawn)
 
-    def single(self: Objective, frames: torch.Tensor, direction: torch.Tensor):
+    def single(self: Objective, frames: torch.Tensor, *drawn):
         if len(frames) > poses:
             raise torch.OutOfMemoryError("injected")
-        return static(self, frames, direction)
+        return static(self, frames, *drawn)
 
     monkeypatch.setattr(Objective, "window", some)
     monkeypatch.setattr(Objective, "static", single)
