@@ -32,7 +32,7 @@ def fields_in(scene: bpy.types.Scene) -> list[bpy.types.Object]:
 
 def world_over(scene: bpy.types.Scene, frames: range, fps: float) -> ShotWorld | None:
     """Return gravity and wind over frames of a timeline; None where gravity is the usual one and nothing blows."""
-    gravity, air = _gravity(scene, frames), _air(fields_in(scene), frames)
+    gravity, air = _gravity(scene, frames), _air(fields_in(scene), frames, fps)
     return None if gravity is None and air is None else ShotWorld(fps, gravity=gravity, air=air)
 
 
@@ -70,7 +70,7 @@ def _gravity(scene: bpy.types.Scene, frames: range) -> np.ndarray | None:
     return None if np.abs(found + GRAVITY * UP).max() < 1e-4 else found
 
 
-def _air(fields: list[bpy.types.Object], frames: range) -> Air | None:
+def _air(fields: list[bpy.types.Object], frames: range, fps: float) -> Air | None:
     if not fields:
         return None
     velocity, gusts = np.zeros((len(frames), 3)), np.zeros(len(frames))
@@ -90,7 +90,7 @@ def _air(fields: list[bpy.types.Object], frames: range) -> Air | None:
     seed = eddies[0].seed if eddies else 0
     if not velocity.any() and not gusts.any():
         return None
-    return Air(_least(velocity), _least(gusts), length=size, seed=seed)
+    return Air(_least(velocity), _least(gusts), length=size, seed=seed, begins=frames.start / fps)
 
 
 def _least(values: np.ndarray) -> np.ndarray:

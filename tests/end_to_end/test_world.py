@@ -14,6 +14,7 @@ from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
+from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.runtime import Player
 from ssilk_core.scene.kinematics import hub_places
@@ -99,6 +100,15 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
     assert "does not see" not in capsys.readouterr().err
+
+
+def test_gusts_are_the_same_in_whatever_range_of_a_shot(toy, stage):
+    toy.write_clip(stage / "long.usda", frames=90)
+    request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="long.usda", gusts="6,2,1")
+    whole, part = (load_rollout(replace(request, range=each)).source for each in (None, "60-89"))
+    assert part.start > 0 and np.ptp(part.gravity, axis=0).min() > 1
+    follow = part.frame_count - 1  # the first has no frame before it, from which the root would come
+    np.testing.assert_allclose(part.gravity[1:], whole.gravity[-follow:], atol=1e-9)
 
 
 def test_the_network_feels_wind_and_gravity_as_the_player_does(stage, capsys):

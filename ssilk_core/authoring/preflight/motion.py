@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -271,8 +271,7 @@ def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
     rate = min(CHECKED_RATE, MOST_CHECKED / seconds)
     for motion in motions:
         chosen = np.arange(0, motion.frame_count, max(1, round(motion.fps / rate)))
-        world = motion_transforms(replace(motion, rotations=motion.rotations[chosen],
-                                          translations=motion.translations[chosen]), skeleton.parents)  # fmt: skip
+        world = motion_transforms(motion.picked(chosen), skeleton.parents)
         matrices = skinning_matrices(world, skeleton.bind_transforms)[:, :, :3].transpose(1, 2, 3, 0)
         buried.append(poser.buried(torch.as_tensor(matrices, dtype=torch.float32)).numpy())
     every, clips = np.concatenate(buried, axis=1), [found.any(axis=0).mean() for found in buried]

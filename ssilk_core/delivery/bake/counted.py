@@ -8,7 +8,7 @@ every `EVERY`-th from the first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -148,7 +148,7 @@ def _shown(
     from ...physics.skin.covered_skin import ShownCounts
 
     device = skin.points.device
-    part = replace(motion, rotations=motion.rotations[samples], translations=motion.translations[samples])
+    part = motion.picked(samples)
     matrices, origin = centred_matrices(part, scene.character.skeleton)
 
     def tensor(frames: Sequence[Floats]) -> torch.Tensor:

@@ -125,8 +125,7 @@ class DirectedPoses:
         motion, found = self.direction.motion, []
         for at in range(0, len(samples), CHUNK):
             rows = samples[at : at + CHUNK]
-            some = Motion(motion.path, motion.fps, motion.rotations[rows], motion.translations[rows])
-            pose, off = self._held.pose(some)
+            pose, off = self._held.pose(motion.picked(rows))
             self.off += off[self.direction.free[rows] < 1].tolist()
             found.append(replace(pose, start=at))
         return GarmentPose.joined(found)

@@ -46,12 +46,16 @@ class MovingAir:
         found = np.broadcast_to(wind, points.shape)
         if not gusts > 0:
             return found
-        phase = (points - self._carried(seconds)) @ self._waves.T + self._turning * seconds + self._phase
+        turned = self._turning * (self._air.begins + seconds)
+        phase = (points - self._carried(seconds)) @ self._waves.T + turned + self._phase
         return found + gusts * (np.cos(phase) @ self._across)
 
     def _carried(self, seconds: float) -> Floats:
-        """Return how far the wind has carried the air since the first frame [m], shape (3,)."""
+        """Return how far the wind has carried the air since time zero [m], shape (3,).
+
+        Before the first frame it blew as it does then.
+        """
         velocity, now = self._air.velocity, interpolated(self._air.velocity, seconds, self._fps)
         low, part = frame_at(seconds, self._fps, len(velocity))
-        inside = self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
+        inside = self._air.begins * velocity[0] + self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
         return inside + (seconds - (low + part) / self._fps) * now

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,5 +62,4 @@ def observe(player: Player, motions: Sequence[Motion], frames: int) -> ObservedF
 
 def _character(motion: Motion, every: int, skeleton: Skeleton) -> NDArray:
     """Return the character's skinning matrices relative to its root (J, 3, 4, F) for every `every`th frame."""
-    some = replace(motion, rotations=motion.rotations[::every], translations=motion.translations[::every])
-    return character_matrices(some, skeleton)[0]
+    return character_matrices(motion.picked(slice(None, None, every)), skeleton)[0]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...errors import fail
-from .arrays import Floats, assign, frozen, need_finite
+from .arrays import Floats, Ints, assign, frozen, need_finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +82,15 @@ class Motion:
             translations=self.translations[start:stop],
             start=self.start + start,
             gravity=None if self.gravity is None else self.gravity[start:stop],
+        )
+
+    def picked(self, frames: Ints | slice) -> Motion:
+        """Return some frames, of which each counts by itself: rate and start are those of the whole."""
+        return replace(
+            self,
+            rotations=self.rotations[frames],
+            translations=self.translations[frames],
+            gravity=None if self.gravity is None else self.gravity[frames],
         )
 
     def after(self, before: Motion) -> Motion:

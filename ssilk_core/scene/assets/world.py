@@ -62,6 +62,7 @@ class Air:
         gusts: RMS speed of the turbulence that the wind carries along [m/s], shape (F or 1,).
         length: size of its largest eddies [m].
         seed: of its eddies.
+        begins: time of the first frame [s], so that gusts are the same in whatever range of a shot.
 
     Raises:
         SsilkError: a value is not finite, a speed negative or above the fastest allowed, or the length not positive.
@@ -71,6 +72,7 @@ class Air:
     gusts: Floats
     length: float = 2.0
     seed: int = 0
+    begins: float = 0.0
 
     def __post_init__(self) -> None:
         velocity, gusts = frozen(self.velocity, np.float64), frozen(self.gusts, np.float64)

@@ -334,6 +334,9 @@ def test_gusts_are_as_strong_as_they_say_solenoidal_continuous_and_the_same_agai
     assert np.sqrt(((found - [8, 0, 0]) ** 2).sum(axis=1).mean()) == pytest.approx(3.0, rel=0.02)
     np.testing.assert_array_equal(found, MovingAir(air, FPS).velocity(points, 2.0))
     assert np.abs(found - MovingAir(replace(air, seed=8), FPS).velocity(points, 2.0)).max() > 1
+    steady = replace(air, velocity=air.velocity[:1])
+    later = MovingAir(replace(steady, begins=1.5), FPS).velocity(points, 0.5)
+    np.testing.assert_allclose(later, MovingAir(steady, FPS).velocity(points, 2.0), atol=1e-9)
     step = 1e-5
     slopes = np.stack(
         [

@@ -322,3 +322,9 @@ def test_bad_sizes_and_no_motions_are_refused(file):
         ModelSize(shapes=1, joints=1, influences=0)
     with pytest.raises(SsilkError, match="motions: none given"):
         Reducer(file, [])
+
+
+def test_a_model_is_cut_to_what_it_does_in_the_wind_of_a_long_motion(file, motion):
+    blown = replace(motion, gravity=np.tile([0, -9.81, 9.81], (motion.frame_count, 1)))
+    still, seen = (Reducer(file, [each], frames=motion.frame_count // 3).seen for each in (motion, blown))
+    assert seen.states.shape == still.states.shape and np.abs(seen.states - still.states).max() > 1e-3

@@ -227,7 +227,7 @@ def _air(scene: Usd.Prim | None, seconds: Floats, asked: AskedWorld, units: Stag
         velocity = (units.rotation @ np.array(asked.wind))[None]
     if asked.gusts is not None:
         gusts, length, seed = np.array([asked.gusts[0]]), asked.gusts[1], asked.gusts[2]
-    return Air(velocity, gusts, length, seed)
+    return Air(velocity, gusts, length, seed, begins=float(seconds[0]))
 
 
 def _values(prim: Usd.Prim, name: str, codes: Sequence[Usd.TimeCode], shape: tuple[int, ...]) -> Floats:
