@@ -109,7 +109,7 @@ class Objective:
         return terms
 
     def _planes(
-        self, x: Tensor, character: Tensor, buried: Tensor | None, beneath: Beneath | None
+        self, x: Tensor, character: Tensor, buried: Tensor | None = None, beneath: Beneath | None = None
     ) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
 

@@ -133,9 +133,12 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     chain = [made]
     while "base" in chain[-1]:
         chain.append(chain[-1]["base"])
-    whole, last, middle, first = (f"{each['iteration']:,}" for each in chain)
-    alone = "of the stepper alone"
-    trained = f"{first} iterations, then {middle} {alone}, then {last} {alone}, then {whole}"
+    first, *later = reversed(chain)
+    alone = ["" if each.get("whole") else " of the stepper alone" for each in later]
+    trained = f"{first['iteration']:,} iterations" + "".join(
+        f", then {each['iteration']:,}{words}" for each, words in zip(later, alone)
+    )
+    assert "of the stepper alone" in trained and not alone[-1]
     assert f"shipped cape: {trained} on {len(made['motions'])} motions, seed" in said
     assert {path.name for path in tmp_path.iterdir()} == {
         *("wardrobe", "motions", "shot.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")

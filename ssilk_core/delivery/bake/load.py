@@ -162,11 +162,11 @@ class LoadedGarment:
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""
-        from ssilk_usd.reading.direction import read_direction
+        from ssilk_usd.reading.direction import SaidDirection, read_direction
 
-        garment = split_location(self.deformer.scene.garment.mesh.path)[1]
-        assert garment is not None
-        said = read_direction(request.motion, request.stage, garment, read.whole)
+        garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
+        if garment is not None:  # a model may know its garment by a name alone
+            said = read_direction(request.motion, request.stage, garment, read.whole)
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
