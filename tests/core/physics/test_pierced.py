@@ -225,6 +225,7 @@ def test_training_leaves_buried_limbs_out_as_each_pose_does(monkeypatch, scene):
 
     objective = Objective.__new__(Objective)  # only what finds planes
     objective.body, objective.surface, objective.clearance, objective.buried = collision, True, 0.0, found
+    objective.inner = None
     objective.contacts = Contacts(whole, vertex_samples(whole.garment.mesh.vertex_count), device=CPU)
     x = torch.tensor(whole.garment.mesh.points, dtype=torch.float32)[..., None] - torch.tensor([0.4, 0, 0])[:, None]
     frames = torch.tensor([1, 0])
