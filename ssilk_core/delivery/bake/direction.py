@@ -55,6 +55,8 @@ class Direction:
         for span in split_at_cuts(self.motion, skeleton):
             stop = start + span.frame_count
             aligned = start + (self.first - start) % self.hold if start <= self.first < stop else start
+            if 0 < start < aligned:  # handles would show the take before
+                found.append(np.array([start]))
             found.append(np.arange(aligned, stop, self.hold) if aligned < stop else np.array([start]))
             start = stop
         return found

@@ -37,3 +37,14 @@ def test_held_poses_are_counted_from_the_first_frame_and_anew_after_a_cut(scene,
     np.testing.assert_array_equal(direction.shown(np.concatenate(runs)), [0, 0, 0, 0, 0, 1, 1, 2, 2, 2, 3, 3])
     (whole,) = replace(direction, hold=1).runs(scene.character.skeleton)
     np.testing.assert_array_equal(whole, np.arange(12))
+
+
+def test_no_pose_of_before_a_cut_is_shown_after_it(scene, toy_motion):
+    """Held poses are counted from frame 6, the shot's first; handles begin with a frame of another take."""
+    motion = toy_motion(scene, 12)
+    places = motion.translations.copy()
+    places[1:, 0] += [9.0, 0, 0]
+    direction = Direction(np.ones(12), 4, replace(motion, translations=places), 6)
+    made = np.concatenate(direction.runs(scene.character.skeleton))
+    assert {0, 2, 6, 10} <= set(made)
+    assert (made[direction.shown(made)][1:] >= 1).all()
