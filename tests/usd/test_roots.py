@@ -75,6 +75,26 @@ def test_limbs_with_carried_by_no_joint_leave_the_torso_to_carry_the_body():
     assert legs_and_arms == {"LeftUpLeg", "RightUpLeg", "LeftArm", "RightArm"}
 
 
+@pytest.mark.parametrize("cut", [("",), ("LeftUpLeg", "RightUpLeg", "LeftArm", "RightArm", "Spine")])
+def test_a_still_joint_above_limbs_with_roots_of_their_own_carries_no_body(cut):
+    """Captures are flattened beneath one joint, and control rigs export pelvis and spine beside each other."""
+    stage = reordered(None, cut)
+    carried = read_character(stage).skeleton
+    skeleton = next(UsdSkel.Skeleton(prim) for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton))
+    skeleton.GetJointsAttr().Set(["root", *(f"root/{path}" for path in skeleton.GetJointsAttr().Get())])
+    for attribute in (skeleton.GetBindTransformsAttr(), skeleton.GetRestTransformsAttr()):
+        attribute.Set([Gf.Matrix4d(1), *attribute.Get()])
+    for prim in stage.Traverse():
+        indices = UsdSkel.BindingAPI(prim).GetJointIndicesAttr()
+        if prim.IsA(UsdGeom.Mesh) and indices and indices.HasAuthoredValue():
+            shifted = np.array(indices.Get()) + 1
+            shifted[0] = 0  # painted by accident
+            indices.Set(Vt.IntArray.FromNumpy(shifted))
+    character = read_character(stage)
+    assert character.skeleton.joint_names[character.skeleton.hub] == f"root/{carried.joint_names[carried.hub]}"
+    assert len(list(carried_by_no_joint(character))) == 1
+
+
 def test_a_body_that_hangs_from_one_root_is_no_finding():
     assert not list(carried_by_no_joint(read_character(str(DEMO))))
 

@@ -12,6 +12,7 @@ from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
 _STRAY = 0.05  # of all bodies that may be bound to joints above or beside the one that carries them
+_STRAY_ABOVE = 0.002  # of all bodies that the joint which holds them together may move, and yet carry none
 _WHOLE = 0.999  # of a body, and no more, that one joint may move where several do
 
 
@@ -90,8 +91,9 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
 
     Game skeletons have joints above the hips, which may stand still while the character runs, and joints beside the
     hips for what hands hold. Bodies that one joint moves as a whole, such as props and shadows, do not count beside
-    others. Where limbs have roots of their own, as deforming bones of control rigs have, it is the root amid them.
-    Where bodies of their own, as horse and rider, hang from a joint that moves none itself, it is the largest body's.
+    others. Where limbs have roots of their own, as deforming bones of control rigs have, it is the root amid them,
+    whether or not a joint that moves nothing itself, and may stand still, holds them together. Where bodies of their
+    own, as horse and rider, hang from such a joint, it is the largest body's.
 
     Args:
         moved: `moved_by_joints` of each body.
@@ -102,12 +104,14 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
     if not own.sum() > 0:  # nor where it is no number, which others refuse
         return 0
     held = np.flatnonzero(below >= (1 - _STRAY) * own.sum())
-    if len(held):
+    above = int(held[-1]) if len(held) else -1
+    if above >= 0:
         bending = _bending(moved)
-        if own[held[-1]] > 0 or len(bending) < 2:
-            return int(held[-1])
-        return carrying_joint([max(bending, key=np.sum)], parents, places)
-    roots = np.flatnonzero((parents < 0) & (below > 0))
+        if own[above] > _STRAY_ABOVE * own.sum():
+            return above
+        if len(bending) > 1:
+            return carrying_joint([max(bending, key=np.sum)], parents, places)
+    roots = np.flatnonzero((parents == above) & (below > 0))
     away = np.linalg.norm(places[roots, None] - places, axis=-1) @ own
     return int(roots[away.argmin()])
 
