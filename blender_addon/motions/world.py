@@ -15,23 +15,30 @@ from ssilk_usd.units import StageUnits
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.scene.assets import UP, Air, ShotWorld
 
-from ..scene.objects import scene_step
+from ..errors import SetupError
+from ..scene.objects import is_disabled, scene_step
 from .evaluating import evaluating
-from .keys import curves_of
+from .keys import changing_paths, curves_of
 
 WIND, TURBULENCE = "WIND", "TURBULENCE"
+STRENGTH = "field.strength"
 EDDIES = 2.0  # [m] of the largest, where a field of turbulence names no size
 TO_CORE = StageUnits(1.0, "Z").rotation  # Blender's axes
 
 
 def fields_in(scene: bpy.types.Scene) -> list[bpy.types.Object]:
-    """Return the objects whose wind or turbulence is on in a scene, by name."""
-    found = [thing for thing in scene.objects if thing.field and thing.field.type in (WIND, TURBULENCE)]
-    return sorted((thing for thing in found if not thing.hide_viewport), key=lambda thing: thing.name)
+    """Return the objects whose wind or turbulence is on in a scene, by name; Blender leaves out excluded ones."""
+    layer = bpy.context.view_layer if scene == bpy.context.scene else scene.view_layers[0]
+    found = [thing for thing in layer.objects if thing.field and thing.field.type in (WIND, TURBULENCE)]
+    return sorted((thing for thing in found if not is_disabled(thing)), key=lambda thing: thing.name)
 
 
 def world_over(scene: bpy.types.Scene, frames: range, fps: float) -> ShotWorld | None:
-    """Return gravity and wind over frames of a timeline; None where gravity is the usual one and nothing blows."""
+    """Return gravity and wind over frames of a timeline; None where gravity is the usual one and nothing blows.
+
+    Raises:
+        SetupError: gravity cannot be read.
+    """
     gravity, air = _gravity(scene, frames), _air(fields_in(scene), frames, fps)
     return None if gravity is None and air is None else ShotWorld(fps, gravity=gravity, air=air)
 
@@ -41,11 +48,10 @@ def signature(scene: bpy.types.Scene) -> tuple[object, ...]:
     blown = []
     for thing in fields_in(scene):
         moves = thing.animation_data or thing.parent or thing.constraints
-        still = (
-            () if moves else (thing.field.strength, *(round(value, 6) for row in thing.matrix_world for value in row))
-        )
-        blown.append((thing.name, thing.field.type, thing.field.size, thing.field.seed, *still))
-    pull = () if _gravity_curves(scene) else tuple(scene.gravity)
+        place = () if moves else [round(value, 6) for row in thing.matrix_world for value in row]
+        strength = () if STRENGTH in changing_paths(thing.animation_data) else (thing.field.strength,)
+        blown.append((thing.name, thing.field.type, thing.field.size, thing.field.seed, *strength, *place))
+    pull = () if "gravity" in changing_paths(scene.animation_data) else tuple(scene.gravity)
     return scene.use_gravity, *pull, *blown
 
 
@@ -58,9 +64,16 @@ def _gravity_curves(scene: bpy.types.Scene) -> list[bpy.types.FCurve]:
 
 
 def _gravity(scene: bpy.types.Scene, frames: range) -> np.ndarray | None:
-    """Return the scene's gravity [m/s2], shape (F or 1, 3), in the core's axes; None for the usual one."""
-    found = np.array(scene.gravity)[None]
-    if curves := _gravity_curves(scene):
+    """Return the scene's gravity [m/s2], shape (F or 1, 3), in the core's axes; None for the usual one.
+
+    Raises:
+        SetupError: it is driven, or keyed on NLA tracks.
+    """
+    found, curves = np.array(scene.gravity)[None], _gravity_curves(scene)
+    if scene.use_gravity and not curves and "gravity" in changing_paths(scene.animation_data):
+        where = f"The gravity of '{scene.name}' is driven or on NLA tracks"
+        raise SetupError(f"{where}; key it in the scene's own action.")
+    if curves:
         found = np.repeat(found, len(frames), axis=0)
         for curve in curves:
             found[:, curve.array_index] = [curve.evaluate(frame * scene_step()) for frame in frames]
@@ -82,7 +95,9 @@ def _air(fields: list[bpy.types.Object], frames: range, fps: float) -> Air | Non
                 thing = bpy.data.objects[name].evaluated_get(depsgraph)
                 if thing.field.type == WIND:
                     axis = np.array(thing.matrix_world)[:3, 2]
-                    velocity[row] += thing.field.strength * TO_CORE @ (axis / np.linalg.norm(axis))
+                    length = float(np.linalg.norm(axis))
+                    if length > 0:  # where it is scaled flat, nothing blows
+                        velocity[row] += thing.field.strength * TO_CORE @ (axis / length)
                 else:
                     gusts[row] = np.hypot(gusts[row], thing.field.strength)
     eddies = [thing.field for thing in fields if thing.field.type == TURBULENCE]

@@ -81,3 +81,59 @@ def test_without_gravity_cloth_weighs_nothing_and_turbulence_is_gusts(ready, tra
     np.testing.assert_array_equal(world.gravity, np.zeros((1, 3)))
     assert (world.air.gusts.tolist(), world.air.length, world.air.seed) == ([6.0], 0.5, 7)
     assert not world.air.velocity.any()
+
+
+def test_what_blender_leaves_out_or_cannot_point_anywhere_does_not_blow(ready, trained, fan):
+    """Blender's own cloth stands still under each of these fields, too."""
+    from blender_addon.motions.world import signature, world_over
+
+    scene, layer = ready.context.scene, ready.context.view_layer
+    off = ready.data.collections.new("off")
+    scene.collection.children.link(off)
+    home = fan.users_collection[0]
+    off.objects.link(fan)
+    home.objects.unlink(fan)
+    blown, there = world_over(scene, range(1, 3), 24.0), layer.layer_collection.children["off"]
+    before = signature(scene)
+    try:
+        assert blown.air.velocity[0, 0] == pytest.approx(6.0)
+        there.exclude = True
+        layer.update()
+        assert world_over(scene, range(1, 3), 24.0) is None and signature(scene) != before
+        there.exclude, off.hide_viewport = False, True
+        layer.update()
+        assert world_over(scene, range(1, 3), 24.0) is None and signature(scene) != before
+        off.hide_viewport = False
+        there.hide_viewport = True  # the eye, which hides and does not disable
+        assert world_over(scene, range(1, 3), 24.0).air.velocity[0, 0] == pytest.approx(6.0)
+        there.hide_viewport, fan.scale = False, (1, 1, 0)
+        layer.update()
+        assert world_over(scene, range(1, 3), 24.0) is None
+    finally:
+        home.objects.link(fan)
+        ready.data.collections.remove(off)
+
+
+def test_an_edit_of_a_field_that_moves_is_noticed_and_driven_gravity_is_refused(ready, trained, fan):
+    from blender_addon.errors import SetupError
+    from blender_addon.motions.world import signature, world_over
+
+    scene = ready.context.scene
+    fan.keyframe_insert("rotation_euler", frame=1)
+    fan.rotation_euler = (0, 0, 0)
+    fan.keyframe_insert("rotation_euler", frame=9)
+    before = signature(scene)
+    fan.field.strength += 2
+    assert signature(scene) != before
+    scene.driver_add("gravity", 2).driver.expression = "-frame"
+    try:
+        scene.frame_set(3)
+        before = signature(scene)
+        scene.frame_set(7)
+        assert signature(scene) == before
+        with pytest.raises(SetupError, match="is driven or on NLA tracks"):
+            world_over(scene, range(1, 3), 24.0)
+    finally:
+        scene.animation_data_clear()
+        scene.gravity = (0, 0, -9.81)
+        scene.frame_set(1)

@@ -58,7 +58,7 @@ class BakeRequest:
             `decomposition`), "points" as points.
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
-            numbers as text (`delivery.bake.world`). Refinement alone meets it.
+            numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.

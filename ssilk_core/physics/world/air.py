@@ -57,7 +57,5 @@ class MovingAir:
         """
         velocity, now = self._air.velocity, interpolated(self._air.velocity, seconds, self._fps)
         low, part = frame_at(seconds, self._fps, len(velocity))
-        inside = (
-            self._air.begins * velocity[0] + self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
-        )
-        return inside + (seconds - (low + part) / self._fps) * now
+        inside = self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
+        return self._air.begins * velocity[0] + inside + (seconds - (low + part) / self._fps) * now
