@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import bpy
 
 from ..scene.armature import leader_of
-from ..scene.garment import armature_of, bodies_of, need_left, no_meshes
+from ..scene.garment import armature_of, bodies_of, follow_bodies, need_left, no_meshes
 from ..scene.meshes import PREFIX
 from ..scene.modifiers import bones_place, reshapes, shown_or_rendered_alone, unmet_modifiers
 from .bodies import look_at
@@ -73,7 +73,9 @@ def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str
         for name in shown_or_rendered_alone(body):
             text = f"The modifier '{name}' of '{body.name}' is switched on in viewports or in renders alone"
             yield f"{text}; cloth meets the body as viewports show it."
-    for body in bodies if garment.ssilk.bodies is None else ():
+    chosen = garment.ssilk.bodies is not None
+    yield from (f"{text}." for text in (() if chosen else follow_bodies(garment, bodies)))
+    for body in () if chosen else bodies:
         if body.hide_render:
             text = f"'{body.name}' is not rendered, and cloth meets it all the same"
             yield f"{text}; to leave it out, put the other bodies in a collection, and choose that as Bodies."

@@ -7,7 +7,7 @@ would move them twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import bpy
 import numpy as np
@@ -149,11 +149,28 @@ def no_meshes(garment: bpy.types.Object, armature: bpy.types.Object) -> list[str
     return said
 
 
+def follow_bodies(garment: bpy.types.Object, bodies: Sequence[bpy.types.Object]) -> list[str]:
+    """Return in words which meshes that are rendered follow a body by a modifier, as fine meshes do cages."""
+    said = []
+    for thing in bpy.context.view_layer.objects:
+        if thing.type != "MESH" or thing.hide_render or thing == garment or thing in bodies or is_garment(thing):
+            continue
+        for modifier in thing.modifiers:
+            target = getattr(modifier, FOLLOWING.get(modifier.type, ""), None)
+            if target in bodies and modifier.is_bound and modifier.show_viewport:
+                said.append(
+                    f"'{thing.name}' follows '{target.name}' by its modifier '{modifier.name}', and cloth does not "
+                    "meet it; if it is the body that is seen, bind it to the bones by an Armature modifier"
+                )
+    return said
+
+
 def _modifier_armature(thing: bpy.types.Object) -> bpy.types.Object | None:
     bound = (modifier.object for modifier in thing.modifiers if modifier.type == "ARMATURE")
     return next(filter(None, bound), None)
 
 
+FOLLOWING = {"SURFACE_DEFORM": "target", "MESH_DEFORM": "object"}  # modifiers, and which property names what leads
 SURFACES = ("CURVE", "SURFACE", "FONT", "META")  # kinds of objects that have a surface, and no mesh of their own
 Carrier = tuple[bpy.types.Object, bpy.types.Bone]
 

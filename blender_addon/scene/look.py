@@ -41,7 +41,7 @@ def _lost(thing: bpy.types.Object) -> list[str]:
         ("material", list(materials)), ("UV map", maps), ("colours", colours), ("attribute", others),
         ("custom property", own), ("modifier", _on_top(thing)),
     )  # fmt: skip
-    return [f"the {kind} '{name}'" for kind, names in kinds for name in names] + _shading(mesh)
+    return [f"the {kind} '{name}'" for kind, names in kinds for name in names] + _shading(thing)
 
 
 def _is_ours(name: str) -> bool:
@@ -56,11 +56,17 @@ def _on_top(thing: bpy.types.Object) -> list[str]:
     return [each.name for each in after if each.show_render and each.type not in unseen]
 
 
-def _shading(mesh: bpy.types.Mesh) -> list[str]:
-    """Return in words which shading of a mesh USD does not get: it shows meshes as smooth subdivision surfaces."""
-    sharp = any(_holds(mesh, name) for name in ("sharp_face", "sharp_edge")) or mesh.has_custom_normals
-    creased = any(_holds(mesh, name) for name in ("crease_edge", "crease_vert"))
-    return ["its flat or sharp shading"] * sharp + ["its creases"] * creased
+def _shading(thing: bpy.types.Object) -> list[str]:
+    """Return in words which shading of a mesh USD does not get: it shows meshes as smooth subdivision surfaces.
+
+    Modifiers such as Smooth by Angle make some of it, whichever stand above those that are handed over.
+    """
+    evaluated = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).data
+    meshes = (thing.data, evaluated)
+    sharp = any(_holds(mesh, name) for mesh in meshes for name in ("sharp_face", "sharp_edge"))
+    creased = any(_holds(mesh, name) for mesh in meshes for name in ("crease_edge", "crease_vert"))
+    turned = any(mesh.has_custom_normals for mesh in meshes)
+    return ["its flat or sharp shading"] * (sharp or turned) + ["its creases"] * creased
 
 
 def _holds(mesh: bpy.types.Mesh, name: str) -> bool:

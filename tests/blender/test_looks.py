@@ -62,6 +62,17 @@ def test_modifiers_that_shape_a_body_before_its_bones_are_not_lost(bpy, skirt):
     assert lost_looks([pillar]) == []
 
 
+def test_shading_that_a_modifier_above_the_bones_makes_is_named(bpy, skirt):
+    """Smooth by Angle marks edges as sharp, and Weighted Normal turns corners, before bones move the mesh."""
+    from blender_addon.scene.look import lost_looks
+
+    pillar = bpy.data.objects["Pillar"]
+    pillar.data.shade_smooth()
+    pillar.modifiers.new("Weighted", "WEIGHTED_NORMAL")
+    pillar.modifiers.move(1, 0)
+    assert lost_looks([pillar]) == ["'Pillar' loses its flat or sharp shading"]
+
+
 def test_what_is_drawn_of_a_character_and_not_written_is_named(bpy, skirt):
     from blender_addon.scene.look import left_behind
 

@@ -267,6 +267,28 @@ def test_a_body_whose_shape_renders_show_otherwise_is_told(bpy, moving):
     )
 
 
+def bound_fine_mesh(bpy, cage) -> Any:
+    """A finer mesh that a bound Surface Deform moves as its cage."""
+    fine = add_mesh(bpy, "Fine", *tube(32, 30, (0.02, 1.68), (0.2, 0.2)))
+    fine.modifiers.new("Follow", "SURFACE_DEFORM").target = cage
+    activate(bpy, fine)
+    bpy.context.view_layer.update()
+    assert bpy.ops.object.surfacedeform_bind(modifier="Follow") == {"FINISHED"} and fine.modifiers[0].is_bound
+    return fine
+
+
+def test_a_body_that_follows_a_cage_is_told(bpy, moving):
+    pillar = bpy.data.objects["Pillar"]
+    fine = bound_fine_mesh(bpy, pillar)
+    (told,) = said_of(moving)
+    assert told.startswith("'Fine' follows 'Pillar' by its modifier 'Follow', and cloth does not meet it; if it is")
+    fine.hide_render = True
+    assert not said_of(moving)
+    fine.hide_render, moving.ssilk.bodies = False, bpy.data.collections.new("Bodies")
+    moving.ssilk.bodies.objects.link(pillar)
+    assert not said_of(moving)  # the artist has said what cloth meets
+
+
 def test_a_cage_that_is_not_rendered_is_told(bpy, moving):
     cage = bpy.data.objects["Pillar"].copy()
     cage.name, cage.hide_render = "Cage", True
