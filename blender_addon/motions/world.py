@@ -14,6 +14,7 @@ from ssilk_usd.units import StageUnits
 
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.scene.assets import UP, Air, ShotWorld
+from ssilk_core.scene.assets.world import FASTEST
 
 from ..errors import SetupError
 from ..scene.objects import is_disabled, scene_step
@@ -37,7 +38,7 @@ def world_over(scene: bpy.types.Scene, frames: range, fps: float) -> ShotWorld |
     """Return gravity and wind over frames of a timeline; None where gravity is the usual one and nothing blows.
 
     Raises:
-        SetupError: gravity cannot be read.
+        SetupError: gravity cannot be read, or fields blow too fast.
     """
     gravity, air = _gravity(scene, frames), _air(fields_in(scene), frames, fps)
     return None if gravity is None and air is None else ShotWorld(fps, gravity=gravity, air=air)
@@ -100,6 +101,10 @@ def _air(fields: list[bpy.types.Object], frames: range, fps: float) -> Air | Non
                         velocity[row] += thing.field.strength * TO_CORE @ (axis / length)
                 else:
                     gusts[row] = np.hypot(gusts[row], thing.field.strength)
+    fastest = max(float(np.linalg.norm(velocity, axis=1).max()), float(gusts.max()))
+    if not fastest <= FASTEST:
+        blown = ", ".join(f"'{name}'" for name in names)
+        raise SetupError(f"{blown} blow with up to {fastest:.4g} m/s; lower the strength, {FASTEST:g} m/s at most.")
     eddies = [thing.field for thing in fields if thing.field.type == TURBULENCE]
     size = max((field.size for field in eddies), default=0.0) or EDDIES
     seed = eddies[0].seed if eddies else 0

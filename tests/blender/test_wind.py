@@ -114,6 +114,14 @@ def test_what_blender_leaves_out_or_cannot_point_anywhere_does_not_blow(ready, t
         ready.data.collections.remove(off)
 
 
+def test_a_field_that_blows_too_fast_is_named(ready, trained, fan):
+    fan.field.strength = 300.0
+    with pytest.raises(
+        RuntimeError, match=f"'{fan.name}' blow with up to 300 m/s; lower the strength, 100 m/s at most"
+    ):
+        ready.ops.ssilk.play_live()
+
+
 def test_an_edit_of_a_field_that_moves_is_noticed_and_driven_gravity_is_refused(ready, trained, fan):
     from blender_addon.errors import SetupError
     from blender_addon.motions.world import signature, world_over
