@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...events import Message, Reporter
+from ...files import split_location
 from ...scene.assets import Deformer, GarmentPose, Motion
 from ..gltf.shot import SET, GlbLabels, write_glb
 
@@ -41,8 +42,12 @@ def write_glb_shot(
     from ssilk_usd.names import shape_name
     from ssilk_usd.shots.shot import TimeSpan, checked_poses, summary
     from ssilk_usd.writing.author import prim_names, unique_names
+    from ssilk_usd.writing.look import with_texture_coordinates
 
     scene = deformer.scene
+    mesh = with_texture_coordinates(scene.garment.mesh, split_location(scene.character.path)[0])
+    scene = replace(scene, garment=replace(scene.garment, mesh=mesh))
+    deformer = replace(deformer, scene=scene)
     garment, *bodies = prim_names([scene.garment.mesh.path, *(body.mesh.path for body in scene.character.bodies)])
     labels = GlbLabels(
         character=prim_names([scene.character.path])[0],

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
-from ..reading.mesh import is_garment, kept_faces, polygons
+from ..reading.mesh import is_garment, kept_faces, polygons, texture_coordinates
 from .body_faces import face_kind
 from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
 from .look_spaces import keep_colour_space, move_spaces
@@ -71,6 +71,20 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
     name first.
     """
     return next(_look_sources(mesh, stage), None)
+
+
+def with_texture_coordinates(mesh: Mesh, source: str) -> Mesh:
+    """Return a mesh with the texture coordinates that its prim in a file has, which it may have got after training.
+
+    Where the file has no such prim, or none on it, those of the mesh stay.
+    """
+    stage = open_stage(source) if Path(source).is_file() else None
+    look = look_source(mesh, stage) if stage else None
+    if look is None:
+        return mesh
+    _, indices = polygons(look.prim, mesh.vertex_count, location(look.prim))
+    found = texture_coordinates(look.prim, indices)
+    return mesh if found is None else replace(mesh, uvs=found[look.corners])
 
 
 def _twin(mesh: Mesh, look: LookSource, stage: Usd.Stage) -> Usd.Prim | None:
