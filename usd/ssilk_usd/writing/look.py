@@ -18,10 +18,10 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Ints, Mesh
+from ssilk_core.scene.assets import Garment, Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
-from ..reading.mesh import is_garment, kept_faces, polygons, texture_coordinates
+from ..reading.mesh import display_colour, is_garment, kept_faces, polygons, texture_coordinates
 from .body_faces import face_kind
 from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
 from .look_spaces import keep_colour_space, move_spaces
@@ -73,18 +73,20 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
     return next(_look_sources(mesh, stage), None)
 
 
-def with_texture_coordinates(mesh: Mesh, source: str) -> Mesh:
-    """Return a mesh with the texture coordinates that its prim in a file has, which it may have got after training.
+def as_it_looks(garment: Garment, source: str) -> Garment:
+    """Return a garment with the colour and texture coordinates that its prim in a file has by now.
 
-    Where the file has no such prim, or none on it, those of the mesh stay.
+    Where the file has no such prim, or none of these on it, those of the garment stay.
     """
     stage = open_stage(source) if Path(source).is_file() else None
-    look = look_source(mesh, stage) if stage else None
+    look = look_source(garment.mesh, stage) if stage else None
     if look is None:
-        return mesh
+        return garment
+    mesh, colour = garment.mesh, display_colour(look.prim)
     _, indices = polygons(look.prim, mesh.vertex_count, location(look.prim))
-    found = texture_coordinates(look.prim, indices)
-    return mesh if found is None else replace(mesh, uvs=found[look.corners])
+    uvs = texture_coordinates(look.prim, indices)
+    mesh = mesh if uvs is None else replace(mesh, uvs=uvs[look.corners])
+    return replace(garment, mesh=mesh, colour=colour or garment.colour)
 
 
 def _twin(mesh: Mesh, look: LookSource, stage: Usd.Stage) -> Usd.Prim | None:
