@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.reading.mesh import read_mesh
 from ssilk_usd.shots.play import Shot
 
@@ -180,6 +180,27 @@ def test_seams_of_the_texture_double_their_points_behind_all_others():
     np.testing.assert_allclose(drawn.uvs, [[0, 1], [0.5, 1], [0.5, 0], [0, 0], [1, 1], [0.6, 1]], atol=1e-6)
     part = drawn_mesh(mesh, np.array([True, False]))
     np.testing.assert_array_equal(part.faces, [[1, 4, 2]])  # what is left needs no second coordinate
+
+
+def test_colour_and_texture_coordinates_are_those_that_the_stage_has_by_now(copy):
+    """Cloth is often unwrapped after it was trained; materials then read a set that the model does not know."""
+    shutil.copy("rigged.usda", "unwrapped.usda")
+    stage = Usd.Stage.Open("unwrapped.usda")
+    cape = next(UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.HasAttribute("ssilk:proxyJoints"))
+    corners = len(cape.GetFaceVertexIndicesAttr().Get())
+    wanted = np.random.default_rng(5).random((corners, 2)).astype(np.float32)
+    primvar = UsdGeom.PrimvarsAPI(cape).CreatePrimvar("map1", Sdf.ValueTypeNames.TexCoord2fArray, "faceVarying")
+    primvar.Set(Vt.Vec2fArray.FromNumpy(wanted))
+    cape.CreateDisplayColorAttr([(0.1, 0.2, 0.75)])
+    stage.Save()
+    assert run("bake model.safetensors --stage unwrapped.usda --motion sway.usda --target glb -o unwrapped.glb") == 0
+    reader = Reader("unwrapped.glb")
+    (mesh,) = [each for each in reader.json["meshes"] if each["name"] == cape.GetPrim().GetName()]
+    found = reader[mesh["primitives"][0]["attributes"]["TEXCOORD_0"]] * [1, -1] + [0, 1]
+    assert np.abs(found[:, None] - wanted).max(axis=-1).min(axis=1).max() < 1e-6
+    material = reader.json["materials"][mesh["primitives"][0]["material"]]
+    np.testing.assert_allclose(material["pbrMetallicRoughness"]["baseColorFactor"], [0.1, 0.2, 0.75, 1], atol=1e-6)
+    assert len(np.unique(found, axis=0)) == len(np.unique(wanted, axis=0))
 
 
 def test_verify_finds_a_key_that_was_changed_and_says_what_a_file_lacks(copy, capsys):

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...events import Message, Reporter
+from ...files import split_location
 from ...scene.assets import Deformer, GarmentPose, Motion
 from ..gltf.shot import SET, GlbLabels, write_glb
 
@@ -41,8 +42,12 @@ def write_glb_shot(
     from ssilk_usd.names import shape_name
     from ssilk_usd.shots.shot import TimeSpan, checked_poses, summary
     from ssilk_usd.writing.author import prim_names, unique_names
+    from ssilk_usd.writing.look import as_it_looks
 
     scene = deformer.scene
+    looks = as_it_looks(scene.garment, split_location(scene.character.path)[0])
+    scene = replace(scene, garment=looks)
+    deformer = replace(deformer, scene=scene)
     garment, *bodies = prim_names([scene.garment.mesh.path, *(body.mesh.path for body in scene.character.bodies)])
     labels = GlbLabels(
         character=prim_names([scene.character.path])[0],
@@ -64,7 +69,8 @@ def write_glb_shot(
         hidden_polygons=None if hidden_polygons is None else hidden_polygons.masks,
         provenance=provenance,
     )
-    left = "a glb keeps the mean colour and one UV set of each mesh; other sets, materials and subsets are left out"
+    kept = "a glb keeps the garment's mean colour and one UV set of each mesh"
+    left = f"{kept}; other colours and sets, materials and subsets are left out"
     told = summary(path, deformer, motion, TimeSpan.of(motion, start, samples_per_frame), shapes)
     return replace(told, left_out=left)
 

@@ -28,7 +28,7 @@ SET = 4  # influences in one attribute
 ARMATURE = 0  # the node above the joints, which follow it in their order
 GARMENT, BODY = "garment", "body"  # kinds of meshes, as the file says them
 AT_REST = 1e-7  # [m] by which a joint's place may differ and still count as the same
-# Plain colours, linear: the bake knows no materials. Cloth is seen from both sides.
+# Plain colours, linear, where a garment has none: the bake knows no materials. Cloth is seen from both sides.
 MATERIALS = (
     ("Garment", (0.30, 0.06, 0.08, 1.0), True),
     ("Body", (0.45, 0.42, 0.40, 1.0), False),
@@ -93,7 +93,9 @@ def write_glb(
     nodes = glb.document["nodes"]
     for joint, parent in enumerate(scene.parents):
         nodes[ARMATURE if parent < 0 else 1 + parent].setdefault("children", []).append(1 + joint)
-    for name, colour, both in MATERIALS:
+    authored = scene.garment.colour
+    for name, plain, both in MATERIALS:
+        colour = (*authored, 1.0) if authored and name == "Garment" else plain
         surface = {"baseColorFactor": colour, "metallicFactor": 0, "roughnessFactor": 0.9}
         glb.add("materials", {"name": name, "doubleSided": both, "pbrMetallicRoughness": surface})
     binds = invert_rigid(scene.bind_transforms).swapaxes(1, 2).astype(np.float32).reshape(-1, 16)  # by columns

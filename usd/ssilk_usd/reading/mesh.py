@@ -78,7 +78,7 @@ def read_mesh(prim: Usd.Prim, to_core: Floats, offsets: Floats | None = None) ->
     points = points if offsets is None else points + offsets
     counts, indices = polygons(prim, len(points), where)
     corners, counts, _ = kept_faces(prim, counts)
-    uvs = _texture_coordinates(prim, indices)
+    uvs = texture_coordinates(prim, indices)
     return Mesh(
         where,
         apply(to_core, points),
@@ -145,7 +145,7 @@ def placement(prim: Usd.Prim) -> Floats:
     return np.eye(4) if matrix is None else column_matrix(matrix)
 
 
-def _texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
+def texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
     """Return (u, v) for each face corner from the UV set of the mesh, or None."""
     chosen = _uv_set(prim)
     if chosen is None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,10 @@ from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Ints, Mesh
+from ssilk_core.scene.assets import Garment, Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
-from ..reading.mesh import is_garment, kept_faces, polygons
+from ..reading.mesh import display_colour, is_garment, kept_faces, polygons, texture_coordinates
 from .body_faces import face_kind
 from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
 from .look_spaces import keep_colour_space, move_spaces
@@ -71,6 +71,22 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
     name first.
     """
     return next(_look_sources(mesh, stage), None)
+
+
+def as_it_looks(garment: Garment, source: str) -> Garment:
+    """Return a garment with the colour and texture coordinates that its prim in a file has by now.
+
+    Where the file has no such prim, or none of these on it, those of the garment stay.
+    """
+    stage = open_stage(source) if Path(source).is_file() else None
+    look = look_source(garment.mesh, stage) if stage else None
+    if look is None:
+        return garment
+    mesh, colour = garment.mesh, display_colour(look.prim)
+    _, indices = polygons(look.prim, mesh.vertex_count, location(look.prim))
+    uvs = texture_coordinates(look.prim, indices)
+    mesh = mesh if uvs is None else replace(mesh, uvs=uvs[look.corners])
+    return replace(garment, mesh=mesh, colour=colour or garment.colour)
 
 
 def _twin(mesh: Mesh, look: LookSource, stage: Usd.Stage) -> Usd.Prim | None:
