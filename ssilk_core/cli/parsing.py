@@ -11,12 +11,15 @@ from typing import Any, NoReturn
 
 from ..errors import did_you_mean, fail, fail_unknown
 
+NUMBERS = re.compile(r"^-(\d|\.\d)[\d.,eE+-]*$")
+
 
 class Parser(argparse.ArgumentParser):
     """An `argparse.ArgumentParser` that takes no abbreviations and raises `SsilkError`."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options, allow_abbrev=False)
+        self._negative_number_matcher = NUMBERS  # argparse knows single numbers alone: `--wind -5,0,0`
 
     def error(self, message: str) -> NoReturn:
         """Raise `SsilkError`."""

@@ -29,7 +29,7 @@ class TrainConfig:
         state_reuse: share of windows that continue from the final state of the previous window in the same slot.
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
         wind_fraction: share of windows in which an even wind pulls on the cloth beside gravity, in any direction,
-            with up to `windows.STRONGEST_PULL`; it changes now and then.
+            with up to `network.settings.STRONGEST_PULL`; it changes now and then.
         recombinations: number of extra motions for each motion, whose limbs move as in another motion; fewer where
             all poses would be more than `training.job.MOST_POSES`.
         perturbations: likewise with joints turned at random. About half go to and fro between these poses and the

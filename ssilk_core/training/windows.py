@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from ..errors import fail
+from ..network.settings import STRONGEST_PULL
 from .motion_bank import MotionBank
 from .settings import TrainConfig
 
@@ -25,7 +26,6 @@ def random_directions(count: int, rotated: float, generator: torch.Generator, de
 
 
 GUSTS = 0.1  # chance that the wind changes within a window that continues another
-STRONGEST_PULL = 4.0  # [g] drawn at random; the usual fabric feels it in a wind of 20 m/s
 
 
 def random_pulls(count: int, share: float, generator: torch.Generator, device: torch.device) -> Tensor:

@@ -132,6 +132,13 @@ def test_the_network_feels_wind_and_gravity_as_the_player_does(stage, capsys):
     assert main(["verify", "blown.usdc"]) == 0
 
 
+def test_wind_that_is_stronger_than_in_training_is_told(stage, capsys):
+    assert main([*BAKE, "plain.usda", "-o", "storm.usdc", "--wind", "-40,0,0"]) == 0
+    assert "gravity and wind pull with up to" in capsys.readouterr().err
+    assert main([*BAKE, "plain.usda", "-o", "breeze.usdc", "--wind", "-4,0,0"]) == 0
+    assert "pull with up to" not in capsys.readouterr().err
+
+
 def test_a_network_that_was_trained_in_wind_says_nothing_of_it(stage, capsys):
     file = load_model("model.safetensors")
     train = {**file.provenance.get("train", {}), "wind_fraction": 0.25}

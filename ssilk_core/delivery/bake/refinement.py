@@ -13,6 +13,8 @@ import numpy as np
 from ...devices import select_device
 from ...errors import SsilkError, VerificationError, fail
 from ...events import Countdown, Message, Reporter, silent
+from ...network.settings import STRONGEST_PULL
+from ...physics.constants import GRAVITY
 from ...scene.assets import Deformer, Floats, Motion, Scene
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
 from .direction import free_stretches
@@ -49,8 +51,8 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     if not rollout.request.refine:
         if not rollout.request.lbs:
             missed = unseen(*_surrounded(rollout), report, sight=rollout.sight, drag=rollout.fabric.drag)
-            if missed:
-                report(Message(f"{rollout.request.motion}: {missed}", "warning"))
+            for words in filter(None, (missed, _too_strong(rollout.source))):
+                report(Message(f"{rollout.request.motion}: {words}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
 
@@ -147,6 +149,16 @@ def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool
         deformer = replace(deformer, shapes=deformer.shapes[:0])
     poses = list(rollout.network_poses())
     return decompose(deformer, rollout.motion, points, poses, device=select_device(rollout.request.device))
+
+
+def _too_strong(motion: Motion) -> str:
+    """Return the words where cloth is pulled by more than networks are trained with; empty where it is not."""
+    if motion.gravity is None:
+        return ""
+    strongest, known = float(np.linalg.norm(motion.gravity, axis=1).max()) / GRAVITY, 1 + STRONGEST_PULL
+    if strongest <= known:
+        return ""
+    return f"gravity and wind pull with up to {strongest:.1f} g; networks are trained up to {known:g} g"
 
 
 def _surrounded(rollout: BakeRollout) -> tuple[str, str, Scene, Motion, AskedWorld | None]:

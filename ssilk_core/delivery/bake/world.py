@@ -133,7 +133,7 @@ def _numbers(text: str) -> list[float]:
 def _vector(option: str, text: str) -> Vector:
     numbers = _numbers(text)
     if len(numbers) != 3 or not all(map(isfinite, numbers)):
-        fail(option, f"'{text}'", "X,Y,Z is needed, such as 0,0,5; write --wind=-5,0,0 where X is negative")
+        fail(option, f"'{text}'", "X,Y,Z is needed, such as 0,0,5 or -5,0,0")
     x, y, z = numbers
     return x, y, z
 

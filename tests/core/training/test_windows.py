@@ -9,10 +9,11 @@ import torch
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.descriptors import pose_features
+from ssilk_core.network.settings import STRONGEST_PULL
 from ssilk_core.scene.kinematics import motion_transforms, skinning_matrices
 from ssilk_core.training.motion_bank import MotionBank, build_bank
 from ssilk_core.training.settings import TrainConfig
-from ssilk_core.training.windows import STRONGEST_PULL, WindowSampler, random_directions, random_pulls
+from ssilk_core.training.windows import WindowSampler, random_directions, random_pulls
 
 CPU, JOINTS = torch.device("cpu"), np.arange(3)
 CONFIG = TrainConfig(batch=6, window=5, state_reuse=0.7)
