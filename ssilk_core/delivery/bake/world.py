@@ -81,16 +81,18 @@ class Sight:
     Attributes:
         pull: whether it sees gravity and wind; absolute descriptors name the axes of the world.
         strength: whether it was trained under others than the usual gravity.
+        colliders: whether it sees them.
     """
 
     pull: bool
     strength: bool
+    colliders: bool
 
     @classmethod
     def of(cls, file: ModelFile) -> Sight:
         """Return that of a trained network."""
         blown = file.provenance.get("train", {}).get("wind_fraction", 0) > 0
-        return cls(file.config.descriptors == "relative", blown)
+        return cls(file.config.descriptors == "relative", blown, file.config.proximity_points > 0)
 
 
 def unseen(
@@ -115,10 +117,10 @@ def unseen(
 
     garment = split_location(scene.garment.mesh.path)[1]
     found = find_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
-    sees = {"wind": sight.pull and drag > 0, "its gravity": sight.pull}
+    sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
     told = [UNSEEN.format(" and ".join(missed))] if missed else []
-    if not sight.strength and len(missed) < len(found.parts):
+    if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
         told.append(STILL)
     return "; ".join(told)
 
