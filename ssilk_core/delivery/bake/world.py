@@ -14,7 +14,7 @@ from ...files import split_location
 from ...scene.assets import Motion, Scene, ShotWorld
 
 if TYPE_CHECKING:
-    from ssilk_usd.reading.world import AskedWorld
+    from ssilk_usd.reading.world import AskedWorld, FoundWorld
 
     from ...network.checkpoint import ModelFile
 
@@ -66,12 +66,27 @@ def world_of(
     *,
     colliders: bool = True,
 ) -> ShotWorld | None:
-    """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
-    from ssilk_usd.reading.world import read_world
+    """Return what surrounds a character at each frame of its motion; None where nothing does."""
+    return _found(source, stage, scene, motion, asked, report, colliders=colliders).read(report)
+
+
+def _found(
+    source: str,
+    stage: str,
+    scene: Scene,
+    motion: Motion,
+    asked: AskedWorld | None,
+    report: Reporter,
+    *,
+    colliders: bool = True,
+) -> FoundWorld:
+    """Return what `ssilk_usd.reading.world.find_world` finds around the character of a scene."""
+    from ssilk_usd.reading.world import find_world
 
     garment = split_location(scene.garment.mesh.path)[1]
-    found = scene.character, motion, asked
-    return read_world(source, stage, *found, garment=garment, colliders=colliders, report=report)
+    return find_world(
+        source, stage, scene.character, motion, asked, garment=garment, colliders=colliders, report=report
+    )
 
 
 @dataclass(frozen=True)
@@ -113,10 +128,7 @@ def unseen(
     Args:
         drag: of the garment's fabric, by which air moves it.
     """
-    from ssilk_usd.reading.world import find_world
-
-    garment = split_location(scene.garment.mesh.path)[1]
-    found = find_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
+    found = _found(source, stage, scene, motion, asked, report)
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
     told = [UNSEEN.format(" and ".join(missed))] if missed else []
