@@ -60,11 +60,15 @@ def floor_of(scene: Scene, motion: Motion) -> float:
     return float(skin_points(body.mesh.points[rows], skin, matrices)[..., 1].min())
 
 
-def with_floor(subject: Subject, motion: Motion, height: float) -> Motion:
-    """Return a motion whose garment sees a floor at a height [m]."""
+def floor_world(motion: Motion, height: float) -> ShotWorld:
+    """Return a world with a floor at a height [m]."""
     corners = np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]]) * SIZE + [0, height, 0]
     faces, whole = np.array([[0, 1, 2], [0, 2, 3]]), np.ones(1, dtype=bool)
-    world = ShotWorld(motion.fps, (Collider("the floor", faces, corners[None], np.eye(4)[None], whole),))
+    return ShotWorld(motion.fps, (Collider("the floor", faces, corners[None], np.eye(4)[None], whole),))
+
+
+def seeing(subject: Subject, motion: Motion, world: ShotWorld) -> Motion:
+    """Return a motion whose garment sees the colliders of a world."""
     rows, reach = proximity_vertices(subject.scene, subject.file.config), proximity_reach(subject.scene)
     near = felt_proximity(world, motion, subject.scene, rows, reach, partial(proximity, reach=reach))
     return replace(motion, proximity=near)
@@ -94,7 +98,7 @@ def main() -> None:
         motion = read_motion(options.motions / f"{entry['clip']}.usdc", subject.scene.character.skeleton)
         motion = resample(motion, subject.file.config.fps).clip(0, options.frames)
         floor = floor_of(subject.scene, motion)
-        for name, seen in ("sees it", with_floor(subject, motion, floor)), ("does not", motion):
+        for name, seen in ("sees it", seeing(subject, motion, floor_world(motion, floor))), ("does not", motion):
             heights = heights_of(player, seen, floor)
             every[name].append(heights)
             rows.append([entry["clip"], name, *_cells(Sunk.of(heights))])
