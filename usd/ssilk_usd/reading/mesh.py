@@ -12,7 +12,6 @@ from ssilk_core.scene.assets import Floats, Ints, Mesh
 from ..names import CLASS, GARMENT, GEOM_BIND, PROXIES, SKEL
 from ..opening.stage import (
     EARLIEST,
-    PRIMS,
     apply,
     column_matrix,
     has_value,
