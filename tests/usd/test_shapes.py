@@ -271,3 +271,10 @@ def test_later_points_of_a_skinned_mesh_are_not_shown_and_not_told(tmp_path):
     shot = str(tmp_path / "shot.usda")
     np.testing.assert_array_equal(seen(shot, "/Hero/Body", 5), seen(hero, "/Hero/Body", 1))
     assert shown_otherwise(hero, shot, garment="Cape") == []
+
+
+def test_a_motion_on_a_skeleton_without_bind_pose_is_no_fault(tmp_path):
+    hero, stage = over(tmp_path)
+    stage.GetPrimAtPath("/Hero/Rig").GetAttribute("bindTransforms").Block()
+    stage.Save()
+    assert shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape") == []

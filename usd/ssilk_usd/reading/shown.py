@@ -11,6 +11,7 @@ from collections.abc import Container, Iterable, Iterator
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats
@@ -78,7 +79,10 @@ def shown_otherwise(
     _, placed = find_animation(of_motion := open_stage(file), prim, root)
     if placed is None:
         return [*filter(None, found)]
-    there = find_skeleton(of_motion, root=str(placed.GetPath()), garment=garment)
+    try:
+        there = find_skeleton(of_motion, root=str(placed.GetPath()), garment=garment)
+    except SsilkError:  # a motion plays on a skeleton that nothing can be bound to, without bind pose
+        return [*filter(None, found)]
     if there.prim == skel.prim:
         return [*filter(None, found)]
     for mesh in _caches(there, own):
