@@ -266,7 +266,7 @@ class BakeRollout:
 
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""
-        from ssilk_usd.reading.shapes import tell_animated_shapes
+        from ssilk_usd.reading.shown import tell_shown_otherwise
 
         from ...authoring.preflight.motion import joint_jumps, root_jumps
 
@@ -277,7 +277,7 @@ class BakeRollout:
             code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
-        tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
+        tell_shown_otherwise(self.request.stage, [self.source.path], report, root=self.request.root)
         if self.held_off:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
