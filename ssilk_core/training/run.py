@@ -45,15 +45,23 @@ RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a run: `finished` is False if it was interrupted; `score` is that of the best model.
+    """Result of a run.
 
-    `seconds` is the wall time [s], with that before a resumption. It does not count in a comparison.
+    Attributes:
+        finished: False if it was interrupted.
+        iterations: that are done.
+        model_iteration: the one that the model on disk is of.
+        score, lbs: of that model, and of linear blend skinning.
+        moves: whether dynamic training had begun, where there is any.
+        seconds: wall time [s], with that before a resumption. It does not count in a comparison.
     """
 
     finished: bool
     iterations: int
+    model_iteration: int
     score: Score
     lbs: Score
+    moves: bool
     seconds: float = field(compare=False)
 
 
@@ -96,6 +104,8 @@ class TrainingRun:
         if job.minutes and job.is_trainable:
             if job.resume:
                 self.clock.plan_rest(job.minutes)
+                left = max(0.0, job.minutes - self.clock.wall / 60)
+                report(Message(f"of {job.minutes:g} minutes for the whole run, {left:.1f} are left"))
             else:
                 self._plan(job.minutes)
         self._build_stepper()
@@ -139,7 +149,7 @@ class TrainingRun:
         count = format_count(len(self.job.held_out), "motions")
         self.report(Message(f"linear blend skinning is scored on {count} to validate on, to compare with"))
         score = self.parts.validator.lbs_score()
-        self.clock.validation_seconds = time.monotonic() - began
+        self.clock.scored_lbs(time.monotonic() - began)
         return score
 
     def _plan(self, minutes: float) -> None:
@@ -280,13 +290,14 @@ class TrainingRun:
         """Do one iteration."""
         self._within_memory(lambda: self.stepper.run(self.state.iteration))
         self.state.iteration += 1
+        self.clock.stepped()
         # On a processor steps are long, and those launched are done.
         if self.device.type == "cpu" and self.clock.measurement_due:
             self._measure_pace()
 
-    def check(self, seconds_left: float) -> None:
+    def check(self) -> None:
         """Report progress and skipped steps, follow the clock, and recover if training diverges."""
-        self.report_progress(seconds_left)
+        self.report_progress()
         self._measure_pace()
         if text := self.monitor.check():
             self.report(Message(text, "warning"))
@@ -300,10 +311,11 @@ class TrainingRun:
         """Whether nothing was said of the progress for long; a GPU would have to be waited for."""
         return self.device.type == "cpu" and time.monotonic() - self._reported_at >= REPORT_INTERVAL
 
-    def report_progress(self, seconds_left: float) -> None:
-        """Report the progress and the energies of the last batch."""
-        self._reported_at = time.monotonic()
-        self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
+    def report_progress(self) -> None:
+        """Report the progress and the energies of the last batch, for which a GPU is waited for."""
+        self._reported_at, terms = time.monotonic(), self._batch_terms()
+        left = self.clock.seconds_left()
+        self.report(Progress(self.state.iteration, self.config.iterations, left, terms))
 
     def _batch_terms(self) -> dict[str, float]:
         """Return energies of the last batch [J]; this waits for the device."""
@@ -342,7 +354,7 @@ class TrainingRun:
 
     def end_early(self) -> None:
         """End because the time is up, with a validation if there were steps since the last one."""
-        self.report_progress(0.0)
+        self.report_progress()
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
         if self.state.iteration != self.saved:
             self.validate()
@@ -351,9 +363,7 @@ class TrainingRun:
         found: list[Score] = []
         began = time.monotonic()
         self._within_memory(lambda: found.append(self.parts.validator.score(self.stepper.ema_model)))
-        # More is measured of a model than of linear blend skinning.
-        clock = self.clock
-        clock.validation_seconds = max(clock.validation_seconds, time.monotonic() - began)
+        self.clock.validated(time.monotonic() - began)
         return found[0]
 
     def _recover(self, found: str, broken: list[str]) -> None:
@@ -482,12 +492,14 @@ def train(
     if run.state.skipped:
         report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
     score = run.final_score()
-    return TrainingResult(finished, run.state.iteration, score, run.lbs, run.clock.wall)
+    state, best = run.state, run.state.best
+    of = best.iteration if best else state.iteration
+    return TrainingResult(finished, state.iteration, of, score, run.lbs, run.clock.has_moved, run.clock.wall)
 
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:
     """Iterate until all iterations are done, the time is up or `stop` is set; return False in the last case."""
-    began, steps = time.monotonic(), 0
+    steps = 0
     while run.state.iteration < (total := run.config.iterations) and not run.should_stop(stop):
         if run.clock.time_left <= 0:
             run.end_early()
@@ -496,11 +508,10 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
         if stop.is_set() and isinstance(stop, PatientStop):
             stop.obeyed()  # before a validation, which takes longer
         steps += 1
-        left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.clock.time_left))
         if run.state.iteration % CHECK_INTERVAL == 0 or run.state.iteration == total or steps == 1:
-            run.check(left)
+            run.check()
         elif run.report_due:
-            run.report_progress(left)
+            run.report_progress()
         if run.validation_due:
             run.validate()
         elif run.first_model_due:
