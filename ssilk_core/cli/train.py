@@ -20,6 +20,7 @@ from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, TextReporter, silent
 from ..network.settings import ModelConfig, apply_overrides, setting_names
+from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
 from . import options as shared
@@ -163,8 +164,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
     if fabric.friction:
-        words = f"friction = {fabric.friction:g}: 'ssilk simulate' knows it; the network is trained without friction"
-        report(Message(words, "warning"))
+        report(Message(f"friction = {fabric.friction:g} is left out; {FRICTION}", "warning"))
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
