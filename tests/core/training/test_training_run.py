@@ -31,7 +31,7 @@ from ssilk_core.physics.intersections.contours import IntersectionContours
 from ssilk_core.physics.skin.covered_skin import CoveredSkin
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.scene.fabrics import Fabric
-from ssilk_core.training import divergence, validation
+from ssilk_core.training import divergence, fitting_batch, validation
 from ssilk_core.training import job as job_module
 from ssilk_core.training import run as training
 from ssilk_core.training.curve import CurvePoint, append_point, curve_path
@@ -480,7 +480,7 @@ def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scen
 
 def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
     small = job("lowered", replace(SHORT, batch=4000, pretraining_batch=90_000, iterations=1, static_fraction=0.0))
-    monkeypatch.setattr(training, "free_memory", lambda device: 1 << 30)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 1 << 30)
     events: list[Event] = []
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
     run = training.TrainingRun(small, events.append)
@@ -500,13 +500,13 @@ def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
     )
     runs = []
     for megabytes in (400, 500, 330):
-        monkeypatch.setattr(training, "free_memory", lambda device, size=megabytes << 20: size)
+        monkeypatch.setattr(fitting_batch, "free_memory", lambda device, size=megabytes << 20: size)
         runs.append(training.TrainingRun(replace(big, resume=bool(runs)), silent).config)
     assert runs[0] == runs[1] == runs[2] and runs[0].batch < 4000
 
 
 def test_a_batch_of_one_that_cannot_fit_is_refused(job, monkeypatch):
-    monkeypatch.setattr(training, "free_memory", lambda device: 30 << 20)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 30 << 20)
     with pytest.raises(SsilkError, match=r"/toy/strip: a batch of one window of 5 poses needs .* GiB are free"):
         train(job("tiny"), silent)
 
@@ -590,7 +590,7 @@ def may_have(monkeypatch):
     if not torch.cuda.is_available():
         pytest.skip("needs a GPU")
     whole = torch.cuda.get_device_properties(0).total_memory
-    monkeypatch.setattr(training, "free_memory", lambda device: 1 << 50)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 1 << 50)
     yield lambda size: torch.cuda.set_per_process_memory_fraction(min(1.0, size / whole))
     torch.cuda.set_per_process_memory_fraction(1.0)
 
