@@ -19,8 +19,8 @@ import torch
 from torch import Tensor, nn
 
 from ..network.feedback import spread_rows
-from ..network.model.descriptors import proximity_features
-from ..network.proximity import MOST, proximity_reach, proximity_vertices
+from ..network.model.descriptors import proximity_features, proximity_length
+from ..network.proximity import proximity_reach, proximity_vertices
 from ..network.settings import ModelConfig
 from ..physics.skinning import Skinning
 from ..scene.assets import Floats, Ints, Scene, SkinWeights
@@ -31,7 +31,7 @@ SKIN = 0.005  # [m] between these and an obstacle that touches the body
 FLOORS, BOTH = 0.55, 0.25  # shares of poses with obstacles that have a floor or wall alone, and one beside something
 LYING = 0.6  # share of floors that the body touches
 LEVEL = 0.6  # share of floors that are level; others are tilted, or walls
-FURTHEST = 0.5  # reach, up to which others are away from the body
+FURTHEST = 0.4  # of the reach, up to which others are away from the body
 LARGE = 50.0  # [m] half extents of a floor
 SMALLEST, LARGEST = 0.03, 0.5  # [m] half extents of boxes
 THINNEST, THICKEST = 0.02, 0.25  # [m] radii of capsules and balls
@@ -122,7 +122,7 @@ class ObstacleDrawer:
     def seen(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
         """Return features of proximity (N, 3 M) in frames (N,), as `network.proximity` has them."""
         distance, away = obstacles.nearest(self._seen(self.bank.character(frames)))
-        vectors = away * (1 - distance / self.reach).clamp(0, MOST)[:, None]
+        vectors = away * proximity_length(distance, self.reach)[:, None]
         return proximity_features(vectors.permute(2, 0, 1), self.bank.down[frames, self.hub])
 
     def draw(self, frames: Tensor, gravity: Tensor) -> Obstacles:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ...scene.assets import Floats
 from ..descriptors import VECTORS, PoseFeatures
+from ..proximity import MOST
 
 DOWN = (0.0, -1.0, 0.0)  # where gravity points, but in training
 
@@ -49,6 +50,12 @@ def turned_vectors(dynamic: Tensor, direction: Tensor, heading: Tensor) -> Tenso
 def gravity_features(down: Tensor, gravity: Tensor) -> Tensor:
     """Return gravity in each joint's frame: down (N, J', 3, 3), gravity as seen (N, 3), to (N, 3 J')."""
     return torch.einsum("njab,nb->nja", down, gravity).flatten(1)
+
+
+def proximity_length(distance: Tensor, reach: float) -> Tensor:
+    """Return the lengths of `network.proximity` at distances [m]."""
+    share = 1 - distance / reach
+    return torch.where(distance > 0, share.clamp_min(0) ** 2, (2 * share - 1).clamp_max(MOST))
 
 
 def proximity_features(vectors: Tensor, down: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import trimesh
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import ModelFile, model_file
 from ssilk_core.network.descriptors import place_of_hub, pose_features
+from ssilk_core.network.model.descriptors import proximity_length
 from ssilk_core.network.parameters import parameter_shapes, seeing_colliders
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
 from ssilk_core.network.settings import PROXIMITY_POINTS, ModelConfig
@@ -174,7 +175,12 @@ def test_the_network_sees_in_training_what_it_sees_of_the_same_collider_in_a_sho
 def test_proximity_is_nothing_from_the_reach_on_and_points_out_of_what_holds_it() -> None:
     normal = np.array([[0.0, 1.0, 0.0]] * 5)
     found = proximity(np.array([2.0, 1.0, 0.5, 0.0, -3.0]), normal, 1.0)
-    np.testing.assert_allclose(found[:, 1], [0, 0, 0.5, 1, 2])
+    np.testing.assert_allclose(found[:, 1], [0, 0, 0.25, 1, 2])
+    distance = np.linspace(-0.6, 1.2, 181)
+    length = proximity(distance, np.tile([[1.0, 0, 0]], (181, 1)), 1.0)[:, 0]
+    np.testing.assert_allclose(proximity_length(torch.tensor(distance), 1.0).numpy(), length, atol=1e-12)
+    slope = np.diff(length[10:]) / 0.01  # smooth from half a reach inside on
+    assert np.abs(np.diff(slope)).max() < 0.03
 
 
 def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model) -> None:
