@@ -82,7 +82,7 @@ class RunClock:
     def has_moved(self) -> bool:
         """Whether steps of dynamic training were done, where any are asked for."""
         state, asked = self.state, self.job.train
-        if not self.job.is_trainable or asked.static_iterations >= asked.iterations:
+        if self.job.model.scheme == "quasi_static" or asked.static_iterations >= asked.iterations:
             return True
         return state.iteration > (state.static or self.schedule.static_iterations)
 

@@ -256,6 +256,11 @@ def test_a_run_whose_time_ends_in_static_training_has_not_moved(job, monkeypatch
         assert trained.iterations == end and trained.moves == moves
     still = train(job("still", replace(SHORT, iterations=2, static_fraction=0.99)), silent)
     assert still.moves  # as it was asked for
+    quiet = job("quasi_static", asked, minutes=1.0)
+    quiet = replace(quiet, model=replace(quiet.model, scheme="quasi_static"))
+    with monkeypatch.context() as patch:
+        patch.setattr(RunClock, "time_left", property(lambda clock: 3 - clock.state.iteration))
+        assert train(quiet, silent).moves  # all that it can
 
 
 @pytest.mark.parametrize("resume", [False, True])
