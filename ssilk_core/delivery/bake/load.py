@@ -116,7 +116,7 @@ class LoadedGarment:
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
-            sight=Sight.of(self.file),
+            sight=Sight.of(self.file, solved=request.latent_iterations > 0),
             reduction=reduction,
             direction=None if request.lbs else self._directed(request, read),
         )
@@ -151,7 +151,7 @@ class LoadedGarment:
 
     def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
         """Return a motion with the gravity, the wind and the colliders of its shot that the network sees."""
-        sight, scene = Sight.of(self.file), self.deformer.scene
+        sight, scene = Sight.of(self.file, solved=request.latent_iterations > 0), self.deformer.scene
         if not (sight.pull or sight.colliders):
             return motion
         from ...network.proximity import proximity, proximity_reach, proximity_vertices
