@@ -17,11 +17,13 @@ from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
 from ...scene.assets import Deformer, Floats, Motion, Scene
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
+from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .character import on_character
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
+from .riders import riders_of
 from .rollout import BakeRollout
 from .world import Sight, asked_world, world_of
 
@@ -64,6 +66,7 @@ class LoadedGarment:
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
         info: of the garment as an asset.
+        riders: what rides on it.
     """
 
     request: BakeRequest
@@ -77,6 +80,7 @@ class LoadedGarment:
     provenance: dict[str, object]
     record: GarmentRecord
     info: AssetInfo
+    riders: tuple[Rider, ...] = ()
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -118,6 +122,7 @@ class LoadedGarment:
             fabric=self.file.fabric,
             sight=Sight.of(self.file),
             reduction=reduction,
+            riders=self.riders,
             direction=None if request.lbs else self._directed(request, read),
         )
 
@@ -197,7 +202,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     device = select_device(request.device)
     file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
-    (scene, units), stage_held = read_unchanged(
+    (scene, units, riders), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
     model = None if request.lbs else network(file, scene).to(device)
@@ -218,15 +223,17 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         },
         record=_record(file, model_held.digest),
         info=_info(request, model_held.digest),
+        riders=riders,
     )
 
 
-def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits]:
-    """Return a model's scene with the character of a stage, and the units of what is written."""
+def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits, tuple[Rider, ...]]:
+    """Return a model's scene with the character of a stage, the units of what is written, and what rides on it."""
     from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
-    return on_character(file, stage, request.root), _units(stage, request.receiver)
+    scene = on_character(file, stage, request.root)
+    return scene, _units(stage, request.receiver), riders_of(stage, scene.garment.mesh, request.root)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

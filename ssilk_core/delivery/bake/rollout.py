@@ -23,6 +23,7 @@ from ...scene.kinematics import (
     slerp,
     split_at_cuts,
 )
+from ...scene.riders import Rider, RiderJoints
 from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
@@ -85,6 +86,7 @@ class BakeRollout:
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
+        riders: what rides on the garment.
         direction: where the garment is held; None where it moves freely throughout.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
@@ -111,6 +113,7 @@ class BakeRollout:
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
     latents: SolvedLatents | None = None
+    riders: tuple[Rider, ...] = ()
     direction: Direction | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
@@ -131,6 +134,10 @@ class BakeRollout:
             yield from self.network_poses()
         else:
             yield from self.refinement.poses
+
+    def rider_joints(self) -> RiderJoints:
+        """Return the garment with the joints of what rides on it."""
+        return RiderJoints(self.deformer, self.riders)
 
     def network_poses(self, roller: LatentRoller | None = None) -> Iterator[GarmentPose]:
         """Yield the network's poses, some frames at a time.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...files import replacing
-from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
+from ...scene.assets import Body, Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
 from ...scene.kinematics import (
     combined_transforms,
     continuous,
@@ -26,7 +26,7 @@ from .geometry import ShapeNormals, drawn_mesh
 
 SET = 4  # influences in one attribute
 ARMATURE = 0  # the node above the joints, which follow it in their order
-GARMENT, BODY = "garment", "body"  # kinds of meshes, as the file says them
+GARMENT, BODY, RIDER = "garment", "body", "rider"  # kinds of meshes, as the file says them
 AT_REST = 1e-7  # [m] by which a joint's place may differ and still count as the same
 # Plain colours, linear, where a garment has none: the bake knows no materials. Cloth is seen from both sides.
 MATERIALS = (
@@ -43,7 +43,7 @@ class GlbLabels:
         character: name of the node above the joints.
         joints: name of each joint, then of each proxy.
         shapes: name of each blendshape of the deformer.
-        garment, bodies: names of the meshes.
+        garment, bodies, riders: names of the meshes.
         start: time code of the first frame.
         samples_per_frame: how many of the motion's frames make one of the shot's.
     """
@@ -53,6 +53,7 @@ class GlbLabels:
     shapes: Sequence[str]
     garment: str
     bodies: Sequence[str]
+    riders: Sequence[str] = ()
     start: float = 0.0
     samples_per_frame: int = 1
 
@@ -65,6 +66,7 @@ def write_glb(
     labels: GlbLabels,
     *,
     include_body: bool = True,
+    riders: Sequence[Body] = (),
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: Sequence[NDArray[np.bool_]] | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -76,6 +78,7 @@ def write_glb(
     Args:
         motion: the character's motion at the shot's samples.
         poses: consecutive chunks of frames that together cover the motion.
+        riders: what rides on the garment, each bound to a joint of the deformer.
         hidden: from which frames of the motion on the character is hidden (True) or seen (False). Hidden, its joints
             are scaled to nothing, because plain glTF has no visibility.
         hidden_polygons: of each body, those that are left out.
@@ -109,6 +112,8 @@ def write_glb(
         for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
             if mask is None or not mask.all():
                 drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
+    for name, rider in zip(labels.riders, riders, strict=True):
+        drawn.append(_add_mesh(glb, name, rider.mesh, rider.skin, kind=RIDER))
     glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
     glb.document["scene"] = 0
     _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, drawn[0])
@@ -152,6 +157,7 @@ def _add_mesh(
     offsets: Mapping[str, Floats] | None = None,
     at: Floats | None = None,
     hidden: NDArray[np.bool_] | None = None,
+    kind: str = BODY,
 ) -> int:
     """Add a skinned mesh and its node; return the node's index.
 
@@ -181,7 +187,7 @@ def _add_mesh(
             for offset in offsets.values()
         ]  # fmt: skip
         item["weights"] = at.tolist()
-    kind = GARMENT if is_garment else BODY
+    kind = GARMENT if is_garment else kind
     item["extras"] = {"targetNames": list(offsets or ()), "kind": kind, "points": mesh.vertex_count}
     return glb.add("nodes", {"name": name, "mesh": glb.add("meshes", item), "skin": 0})
 

@@ -18,6 +18,7 @@ import os
 from collections.abc import Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -30,7 +31,7 @@ from ..names import shape_name
 from ..opening.garment_api import GarmentRecord
 from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
-from ..reading.mesh import is_garment
+from ..reading.mesh import is_body
 from ..units import StageUnits
 from ..writing.asset_info import AssetInfo, author_asset_info
 from ..writing.author import Asset, define_asset, define_blendshapes, extent_array
@@ -41,6 +42,9 @@ from .play import Shot
 from .samples import PATH_OP, Samples, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 from .velocities import cut_frames, with_velocities
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 DEFORMATION, QUALITY, LEVEL = "deformation", "quality", "level"
 OWN_LEVEL = "default"  # the level that a garment with others is itself
@@ -101,6 +105,7 @@ def write_asset(
     units: StageUnits,
     *,
     include_body: bool = True,
+    riders: RiderJoints | None = None,
     record: GarmentRecord | None = None,
     info: AssetInfo | None = None,
     lean: bool = True,
@@ -109,6 +114,7 @@ def write_asset(
 
     Args:
         include_body: with the body meshes.
+        riders: what rides on the garment; the deformer has its joints.
         record: how the garment was made, kept on its mesh.
         info: of the asset, in a layer of its own, so that another version makes no shot stale; its identifier is the
             asset's own layer where none is given.
@@ -124,7 +130,7 @@ def write_asset(
     with replacing(layout.geometry, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
         asset = define_asset(
-            stage, deformer, bodies, units, name=layout.garment, record=record, output=layout.geometry
+            stage, deformer, bodies, units, riders=riders, name=layout.garment, record=record, output=layout.geometry
         )
         save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
@@ -508,4 +514,4 @@ def _span(layer: Sdf.Layer, rate: float) -> tuple[float, float]:
 def _body_names(stage: Usd.Stage) -> list[str]:
     """Return the names of the body meshes that come with a garment."""
     prims = stage.GetDefaultPrim().GetChildren()
-    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and not is_garment(prim)]
+    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and is_body(prim)]
