@@ -11,6 +11,7 @@ import numpy as np
 
 from ...devices import select_device
 from ...errors import fail
+from ...events import Event
 from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
@@ -67,6 +68,7 @@ class LoadedGarment:
         record: how the model was made, as its mesh stores it.
         info: of the garment as an asset.
         riders: what rides on it.
+        told: what was found about riders, to be reported.
     """
 
     request: BakeRequest
@@ -81,6 +83,7 @@ class LoadedGarment:
     record: GarmentRecord
     info: AssetInfo
     riders: tuple[Rider, ...] = ()
+    told: tuple[Event, ...] = ()
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -123,6 +126,7 @@ class LoadedGarment:
             sight=Sight.of(self.file),
             reduction=reduction,
             riders=self.riders,
+            told=self.told,
             direction=None if request.lbs else self._directed(request, read),
         )
 
@@ -202,7 +206,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     device = select_device(request.device)
     file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
-    (scene, units, riders), stage_held = read_unchanged(
+    (scene, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
     model = None if request.lbs else network(file, scene).to(device)
@@ -224,16 +228,22 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         record=_record(file, model_held.digest),
         info=_info(request, model_held.digest),
         riders=riders,
+        told=told,
     )
 
 
-def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits, tuple[Rider, ...]]:
-    """Return a model's scene with the character of a stage, the units of what is written, and what rides on it."""
+def _on_stage(
+    file: ModelFile, request: BakeRequest
+) -> tuple[Scene, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
+    """Return a model's scene with the character of a stage, the units of what is written, what rides on it, and what
+    there is to report of that."""
     from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
     scene = on_character(file, stage, request.root)
-    return scene, _units(stage, request.receiver), riders_of(stage, scene.garment.mesh, request.root)
+    told: list[Event] = []
+    riders = riders_of(stage, scene.garment.mesh, request.root, lambda event: told.append(event))
+    return scene, _units(stage, request.receiver), riders, tuple(told)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

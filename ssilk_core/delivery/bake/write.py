@@ -89,7 +89,7 @@ def result_of(
         frames=summary.frame_count,
         fps=summary.fps,
         joints=summary.joint_count,
-        proxies=summary.proxy_count,
+        proxies=summary.proxy_count - len(rollout.riders),
         blendshapes=summary.shape_count,
         size_bytes=path.stat().st_size,
         verification=verification,
