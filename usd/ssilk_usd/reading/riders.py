@@ -112,7 +112,10 @@ def _read(prim: Usd.Prim, stage: Usd.Stage, root: str | None, report: Reporter) 
     to_core = skel.bind_to_core @ skel.world_to_bind
     vertices = None
     if has_value(prim, RIDE_VERTICES):
-        vertices = tuple(int(each) for each in np.ravel(value(prim, RIDE_VERTICES)))
+        named = np.ravel(value(prim, RIDE_VERTICES))
+        if named.dtype.kind not in "iu":
+            fail(where, f"{RIDE_VERTICES} is {str(named.tolist())[:40]}", "three whole numbers are needed")
+        vertices = tuple(int(each) for each in named)
     read = tuple(read_mesh(each, to_core @ world_matrix(each)) for each in meshes)
     return SaidRider(where, prim.GetName(), read, vertices)
 
