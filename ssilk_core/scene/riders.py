@@ -75,16 +75,8 @@ class Attachment:
         Raises:
             SsilkError: it is far from the garment.
         """
-        faces, shares, distances = _feet(points, mesh)
-        nearest = float(distances.min())
-        if not nearest <= FARTHEST:
-            allowed = f"a rider lies within {1000 * FARTHEST:g} mm of its garment at rest"
-            todo = "move it there, or choose three vertices that carry it (ssilk:rideVertices)"
-            fail(path, f"it is {1000 * nearest:.3g} mm away from {mesh.path}", allowed, todo)
-        touching = distances <= nearest + TOUCH
-        feet = (shares[touching, :, None] * mesh.points[mesh.faces[faces[touching]]]).sum(axis=1)
-        (face,), (place,), _ = _feet(feet.mean(axis=0)[None], mesh)
-        under = np.union1d(faces[touching], face)
+        face, place, touched = _lies_on(points, mesh, path)
+        under = np.union1d(touched, face)
         corners = mesh.points[mesh.faces[under]]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         vertices = np.unique(mesh.faces[under])
@@ -140,6 +132,15 @@ class Rider:
     name: str
     meshes: tuple[Mesh, ...]
     attachment: Attachment
+
+
+def triangle_beneath(points: Floats, mesh: Mesh, path: str) -> Ints:
+    """Return the vertices (3,) of the triangle beneath the middle of where a rider with points (M, 3) [m] lies.
+
+    Raises:
+        SsilkError: it is far from the garment.
+    """
+    return mesh.faces[_lies_on(points, mesh, path)[0]]
 
 
 class RiderJoints:
@@ -265,6 +266,25 @@ def _edge_frames(corners: Floats) -> Floats:
         z = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         x = first / np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def _lies_on(points: Floats, mesh: Mesh, path: str) -> tuple[int, Floats, Ints]:
+    """Return the triangle beneath the middle of where a rider touches a mesh, the barycentric coordinates of this
+    place, shape (3,), and all triangles that it touches.
+
+    Raises:
+        SsilkError: it is far from the mesh.
+    """
+    faces, shares, distances = _feet(points, mesh)
+    nearest = float(distances.min())
+    if not nearest <= FARTHEST:
+        allowed = f"a rider lies within {1000 * FARTHEST:g} mm of its garment at rest"
+        todo = "move it there, or choose three vertices that carry it (ssilk:rideVertices)"
+        fail(path, f"it is {1000 * nearest:.3g} mm away from {mesh.path}", allowed, todo)
+    touching = distances <= nearest + TOUCH
+    feet = (shares[touching, :, None] * mesh.points[mesh.faces[faces[touching]]]).sum(axis=1)
+    (face,), (place,), _ = _feet(feet.mean(axis=0)[None], mesh)
+    return int(face), place, np.unique(faces[touching])
 
 
 def _feet(points: Floats, mesh: Mesh) -> tuple[Ints, Floats, Floats]:

@@ -198,7 +198,9 @@ def aim(*targets: str):
 
 
 def name_vertices(*vertices: int):
-    return lambda rider: rider.CreateAttribute("ssilk:rideVertices", Sdf.ValueTypeNames.IntArray).Set(Vt.IntArray(vertices))
+    return lambda rider: rider.CreateAttribute("ssilk:rideVertices", Sdf.ValueTypeNames.IntArray).Set(
+        Vt.IntArray(vertices)
+    )
 
 
 @pytest.mark.parametrize(
