@@ -113,6 +113,28 @@ def test_another_blender_shows_the_shot_and_its_riders_as_they_were(ready, train
         assert np.abs(shown(ready, ready.data.objects[name], FRAMES) - points).max() < 1e-4
 
 
+@pytest.mark.parametrize("parented", [False, True])
+def test_a_glb_of_blenders_own_exporter_has_riders_where_blender_shows_them(ready, trained, worn, tmp_path, parented):
+    assert ready.ops.ssilk.bake(pre_roll=0.0) == {"FINISHED"}
+    if parented:
+        trained.parent = ready.data.objects["Rig"]
+    worn.scale = (2.0, 2.0, 2.0)
+    gem = add_mesh(ready, "Gem", *tube(8, 3, (0.0, 0.01), (0.004, 0.004)))
+    gem.parent, gem.location = worn, (0.004, 0.0, 0.005)
+    activate(ready, trained)
+    path = tmp_path / "Skirt.glb"
+    assert ready.ops.ssilk.export_gltf(filepath=str(path)) == {"FINISHED"}
+    expected = {name: shown(ready, ready.data.objects[name], FRAMES) for name in ("Brooch", "Gem")}
+    ready.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    ready.ops.import_scene.gltf(filepath=str(path), merge_vertices=True)
+    for name in ("Brooch", "Gem"):
+        found = shown(ready, ready.data.objects[name], FRAMES)
+        # Vertices come in another order, so middles and extents are compared.
+        for figure in (np.min, np.max, np.mean):
+            away = figure(found, axis=1) - figure(expected[name], axis=1)
+            assert np.abs(away).max() < ALLOWED, (name, figure)
+
+
 def test_what_moves_a_rider_besides_its_cloth_is_told(ready, trained, worn, capfd):
     worn.rotation_mode = "XYZ"
     for frame in (1, 12):
