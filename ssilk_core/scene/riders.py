@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid things that ride on a garment: buttons, brooches, feathers. Each gets a joint of its own, which follows the
-cloth beneath it, so that every format that skins a mesh carries it.
+"""What rides on a garment, so that every format that skins a mesh carries it.
+
+Rigid things, such as buttons, brooches and feathers, get a joint of their own, which follows the cloth beneath them.
 
 The joint stands where a point of the cloth goes that the rider lies on. It turns as the triangles beneath the rider
 do on the whole: the rotation that takes their corners at rest nearest to where they are, by least squares weighted
 with area [Kabsch 1976]. Three vertices that an artist chose carry a rider as Blender's vertex parenting does: their
 mean, turned as the first edge and the normal.
+
+Soft things, such as trims, have the weights and blendshapes of the cloth beneath each of their points. That is where
+the cloth is as far as its weights change evenly from corner to corner: products of two barycentric coordinates stand
+in for one.
 """
 
 from __future__ import annotations
@@ -119,19 +124,19 @@ class Attachment:
 
 @dataclass(frozen=True, eq=False)
 class Rider:
-    """A rigid thing on a garment, at the bind pose.
+    """A thing on a garment, at the bind pose.
 
     Attributes:
         path: where it comes from, for messages.
         name: of its joint.
         meshes: what is drawn of it.
-        attachment: what carries it.
+        attachment: what carries it; None where it is soft, and goes with the cloth beneath each of its points.
     """
 
     path: str
     name: str
     meshes: tuple[Mesh, ...]
-    attachment: Attachment
+    attachment: Attachment | None
 
 
 def triangle_beneath(points: Floats, mesh: Mesh, path: str) -> Ints:
@@ -144,27 +149,32 @@ def triangle_beneath(points: Floats, mesh: Mesh, path: str) -> Ints:
 
 
 class RiderJoints:
-    """A garment with a joint for each rider, after its proxies.
+    """A garment with a joint for each rigid rider, after its proxies.
 
     A joint hangs on the one that moves most of the cloth beneath it: between frames, and in corrections by hand,
     riders follow that.
 
+    Args:
+        influences: most joints that move a point of a soft rider; None for all of the cloth beneath it.
+
     Attributes:
-        deformer: the garment with these joints; without riders as it was.
-        bodies: the riders' meshes, each bound to its joint.
+        deformer: the garment with these joints; without any as it was.
+        bodies: the riders' meshes, bound to the joints that move them.
+        shapes: of each, offsets by the deformer's blendshapes [m], shape (K, M, 3); None where it is rigid.
         names: paths of the joints.
     """
 
-    def __init__(self, deformer: Deformer, riders: Sequence[Rider]) -> None:
-        self._own, self._riders, scene = deformer, tuple(riders), deformer.scene
+    def __init__(self, deformer: Deformer, riders: Sequence[Rider], influences: int | None = None) -> None:
+        self._own, self._all, scene = deformer, tuple(riders), deformer.scene
         rest = scene.garment.mesh.points
-        first = len(scene.joint_names)
-        self._rest = [rest[rider.attachment.vertices] for rider in riders]
-        self._binds = np.array([r.attachment.frame(own) for r, own in zip(riders, self._rest)]).reshape(-1, 4, 4)
-        self._parents = [_carrier(rider.attachment, deformer) for rider in riders]
-        self.names = _joint_paths(riders, self._parents, scene.joint_names)
+        self._riders = [(rider, rider.attachment) for rider in riders if rider.attachment]
+        self._rest = [rest[attachment.vertices] for _, attachment in self._riders]
+        frames = [attachment.frame(own) for (_, attachment), own in zip(self._riders, self._rest)]
+        self._binds = np.array(frames).reshape(-1, 4, 4)
+        self._parents = [_carrier(attachment, deformer) for _, attachment in self._riders]
+        self.names = _joint_paths([rider for rider, _ in self._riders], self._parents, scene.joint_names)
         self.deformer = deformer
-        if riders:
+        if self._riders:
             rig = scene.rig
             rig = ProxyRig(
                 rig.path,
@@ -174,14 +184,30 @@ class RiderJoints:
                 rig.skin,
             )
             self.deformer = replace(deformer, scene=replace(scene, rig=rig))
-        self.bodies = tuple(
-            Body(mesh, SkinWeights.rigid(mesh.path, first + number, mesh.vertex_count))
-            for number, rider in enumerate(riders)
-            for mesh in rider.meshes
-        )
+        joints = iter(range(len(scene.joint_names), len(self.deformer.scene.joint_names)))
+        bound = [each for rider in riders for each in self._bound(rider, joints, influences)]
+        self.bodies = tuple(body for body, _ in bound)
+        self.shapes = tuple(shapes for _, shapes in bound)
 
     def __len__(self) -> int:
-        return len(self._riders)
+        return len(self._all)
+
+    def _bound(
+        self, rider: Rider, joints: Iterator[int], influences: int | None
+    ) -> Iterator[tuple[Body, Floats | None]]:
+        """Yield the meshes of a rider with what moves them."""
+        if rider.attachment:
+            joint = next(joints)
+            for mesh in rider.meshes:
+                yield Body(mesh, SkinWeights.rigid(mesh.path, joint, mesh.vertex_count)), None
+            return
+        cloth, skin = self._own.scene.garment.mesh, self._own.skin
+        weights = skin.dense(len(self._own.scene.joint_names))
+        for mesh in rider.meshes:
+            faces, shares, _ = _feet(mesh.points, cloth)
+            corners = cloth.faces[faces]
+            mixed = SkinWeights.from_dense(mesh.path, np.einsum("mn,mnj->mj", shares, weights[corners]), influences)
+            yield Body(mesh, mixed), np.einsum("mn,kmnc->kmc", shares, self._own.shapes[:, corners])
 
     def poses(
         self, motion: Motion, poses: Iterable[GarmentPose], points: Iterable[Floats] | None = None
@@ -200,7 +226,7 @@ class RiderJoints:
         scene = self._own.scene
         joints = scene.character.skeleton.joint_count
         places = local_transforms(scene.bind_transforms, scene.parents)[joints:, :3, 3]
-        used = np.unique(np.concatenate([rider.attachment.vertices for rider in self._riders]))
+        used = np.unique(np.concatenate([attachment.vertices for _, attachment in self._riders]))
         for pose in poses:
             world = combined_transforms(self._own, motion, pose)
             if shown is None:
@@ -216,19 +242,22 @@ class RiderJoints:
             yield replace(pose, rotations=turned, translations=np.concatenate([moved, local[..., :3, 3]], axis=1))
 
     def rider_points(self, garment: Floats) -> Iterator[tuple[Floats, float]]:
-        """Yield where the cloth (V, 3) [m] carries each of `bodies`, shape (M, 3), and by how much it multiplies
-        what the cloth is off there."""
-        for rider, rest in zip(self._riders, self._rest):
-            attachment = rider.attachment
+        """Yield where the cloth (V, 3) [m] carries each of `bodies`, shape (M, 3), and by how much it multiplies what
+        the cloth is off there; infinite where the rider is soft, and may differ."""
+        rigid_rests, cloth = iter(self._rest), self._own.scene.garment.mesh
+        for rider in self._all:
+            if rider.attachment is None:
+                yield from ((_on_cloth(mesh.points, cloth, garment), np.inf) for mesh in rider.meshes)
+                continue
+            attachment, rest = rider.attachment, next(rigid_rests)
             moved = attachment.transforms(rest, garment[attachment.vertices][None])[0]
             for mesh in rider.meshes:
                 reach = np.linalg.norm(mesh.points - attachment.shares @ rest, axis=1).max()
                 yield mesh.points @ moved[:3, :3].T + moved[:3, 3], float(1 + reach / attachment.spread(rest))
 
     def _placed(self, posed: Floats, used: Ints) -> Iterator[Floats]:
-        for rider, rest in zip(self._riders, self._rest):
-            rows = np.searchsorted(used, rider.attachment.vertices)
-            yield rider.attachment.transforms(rest, posed[:, rows])
+        for (_, attachment), rest in zip(self._riders, self._rest):
+            yield attachment.transforms(rest, posed[:, np.searchsorted(used, attachment.vertices)])
 
     def _skinned(self, world: Floats, pose: GarmentPose, rows: Ints) -> Floats:
         """Return some vertices of the garment in the world [m], shape (F, N, 3)."""
@@ -255,6 +284,15 @@ def _joint_paths(riders: Sequence[Rider], parents: Sequence[int], joints: Sequen
         taken.add(own)
         found.append(f"{joints[parent]}/{own}")
     return tuple(found)
+
+
+def _on_cloth(points: Floats, cloth: Mesh, posed: Floats) -> Floats:
+    """Return where points (M, 3) at rest are on posed cloth (V, 3): each with its triangle, turned as that is."""
+    faces, shares, _ = _feet(points, cloth)
+    before, after = cloth.points[cloth.faces[faces]], posed[cloth.faces[faces]]
+    turned = np.nan_to_num(_edge_frames(after) @ _edge_frames(before).swapaxes(1, 2))
+    feet, moved = (np.einsum("mn,mnc->mc", shares, corners) for corners in (before, after))
+    return moved + (turned @ (points - feet)[..., None])[..., 0]
 
 
 def _edge_frames(corners: Floats) -> Floats:

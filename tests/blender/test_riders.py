@@ -144,6 +144,14 @@ def test_what_moves_a_rider_besides_its_cloth_is_told(ready, trained, worn, capf
     assert "'Brooch': what moves them besides the cloth is not in the shot in USD" in capfd.readouterr().out
 
 
+def test_a_trim_that_follows_the_cloth_by_a_modifier_is_told_as_left_out(ready, trained, capfd):
+    trim = brooch(ready, trained, name="Trim")
+    trim.modifiers.new("Follow", "SURFACE_DEFORM").target = trained
+    activate(ready, trained)
+    assert ready.ops.ssilk.bake(pre_roll=0.0, to_usd=True, to_timeline=False) == {"FINISHED"}
+    assert "holds the garment and its bodies alone, without 'Trim' of 'Rig'." in capfd.readouterr().out
+
+
 def test_what_cannot_ride_is_refused_in_one_sentence(ready, trained):
     def refused(thing) -> str:
         activate(ready, trained)

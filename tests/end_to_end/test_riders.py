@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from ssilk_core.cli import main
 from ssilk_core.delivery.gltf.play import GlbShot
 from ssilk_core.demo.motions import demo_shot
 from ssilk_core.demo.shipped import shipped_path
-from ssilk_core.network.checkpoint import load_model
+from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.scene.assets import LOOSE, Mesh
 
 ALLOWED = 1e-3  # [m] of a rider from its cloth
@@ -60,6 +61,15 @@ def disc_on(mesh: Mesh, face: int, shares: np.ndarray, radius: float) -> tuple[n
 
 def skirt_of(name: str = "model.safetensors") -> Mesh:
     return load_model(name).scene.garment.mesh
+
+
+def lively(path: str) -> None:
+    """Let a model move its cloth far from linear blend skinning, by joints and by shapes."""
+    file, rng = load_model(path), np.random.default_rng(1)
+    own = {name: value.copy() for name, value in file.parameters.items()}
+    own["output.2.weight"] *= 20
+    own["output.2.bias"] += rng.normal(scale=0.3, size=own["output.2.bias"].shape).astype(np.float32)
+    save_model(path, replace(file, parameters=own))
 
 
 FACES = (30, 301, 444)  # of the skirt, beneath the riders
@@ -110,6 +120,83 @@ def off_in(shot: Shot | GlbShot) -> float:
         riders = [posed[f"Button{number}"] for number in range(3)]
         worst = max(worst, largest_off(shot.garment_points(time), riders, mesh, rest, FACES, SHARES))
     return worst
+
+
+def add_belt(stage: Usd.Stage) -> None:
+    """Let a strip of the skirt's own triangles ride on it: two rows of vertices, moved to the middles of edges."""
+    mesh = skirt_of()
+    belt = UsdGeom.Mesh.Define(stage, "/Hero/Belt")
+    faces = mesh.faces[BELT]
+    used, corners = np.unique(faces, return_inverse=True)
+    belt.CreatePointsAttr(
+        Vt.Vec3fArray.FromNumpy(((mesh.points[used] + mesh.points[used + 24]) / 2).astype(np.float32))
+    )
+    belt.CreateFaceVertexCountsAttr([3] * len(faces))
+    belt.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(corners.ravel().astype(np.int32)))
+    belt.GetPrim().CreateRelationship("ssilk:ridesOn").SetTargets(["/Hero/Skirt"])
+    belt.GetPrim().CreateAttribute("ssilk:rideSoft", Sdf.ValueTypeNames.Bool).Set(True)
+    stage.GetRootLayer().Save()
+
+
+BELT = slice(96, 144)  # faces of the skirt
+SOFT = 2e-3  # [m] of a soft rider in the toy, whose triangles are 60 mm wide
+
+
+def belt_off(shot: Shot | GlbShot) -> float:
+    """How far a belt is from the middles of the edges that it lies on, in the worst frame of a shot [m]."""
+    used, worst = np.unique(skirt_of().faces[BELT]), 0.0
+    for time in shot.frame_times:
+        cloth = shot.garment_points(time)
+        (belt,) = (at for at, each in zip(shot.points(time), shot.meshes) if each.name == "Belt")
+        worst = max(worst, float(np.linalg.norm(belt - (cloth[used] + cloth[used + 24]) / 2, axis=1).max()))
+    return worst
+
+
+@pytest.mark.parametrize("target", ["usd", "blender", "game4", "glb", "glb4"])
+def test_soft_riders_have_the_weights_and_shapes_of_their_cloth(hero, capsys, target):
+    add_belt(Usd.Stage.Open("worn.usda"))
+    lively("model.safetensors")
+    name, model = "shot.glb" if "glb" in target else "shot.usdc", "model.safetensors"
+    if "4" in target:
+        model = "few.safetensors"
+        assert run(f"reduce model.safetensors -o {model} --influences 4 --motions clip.usda") == 0
+    capsys.readouterr()
+    assert run(f"bake {model} --stage worn.usda --motion clip.usda --target {target} -o {name}") == 0
+    told = capsys.readouterr()
+    (said,) = re.findall(r"/Hero/Belt is soft, and at most (\S+) mm off its cloth", told.out + told.err)
+    shot = GlbShot(name) if "glb" in target else Shot(name)
+    off = belt_off(shot)
+    assert off < (6e-3 if "4" in target else SOFT)  # four joints of all that move the corners of a triangle
+    assert float(said) / 1000 == pytest.approx(off, rel=0.5)  # of all its points, not of those on edges alone
+    first, last = (shot.garment_points(time) for time in (shot.frame_times[0], shot.frame_times[-1]))
+    assert np.abs(np.ptp(last, axis=0) - np.ptp(first, axis=0)).max() > 0.01  # it moves
+    assert run(f"verify {name}") == 0
+
+
+def test_soft_riders_have_the_shapes_that_layers_add_and_leave_out(hero):
+    add_belt(Usd.Stage.Open("worn.usda"))
+    lively("model.safetensors")
+    assert run("bake model.safetensors --stage worn.usda --motion clip.usda -o layers --refine 2") == 0
+    path = "layers/shots/clip/model/anim.usdc"
+    assert belt_off(Shot(path)) < SOFT
+    stage = Usd.Stage.Open(path)
+    before = Shot(stage).garment_points(5)
+    stage.GetDefaultPrim().GetVariantSet("quality").SetVariantSelection("skin")
+    assert np.abs(Shot(stage).garment_points(5) - before).max() > 1e-3
+    assert belt_off(Shot(stage)) < SOFT
+
+
+def test_a_soft_rider_is_no_point_cache_and_no_three_vertices_carry_it(hero, capsys):
+    stage = Usd.Stage.Open("worn.usda")
+    add_belt(stage)
+    bake = "bake model.safetensors --stage worn.usda --motion clip.usda -o shot.usdc"
+    assert run(f"{bake} --refine 1 --refined-output points") == 2
+    assert "/Hero/Belt: it is soft, and rides on cloth that is written as points" in capsys.readouterr().err
+    name_vertices(1, 2, 30)(stage.GetPrimAtPath("/Hero/Belt"))
+    stage.GetRootLayer().Save()
+    assert run(bake) == 2
+    assert "it has ssilk:rideSoft and ssilk:rideVertices" in capsys.readouterr().err
+    assert not Path("shot.usdc").exists()
 
 
 @pytest.mark.parametrize("target", ["usd", "blender", "game8", "game4", "arkit", "glb", "glb4"])

@@ -70,6 +70,7 @@ def write_glb_shot(
         labels,
         include_body=include_body,
         riders=ridden,
+        rider_shapes=riders.shapes if riders else (),
         hidden=hidden,
         hidden_polygons=None if hidden_polygons is None else hidden_polygons.masks,
         provenance=provenance,

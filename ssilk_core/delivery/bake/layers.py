@@ -272,7 +272,7 @@ def _write_asset(
     from ssilk_usd.shots import layers
 
     version, identifier = use.asset_version or garment.info.version, use.asset_identifier or ""
-    riders = RiderJoints(garment.deformer, garment.riders)
+    riders = RiderJoints(garment.deformer, garment.riders, task.request.receiver.influences)
     written = layers.write_asset(
         layout,
         riders.deformer,
@@ -321,6 +321,7 @@ def _write_layer(
             rollout.motion,
             riders.poses(rollout.motion, rollout.poses()),
             **common,
+            riders=riders,
             hidden=rollout.hidden,
             hidden_polygons=hidden,
             provenance=shot_metadata(rollout, layout.animation),

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from ...errors import VerificationError
-from ...events import Reporter, silent
+from ...errors import VerificationError, fail
+from ...events import Message, Reporter, silent
 from ...files import split_location
 from ...scene.assets import Floats, Mesh
-from ...scene.riders import Attachment, Rider, RiderJoints
+from ...scene.riders import Attachment, Rider, RiderJoints, triangle_beneath
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -29,13 +29,30 @@ def riders_of(stage: Usd.Stage, garment: Mesh, root: str | None, report: Reporte
     file, prim = split_location(garment.path)
     found = []
     for said in read_riders(stage, prim or file or "", root=root, report=report):
-        if said.vertices is None:
-            points = np.concatenate([mesh.points for mesh in said.meshes])
+        points = np.concatenate([mesh.points for mesh in said.meshes])
+        attachment: Attachment | None = None
+        if said.soft:
+            triangle_beneath(points, garment, said.path)  # which it is near to
+        elif said.vertices is None:
             attachment = Attachment.beneath(points, garment, said.path)
         else:
             attachment = Attachment.to_vertices(said.vertices, garment, said.path)
         found.append(Rider(said.path, said.name, said.meshes, attachment))
     return tuple(found)
+
+
+SOFT = 1e-3  # [m] by which soft riders may be off without a warning
+
+
+def need_joints(riders: Sequence[Rider]) -> None:
+    """Raise `SsilkError` where what rides on a garment is soft, of which only the points are to be written."""
+    for rider in riders:
+        if rider.attachment is None:
+            found, allowed = (
+                "it is soft, and rides on cloth that is written as points",
+                "it has the joints of its cloth",
+            )
+            fail(rider.path, found, allowed, "use --refined-output joints, or take ssilk:rideSoft away")
 
 
 class RiddenShot(Protocol):
@@ -50,14 +67,17 @@ class RiddenShot(Protocol):
         """Return the points of each mesh that rides on it [m], shape (M, 3)."""
 
 
-def verify_riders(shot: RiddenShot, times: Sequence[float], riders: RiderJoints) -> None:
+def verify_riders(shot: RiddenShot, times: Sequence[float], riders: RiderJoints, report: Reporter = silent) -> None:
     """Compare the riders of a shot with where its own cloth carries them, both posed by its format's rules alone.
 
+    How far soft ones are off is reported.
+
     Raises:
-        VerificationError: a rider is missing, or is off its cloth by more than rounding.
+        VerificationError: a rider is missing, or a rigid one is off its cloth by more than rounding.
     """
     from ssilk_usd.checking.shot import allowed_error
 
+    soft: dict[str, tuple[float, float]] = {}
     for time in times if riders else ():
         garment = shot.garment_points(time)
         found = shot.rider_points(time)
@@ -65,9 +85,15 @@ def verify_riders(shot: RiddenShot, times: Sequence[float], riders: RiderJoints)
             text = f"it has {len(found)} meshes that ride on its garment; {len(riders.bodies)} are needed"
             raise VerificationError(f"{shot.name}: {text}, as they were baked.")
         for body, points, (expected, factor) in zip(riders.bodies, found, riders.rider_points(garment)):
-            off, bound = float(np.abs(points - expected).max()), factor * allowed_error(garment)
+            off, name = float(np.linalg.norm(points - expected, axis=1).max()), body.mesh.path
+            bound = factor * allowed_error(garment)
             if not off <= bound:
                 raise VerificationError(
-                    f"{shot.name}: {body.mesh.path} is {1000 * off:.3g} mm off its cloth at time code {time:g}; at "
-                    f"most {1000 * bound:.3g} mm is allowed."
+                    f"{shot.name}: {name} is {1000 * off:.3g} mm off its cloth at time code {time:g}; at most "
+                    f"{1000 * bound:.3g} mm is allowed."
                 )
+            if bound == np.inf:
+                soft[name] = max(soft.get(name, (0.0, time)), (off, time))
+    for name, (off, time) in soft.items():
+        text = f"{name} is soft, and at most {1000 * off:.2g} mm off its cloth (time code {time:g})"
+        report(Message(f"{shot.name}: {text}", "info" if off <= SOFT else "warning"))

@@ -138,7 +138,7 @@ class BakeRollout:
 
     def rider_joints(self) -> RiderJoints:
         """Return the garment with the joints of what rides on it."""
-        return RiderJoints(self.deformer, self.riders)
+        return RiderJoints(self.deformer, self.riders, self.request.receiver.influences)
 
     def network_poses(self, roller: LatentRoller | None = None) -> Iterator[GarmentPose]:
         """Yield the network's poses, some frames at a time.

@@ -129,7 +129,7 @@ def skin_trajectories(
         warn_of_sets(found.deformer, path, report)
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
     verification: Verification | None = None
-    ridden = RiderJoints(found.deformer, riders)
+    ridden = RiderJoints(found.deformer, riders, found.deformer.skin.indices.shape[1])
     poses = ridden.poses(motion, found.poses)
     with replacing(path) as unverified:
         with packaged(unverified, report, name=path) as layer:
@@ -147,14 +147,15 @@ def skin_trajectories(
             need_valid(unverified, report)
             shot = open_shot(unverified)
             verification = compare_trajectories(shot, points, tolerance=tolerance)
-            verify_riders(shot, shot.sample_times(), ridden)
+            verify_riders(shot, shot.sample_times(), ridden, report)
         else:
             report(Message("not verified, as asked", "warning"))
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
     return BakeResult(
         path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
-        proxies=summary.proxy_count - len(riders), blendshapes=summary.shape_count, size_bytes=path.stat().st_size,
+        proxies=summary.proxy_count - len(ridden.names), blendshapes=summary.shape_count,
+        size_bytes=path.stat().st_size,
         verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
         intersections=counts.intersections,
     )  # fmt: skip

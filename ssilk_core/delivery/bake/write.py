@@ -21,6 +21,7 @@ from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
+from .riders import need_joints
 from .rollout import BakeRollout
 from .sizing import load_sized
 from .verification import verify_file
@@ -60,6 +61,8 @@ def bake(
     rollout = load_sized(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
+    if request.writes_points:
+        need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
     rollout = refined(solved(rollout, report), report)
@@ -89,7 +92,7 @@ def result_of(
         frames=summary.frame_count,
         fps=summary.fps,
         joints=summary.joint_count,
-        proxies=summary.proxy_count - len(rollout.riders),
+        proxies=summary.proxy_count - sum(rider.attachment is not None for rider in rollout.riders),
         blendshapes=summary.shape_count,
         size_bytes=path.stat().st_size,
         verification=verification,

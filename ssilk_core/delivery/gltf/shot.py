@@ -67,6 +67,7 @@ def write_glb(
     *,
     include_body: bool = True,
     riders: Sequence[Body] = (),
+    rider_shapes: Sequence[Floats | None] = (),
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: Sequence[NDArray[np.bool_]] | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -78,7 +79,8 @@ def write_glb(
     Args:
         motion: the character's motion at the shot's samples.
         poses: consecutive chunks of frames that together cover the motion.
-        riders: what rides on the garment, each bound to a joint of the deformer.
+        riders: what rides on the garment, bound to joints of the deformer.
+        rider_shapes: of each, its offsets by the deformer's blendshapes [m], shape (K, M, 3); None where it is rigid.
         hidden: from which frames of the motion on the character is hidden (True) or seen (False). Hidden, its joints
             are scaled to nothing, because plain glTF has no visibility.
         hidden_polygons: of each body, those that are left out.
@@ -105,18 +107,22 @@ def write_glb(
     joints = list(range(1, 1 + len(scene.parents)))
     glb.add("skins", {"joints": joints, "skeleton": ARMATURE, "inverseBindMatrices": glb.array(binds, "MAT4")})
     offsets = {labels.shapes[index]: deformer.shapes[index] for index in shapes}
-    drawn = [_add_mesh(glb, labels.garment, scene.garment.mesh, deformer.skin, offsets=offsets, at=weights[0])]
+    worn = scene.garment.mesh
+    drawn = [_add_mesh(glb, labels.garment, worn, deformer.skin, offsets=offsets, at=weights[0], kind=GARMENT)]
     if include_body:
         bodies = scene.character.bodies
         masks: Sequence[NDArray[np.bool_] | None] = hidden_polygons or [None] * len(bodies)
         for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
             if mask is None or not mask.all():
                 drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
-    for name, rider in zip(labels.riders, riders, strict=True):
-        drawn.append(_add_mesh(glb, name, rider.mesh, rider.skin, kind=RIDER))
+    morphed = [drawn[0]]
+    for name, rider, own in zip(labels.riders, riders, rider_shapes, strict=True):
+        moved = None if own is None else {labels.shapes[index]: own[index] for index in shapes}
+        drawn.append(_add_mesh(glb, name, rider.mesh, rider.skin, offsets=moved, at=weights[0], kind=RIDER))
+        morphed += [drawn[-1]] if moved else []
     glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
     glb.document["scene"] = 0
-    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, drawn[0])
+    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, morphed)
     timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
               "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
     glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
@@ -162,7 +168,7 @@ def _add_mesh(
     """Add a skinned mesh and its node; return the node's index.
 
     Args:
-        offsets: of each morph target [m], by name; only a garment has them, or none.
+        offsets: of each morph target [m], by name; only a garment and soft riders have them, or none.
         at: weights of the targets where no animation plays.
     """
     drawn, normals = drawn_mesh(mesh, hidden), ShapeNormals(mesh.points, mesh.faces)
@@ -176,9 +182,8 @@ def _add_mesh(
         attributes["TEXCOORD_0"] = glb.array(drawn.uvs, "VEC2", use=VERTICES)
     wide = len(points) > 2**16 - 1  # the largest number of each type means something else to graphics cards
     faces = drawn.faces.reshape(-1).astype("<u4" if wide else "<u2")
-    is_garment = offsets is not None
     primitive = {"attributes": attributes, "indices": glb.array(faces, "SCALAR", use=INDICES),
-                 "material": 0 if is_garment else 1}  # fmt: skip
+                 "material": 0 if kind == GARMENT else 1}  # fmt: skip
     item: dict[str, object] = {"name": name, "primitives": [primitive]}
     if offsets and at is not None:
         primitive["targets"] = [
@@ -187,7 +192,6 @@ def _add_mesh(
             for offset in offsets.values()
         ]  # fmt: skip
         item["weights"] = at.tolist()
-    kind = GARMENT if is_garment else kind
     item["extras"] = {"targetNames": list(offsets or ()), "kind": kind, "points": mesh.vertex_count}
     return glb.add("nodes", {"name": name, "mesh": glb.add("meshes", item), "skin": 0})
 
@@ -213,7 +217,7 @@ def _animate(
     fps: float,
     samples: tuple[Floats, Floats, Floats],
     hidden: Sequence[tuple[int, bool]],
-    garment: int,
+    morphed: Sequence[int],
 ) -> None:
     """Add one animation of what moves, and of the first joint's path, so that it always lasts as long."""
     rotations, translations, weights = samples
@@ -231,7 +235,8 @@ def _animate(
         if joint == 0 or _moves(translations[:, joint]):
             add(1 + joint, "translation", translations[:, joint], "VEC3")
     if weights.shape[1]:
-        add(garment, "weights", weights.reshape(-1), "SCALAR")
+        for node in morphed:
+            add(node, "weights", weights.reshape(-1), "SCALAR")
     if hidden:
         when = glb.array(np.array([frame / fps for frame, _ in hidden], dtype=np.float32), "SCALAR", bounds=True)
         scales = np.array([[0.0 if gone else 1.0] * 3 for _, gone in hidden], dtype=np.float32)

@@ -13,7 +13,7 @@ from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.scene.assets import Mesh
 
-from ..names import RIDE_VERTICES, RIDES_ON, SKEL
+from ..names import RIDE_SOFT, RIDE_VERTICES, RIDES_ON, SKEL
 from ..opening.stage import (
     PRIMS,
     StageLike,
@@ -42,12 +42,14 @@ class SaidRider:
         name: of its prim.
         meshes: at the bind pose, in the core's bind space [m].
         vertices: those of the garment that carry it; None where these are to be found.
+        soft: it goes with the cloth beneath each of its points.
     """
 
     path: str
     name: str
     meshes: tuple[Mesh, ...]
     vertices: tuple[int, ...] | None
+    soft: bool
 
 
 @needs_whole_files
@@ -102,7 +104,7 @@ def _read(prim: Usd.Prim, stage: Usd.Stage, root: str | None, report: Reporter) 
     if not meshes:
         fail(where, "it rides on a garment and has no visible mesh", "one is needed", "take ssilk:ridesOn away")
     if worn := [each for each in meshes if is_garment(each)]:
-        fail(where, f"{listed(worn)} is a garment", "what rides on a garment is rigid", "take ssilk:ridesOn away")
+        fail(where, f"{listed(worn)} is a garment", "a garment moves by itself", "take ssilk:ridesOn away")
     if skinned := [each for each in meshes if inherited(each, SKEL[0]) is not None]:
         todo = "remove its joint indices and weights, or take ssilk:ridesOn away"
         fail(where, f"{listed(skinned)} is skinned itself", "what rides on a garment has no influences", todo)
@@ -116,8 +118,11 @@ def _read(prim: Usd.Prim, stage: Usd.Stage, root: str | None, report: Reporter) 
         if named.dtype.kind not in "iu":
             fail(where, f"{RIDE_VERTICES} is {str(named.tolist())[:40]}", "three whole numbers are needed")
         vertices = tuple(int(each) for each in named)
+    soft = value(prim, RIDE_SOFT) is True
+    if soft and vertices is not None:
+        fail(where, f"it has {RIDE_SOFT} and {RIDE_VERTICES}", "three vertices carry what is rigid", "remove one")
     read = tuple(read_mesh(each, to_core @ world_matrix(each)) for each in meshes)
-    return SaidRider(where, prim.GetName(), read, vertices)
+    return SaidRider(where, prim.GetName(), read, vertices, soft)
 
 
 def _moves(prim: Usd.Prim, root: Usd.Prim) -> bool:

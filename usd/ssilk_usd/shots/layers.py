@@ -34,7 +34,7 @@ from ..opening.stage import open_stage
 from ..reading.mesh import is_body
 from ..units import StageUnits
 from ..writing.asset_info import AssetInfo, author_asset_info
-from ..writing.author import Asset, define_asset, define_blendshapes, extent_array
+from ..writing.author import Asset, define_asset, define_blendshapes, define_rider_shapes, extent_array
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import new_stage, save
 from .layers_facts import AssetFacts, asset_facts
@@ -188,9 +188,11 @@ def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Ve
     with _variant(root, DEFORMATION, "rest"):
         UsdSkel.BindingAPI(root).CreateAnimationSourceRel().SetTargets([])
     with _variant(root, QUALITY, "skin"):
-        binding = UsdSkel.BindingAPI(stage.OverridePrim(asset.garment))
-        binding.CreateBlendShapesAttr().Block()
-        binding.CreateBlendShapeTargetsRel().SetTargets([])
+        soft = [path for path, shapes in zip(asset.rider_paths, asset.rider_shapes) if shapes is not None]
+        for path in (asset.garment, *soft):
+            binding = UsdSkel.BindingAPI(stage.OverridePrim(path))
+            binding.CreateBlendShapesAttr().Block()
+            binding.CreateBlendShapeTargetsRel().SetTargets([])
     _variant(root, DEFORMATION, "skel")
     _variant(root, QUALITY, "full")
 
@@ -214,6 +216,7 @@ def write_animation(
     start: float = 0.0,
     samples_per_frame: int = 1,
     lean: bool = True,
+    riders: RiderJoints | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     points: bool = False,
@@ -227,6 +230,7 @@ def write_animation(
     Args:
         motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
         lean: see `samples.Samples`.
+        riders: what rides on the garment, as its asset has it.
         hidden_polygons: polygons of the bodies that this shot hides, in a variant.
         points: offer the point cache that `write_points` writes as a variant.
         path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
@@ -239,6 +243,7 @@ def write_animation(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         _define_animation(stage, asset, layout, deformer)
+        asset = replace(asset, rider_shapes=riders.shapes if riders else asset.rider_shapes)
         asset = _define_own_shapes(stage, asset, deformer, units)
         set_metadata(stage, span, units)
         if lean:
@@ -288,6 +293,9 @@ def _define_own_shapes(stage: Usd.Stage, asset: Asset, deformer: Deformer, units
     with _variant(stage.GetPrimAtPath(asset.root), QUALITY, "full"):
         mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
         define_blendshapes(mesh, names, deformer.shapes[own], units, before=before)
+        for path, offsets in zip(asset.rider_paths, asset.rider_shapes):
+            rider = UsdGeom.Mesh(stage.OverridePrim(path))
+            define_rider_shapes(rider, offsets, own, units, before=asset.shapes)
     animation = UsdSkel.Animation(stage.GetPrimAtPath(asset.animation))
     animation.CreateBlendShapesAttr(Vt.TokenArray([*before, *names]))
     animation.CreateBlendShapeWeightsAttr()

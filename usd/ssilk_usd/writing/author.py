@@ -41,7 +41,8 @@ class Asset:
         garment: the garment's mesh.
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
         bodies, body_paths: the bodies whose meshes were written, and the prims of these.
-        riders: likewise what rides on the garment.
+        riders, rider_paths: likewise what rides on the garment.
+        rider_shapes: of each rider, offsets by the deformer's blendshapes [m], shape (K, M, 3), or None.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
         left_out: what the meshes lose of their looks, and the character of its parts, for messages; empty where
             nothing.
@@ -55,6 +56,8 @@ class Asset:
     shapes: Ints
     left_out: str = ""
     riders: tuple[Body, ...] = ()
+    rider_paths: tuple[Sdf.Path, ...] = ()
+    rider_shapes: tuple[Floats | None, ...] = ()
 
 
 def define_asset(
@@ -106,9 +109,11 @@ def define_asset(
         bind_skin(mesh, body.skin, skeleton)
         if body.purpose != UsdGeom.Tokens.default_:
             mesh.CreatePurposeAttr(body.purpose)
-    for path in rider_paths:
-        stage.GetPrimAtPath(path).CreateRelationship(RIDES_ON, False).SetTargets([paths[2]])
-    if riders:
+    for path, offsets in zip(rider_paths, riders.shapes if riders else ()):
+        prim = stage.GetPrimAtPath(path)
+        prim.CreateRelationship(RIDES_ON, False).SetTargets([paths[2]])
+        define_rider_shapes(UsdGeom.Mesh(prim), offsets, shapes, units)
+    if riders and riders.names:
         _author_names(garment.GetPrim(), RIDER_JOINTS, riders.names)
     written = [scene.garment.mesh, *(body.mesh for body in (*bodies, *ridden))]
     source = split_location(scene.character.path)[0]
@@ -117,7 +122,10 @@ def define_asset(
         left.add(root.GetPrim().GetName(), *left_behind(scene.character, written))
     if hidden_polygons is not None:
         hide_polygons(stage, root.GetPath(), body_paths, [body.mesh for body in bodies], hidden_polygons)
-    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(body_paths), shapes, str(left), ridden)
+    return Asset(
+        root.GetPath(), paths[2], paths[1], bodies, tuple(body_paths), shapes, str(left), ridden,
+        tuple(rider_paths), riders.shapes if riders else (),
+    )  # fmt: skip
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
@@ -305,3 +313,19 @@ def define_blendshapes(
     names = [*before, *names]
     binding.CreateBlendShapesAttr(Vt.TokenArray(names))
     binding.CreateBlendShapeTargetsRel().SetTargets([path.AppendChild(name) for name in names])
+
+
+def define_rider_shapes(
+    mesh: UsdGeom.Mesh, offsets: Floats | None, shapes: Ints, units: StageUnits, *, before: Sequence[int] | Ints = ()
+) -> None:
+    """Define those blendshapes of a rider that move it, of some of its garment's.
+
+    Args:
+        offsets: by all of the garment's blendshapes [m], shape (K, M, 3); None where it is rigid.
+        before: those of the garment that were defined already.
+    """
+    if offsets is None:
+        return
+    own, there = ([index for index in each if offsets[index].any()] for each in (shapes, before))
+    names = [shape_name(index) for index in own]
+    define_blendshapes(mesh, names, offsets[own], units, before=[shape_name(index) for index in there])
