@@ -184,6 +184,7 @@ class RiderJoints:
                 rig.skin,
             )
             self.deformer = replace(deformer, scene=replace(scene, rig=rig))
+        self._feet: dict[Mesh, tuple[Ints, Floats]] = {}  # of soft meshes: corners and shares, shapes (M, 3)
         joints = iter(range(len(scene.joint_names), len(self.deformer.scene.joint_names)))
         bound = [each for rider in riders for each in self._bound(rider, joints, influences)]
         self.bodies = tuple(body for body, _ in bound)
@@ -206,6 +207,7 @@ class RiderJoints:
         for mesh in rider.meshes:
             faces, shares, _ = _feet(mesh.points, cloth)
             corners = cloth.faces[faces]
+            self._feet[mesh] = corners, shares
             mixed = SkinWeights.from_dense(mesh.path, np.einsum("mn,mnj->mj", shares, weights[corners]), influences)
             yield Body(mesh, mixed), np.einsum("mn,kmnc->kmc", shares, self._own.shapes[:, corners])
 
@@ -247,7 +249,8 @@ class RiderJoints:
         rigid_rests, cloth = iter(self._rest), self._own.scene.garment.mesh
         for rider in self._all:
             if rider.attachment is None:
-                yield from ((_on_cloth(mesh.points, cloth, garment), np.inf) for mesh in rider.meshes)
+                for mesh in rider.meshes:
+                    yield _on_cloth(mesh.points, *self._feet[mesh], cloth.points, garment), np.inf
                 continue
             attachment, rest = rider.attachment, next(rigid_rests)
             moved = attachment.transforms(rest, garment[attachment.vertices][None])[0]
@@ -286,12 +289,16 @@ def _joint_paths(riders: Sequence[Rider], parents: Sequence[int], joints: Sequen
     return tuple(found)
 
 
-def _on_cloth(points: Floats, cloth: Mesh, posed: Floats) -> Floats:
-    """Return where points (M, 3) at rest are on posed cloth (V, 3): each with its triangle, turned as that is."""
-    faces, shares, _ = _feet(points, cloth)
-    before, after = cloth.points[cloth.faces[faces]], posed[cloth.faces[faces]]
+def _on_cloth(points: Floats, corners: Ints, shares: Floats, rest: Floats, posed: Floats) -> Floats:
+    """Return where points (M, 3) at rest are on posed cloth: each with its triangle, turned as that is.
+
+    Args:
+        corners, shares: the triangle of each point and the barycentric coordinates of its foot, shapes (M, 3).
+        rest, posed: vertices of the cloth, shape (V, 3).
+    """
+    before, after = rest[corners], posed[corners]
     turned = np.nan_to_num(_edge_frames(after) @ _edge_frames(before).swapaxes(1, 2))
-    feet, moved = (np.einsum("mn,mnc->mc", shares, corners) for corners in (before, after))
+    feet, moved = (np.einsum("mn,mnc->mc", shares, each) for each in (before, after))
     return moved + (turned @ (points - feet)[..., None])[..., 0]
 
 

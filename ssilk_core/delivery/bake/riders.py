@@ -96,4 +96,4 @@ def verify_riders(shot: RiddenShot, times: Sequence[float], riders: RiderJoints,
                 soft[name] = max(soft.get(name, (0.0, time)), (off, time))
     for name, (off, time) in soft.items():
         text = f"{name} is soft, and at most {1000 * off:.2g} mm off its cloth (time code {time:g})"
-        report(Message(f"{shot.name}: {text}", "info" if off <= SOFT else "warning"))
+        report(Message(text, "info" if off <= SOFT else "warning"))
