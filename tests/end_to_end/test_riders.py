@@ -222,6 +222,26 @@ def test_riders_are_on_their_cloth_whatever_moves_it(hero, more):
     assert off_in(Shot("shot.usdc")) < ROUNDED
 
 
+def test_several_meshes_are_one_rigid_thing_and_rigging_leaves_riders(hero):
+    stage = Usd.Stage.Open("hero.usda")
+    UsdGeom.Xform.Define(stage, "/Hero/Clasp").GetPrim().CreateRelationship("ssilk:ridesOn").SetTargets(
+        ["/Hero/Skirt"]
+    )
+    for number in range(2):
+        part, _ = disc_on(skirt_of(), FACES[number], SHARES[number], 0.01)
+        add_rider(stage, f"/Hero/Clasp/Part{number}", part).GetRelationship("ssilk:ridesOn").SetTargets([])
+    UsdGeom.Xformable(stage.GetPrimAtPath("/Hero/Clasp")).AddTranslateOp().Set((0.001, 0.002, 0.003))
+    stage.GetRootLayer().Save()
+    assert run("rig hero.usda --garment Skirt --proxies 4 -o clasped.usda") == 0
+    assert run("bake model.safetensors --stage clasped.usda --motion clip.usda -o shot.usdc") == 0
+    shot = Usd.Stage.Open("shot.usdc")
+    names = UsdSkel.Skeleton(shot.GetPrimAtPath("/Hero/Skeleton")).GetJointsAttr().Get()
+    carried = [
+        UsdSkel.BindingAPI(shot.GetPrimAtPath(f"/Hero/Part{each}")).GetJointIndicesAttr().Get() for each in (0, 1)
+    ]
+    assert {names[index].rpartition("/")[2] for indices in carried for index in indices} == {"Clasp"}
+
+
 def test_riders_are_on_cloth_that_was_simulated(hero):
     # It is stretched, by which the middle of what a button touches leaves the point beneath its own middle.
     assert run("simulate worn.usda --motion clip.usda -o shot.usdc --range 0-3 --garment Skirt") == 0
