@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..scene.garment import unplayable_here
-from ..scene.riders import attach
+from ..scene.riders import attach, vertices_beneath
 from .reporting import ReportingOperator
 
 
@@ -26,8 +26,9 @@ class AttachToCloth(ReportingOperator, bpy.types.Operator):
 
     def apply(self, context: bpy.types.Context) -> str:
         riders, garment = _riders(context), context.object
-        for rider in riders:
-            attach(rider, garment)
+        found = [vertices_beneath(rider, garment) for rider in riders]  # of all, before one is changed
+        for rider, vertices in zip(riders, found):
+            attach(rider, garment, vertices)
         names = ", ".join(f"'{rider.name}'" for rider in riders)
         return f"{names} {'rides' if len(riders) == 1 else 'ride'} on '{garment.name}'."
 

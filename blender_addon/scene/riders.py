@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.riders import Attachment, triangle_beneath
 
@@ -34,8 +35,8 @@ def with_parts(riders: list[bpy.types.Object]) -> list[bpy.types.Object]:
     return [part for rider in riders for part in _meshes(rider)]
 
 
-def attach(thing: bpy.types.Object, garment: bpy.types.Object) -> None:
-    """Parent an object to the triangle of a garment beneath it, both as they are shown; it stays where it is.
+def vertices_beneath(thing: bpy.types.Object, garment: bpy.types.Object) -> list[int]:
+    """Return the vertices of the triangle of a garment beneath an object, both as they are shown.
 
     Raises:
         SetupError: it has no mesh, is deformed or a garment itself, holds the garment, or is far from the cloth.
@@ -48,9 +49,18 @@ def attach(thing: bpy.types.Object, garment: bpy.types.Object) -> None:
     units, faces = scene_units(), triangles_of(garment.data)
     cloth = Mesh(f"'{garment.name}'", units.points_to_core(cage_points(garment, depsgraph)), faces)
     points = [_shown_points(part, depsgraph) for part in parts]
-    corners = triangle_beneath(units.points_to_core(np.concatenate(points)), cloth, f"'{thing.name}'")
+    shown = units.points_to_core(np.concatenate(points))
+    try:
+        return list(triangle_beneath(shown, cloth, f"'{thing.name}'").tolist())
+    except SsilkError as error:
+        todo = "move it onto the cloth, or parent it to three vertices (Object > Parent > Vertex (Triangle))"
+        raise SetupError(f"'{thing.name}': {error.found}; {error.allowed}; {todo}.") from error
+
+
+def attach(thing: bpy.types.Object, garment: bpy.types.Object, vertices: list[int]) -> None:
+    """Parent an object to three vertices of a garment; it stays where it is."""
     place = thing.matrix_world.copy()
-    thing.parent, thing.parent_type, thing.parent_vertices = garment, TRIANGLE, corners.tolist()
+    thing.parent, thing.parent_type, thing.parent_vertices = garment, TRIANGLE, vertices
     thing.matrix_parent_inverse = Matrix()
     bpy.context.view_layer.update()
     carrier = thing.matrix_world @ thing.matrix_basis.inverted_safe()

@@ -66,7 +66,7 @@ class Attachment:
         found = np.array(vertices)
         if found.shape != (3,) or len(set(vertices)) != 3 or not ((found >= 0) & (found < mesh.vertex_count)).all():
             text = f"three different vertices of {mesh.path} are needed, from 0 to {mesh.vertex_count - 1}"
-            fail(path, f"it rides on the vertices {', '.join(map(str, vertices)) or 'none'}", text)
+            fail(path, f"it rides on the vertices {str(list(vertices))[1:60].rstrip(']') or 'none'}", text)
         sides = np.diff(mesh.points[found], axis=0)
         if not np.linalg.norm(np.cross(*sides)) > SLIVER * (sides**2).sum():
             allowed = "three vertices that span a triangle are needed"

@@ -162,8 +162,17 @@ def test_what_cannot_ride_is_refused_in_one_sentence(ready, trained):
         return str(error.value)
 
     far = brooch(ready, trained, away=0.2)
-    assert re.search(r"'Brooch': it is 18\d mm away from 'Skirt'; a rider lies within 50 mm", refused(far))
+    assert re.search(
+        r"'Brooch': it is 18\d mm away from 'Skirt'; a rider lies within 50 mm.* three vertices", refused(far)
+    )
     assert "'Pillar' is moved by an Armature modifier" in refused(ready.data.objects["Pillar"])
+    near = brooch(ready, trained, name="Near")
+    activate(ready, trained)
+    far.select_set(True)
+    near.select_set(True)
+    with pytest.raises(RuntimeError, match="'Brooch': it is"):
+        ready.ops.ssilk.attach_to_cloth()
+    assert near.parent is None  # all or none
     empty = ready.data.objects.new("Empty", None)
     ready.context.collection.objects.link(empty)
     assert "'Empty' has no mesh" in refused(empty)
