@@ -39,7 +39,8 @@ from ssilk_core.events import silent
 
 CALLS = "openat,newfstatat,statx,access,faccessat2,readlink,rename,unlink,mkdir,chmod,getdents64,fsync"
 READY = "import os, signal, sys, torch, ssilk_core.cli; "
-READY += "import ssilk_usd.shots.layers, ssilk_usd.checking.shot, ssilk_usd.reading.motion; "
+READY += "import ssilk_usd.shots.layers_asset, ssilk_usd.shots.layers_stage, "
+READY += "ssilk_usd.checking.shot, ssilk_usd.reading.motion; "
 WORK = READY + "os.kill(os.getpid(), signal.SIGSTOP); sys.exit(ssilk_core.cli.main(sys.argv[1:]))"
 JOB_TASKS = 50_000  # of a large job, whose file is written to see how large it is
 

@@ -11,7 +11,7 @@ EXIT_INTERNAL = 1
 EXIT_BAD_INPUT = 2
 EXIT_VERIFICATION = 3
 EXIT_TASKS = 4
-EXIT_WORSE = 5  # a model was trained and is worse than linear blend skinning
+EXIT_WORSE = 5  # a model was trained, and is worse than linear blend skinning or has not learned to move
 EXIT_INTERRUPTED = 130
 
 

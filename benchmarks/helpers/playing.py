@@ -70,6 +70,7 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
             player.file.joints,
             lookback,
             player.file.config.descriptors,
+            player.proximity,
         )
         monitor.lap(DESCRIPTORS)
         course = player.stepper.prepare(player.quasi_static(given.static), given, before)

@@ -453,8 +453,8 @@ def _times() -> tuple[int, int, float, float]:
 def _rolled(player: Player, motion: Motion, first: int, stop: int, step: int) -> Iterator[GarmentPose]:
     """Yield the network's poses at frames first, first + step, ..., below stop; the motion is straight in between."""
     seen = slice(first, stop, step)
-    gravity = None if motion.gravity is None else motion.gravity[seen]
-    part = Motion(motion.path, motion.fps / step, motion.rotations[seen], motion.translations[seen], gravity=gravity)
+    part = motion.picked(seen)
+    part = replace(part, fps=motion.fps / step, start=0.0)
     return player.play(part, pre_roll=PRE_ROLL, block=BLOCK).poses()
 
 

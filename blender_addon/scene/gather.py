@@ -28,6 +28,7 @@ from .garment import (
     rest_world,
 )
 from .masks import unmasked
+from .meshes import rendered_map
 from .modifiers import need_plain_modifiers, reshapes
 from .objects import scene_units
 from .shapes import worn_points
@@ -242,7 +243,7 @@ def read_mesh(thing: bpy.types.Object, mesh: bpy.types.Mesh, path: str, points: 
     if np.linalg.det(world[:3, :3]) < 0:  # mirrored: its faces would turn the other way
         faces = faces[:, ::-1]
         corners = np.repeat(2 * (np.cumsum(counts) - counts) + counts - 1, counts) - corners
-    layer = mesh.uv_layers.active
+    layer = rendered_map(mesh)
     return Mesh(
         path,
         scene_units().points_to_core(points),

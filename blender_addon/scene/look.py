@@ -10,6 +10,7 @@ import numpy as np
 
 from .armature import leader_of
 from .garment import FOLLOWING, is_garment
+from .meshes import rendered_map
 from .modifiers import HARMLESS, bones_place, reshapes
 
 DRAWN = ("MESH", "CURVE", "CURVES", "SURFACE", "META", "FONT", "VOLUME")
@@ -27,7 +28,7 @@ def lost_looks(things: Iterable[bpy.types.Object]) -> list[str]:
 def _lost(thing: bpy.types.Object) -> list[str]:
     mesh = thing.data
     materials = {slot.material.name: None for slot in thing.material_slots if slot.material}
-    maps = [layer.name for layer in mesh.uv_layers if layer != mesh.uv_layers.active]
+    maps = [layer.name for layer in mesh.uv_layers if layer != rendered_map(mesh)]
     colours = [each.name for each in mesh.color_attributes if not each.name.startswith("SSILK")]  # heat
     known = {*OWN, *mesh.uv_layers.keys(), *mesh.color_attributes.keys()}
     others = [each.name for each in mesh.attributes if each.name not in known and not _is_ours(each.name)]

@@ -54,6 +54,11 @@ def world_points(thing: bpy.types.Object) -> np.ndarray:
     return points.reshape(-1, 3) @ world[:3, :3].T + world[:3, 3]
 
 
+def rendered_map(mesh: bpy.types.Mesh) -> bpy.types.MeshUVLoopLayer | None:
+    """Return the UV map that renders look up textures by; the active one is only what an artist edits."""
+    return next((layer for layer in mesh.uv_layers if layer.active_render), mesh.uv_layers.active)
+
+
 PREFIX = "SSILK "  # begins the names of shape keys that were baked
 BASIS = "ssilk_basis"  # custom property of shape keys whose basis came with a bake
 

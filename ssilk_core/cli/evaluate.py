@@ -10,8 +10,9 @@ about states of rollouts: a disturbance of the two states before a step should n
 map from these to the next two should stay under one. --no-probes leaves them out.
 --solver continues the first two states of each clip, and of its most violent second, with the reference simulator. It
 tells how far the garment is from that after 5, 10, 30 and 60 frames, and what single steps from its own past miss.
---output writes each row when it is measured, and says that it is unfinished until the last. The same command, given
-again, goes on from there. A file of other models, motions or settings is begun anew.
+--output writes each row when it is measured, and says that it is unfinished until the last. What is measured of the
+next rows is kept beside it, in a file that ends in .parts, every five seconds. The same command, given again, goes on
+from there, to the same figures. Files of other models, motions or settings are begun anew.
 """
 
 from __future__ import annotations
@@ -124,16 +125,17 @@ def evaluated(
     opened, listed = [opener(path, device) for path in options.models], _listed(options)
     results = _results(options, asked, opened, listed)
     known = results.known(report)
-    for models in _by_garment(opened):
+    for number, models in enumerate(_by_garment(opened)):
         dressed, methods = _dressed(models[0].file, options, device, exact), _methods(models)
         playlist = _playlist(options, dressed, listed)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
         try:
-            for row in evaluate(dressed, methods, playlist, asked, report, known[len(results.rows) :]):
+            before, kept = known[len(results.rows) :], results.parts(number)
+            for row in evaluate(dressed, methods, playlist, asked, report, before, kept):
                 results.add(paths.get(row.method), row)
         except KeyboardInterrupt:
-            results.kept.tell_kept(len(results.rows), report)
+            results.interrupted(report)
             raise
     results.finish()
     return results

@@ -38,7 +38,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     file = load_model(options.model)
     model = network(file)
     export_onnx(model, output)
-    static, rates = descriptor_sizes(file.scene, file.joints, file.config.descriptors)
+    static, rates = descriptor_sizes(file.scene, file.joints, file.config)
     report(
         Result(
             "export",

@@ -375,11 +375,11 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
 
 
 def tell_shapes(options: argparse.Namespace, motions: Iterable[Motion], report: Reporter) -> None:
-    """Warn of motions that change the character's shape, in which cloth does not meet it; options as `load_scene`."""
-    from ssilk_usd.reading.shapes import tell_animated_shapes
+    """Warn of motions that show the character's meshes otherwise than its stage; options as `load_scene`."""
+    from ssilk_usd.reading.shown import tell_shown_otherwise
 
     paths = [motion.path for motion in motions]
-    tell_animated_shapes(options.stage, paths, report, root=options.root, garment=options.garment)
+    tell_shown_otherwise(options.stage, paths, report, root=options.root, garment=options.garment)
 
 
 def load_scene(

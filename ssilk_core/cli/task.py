@@ -10,7 +10,6 @@ the job, --check, fails instead.
 from __future__ import annotations
 
 import argparse
-import signal
 from pathlib import Path
 
 from ..delivery.farm.job import read_job
@@ -34,7 +33,6 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake or check."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # farms cancel by it: stop as on Ctrl-C
     report = OpenJdReporter() if options.openjd else report
     if options.check:
         check_tasks(read_job(options.job, options.path_mapping), options.output, report)

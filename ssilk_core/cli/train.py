@@ -5,7 +5,8 @@ Where the stage lacks weights, classes or a proxy rig, they are made as 'ssilk r
 Ctrl-C stops the training after the current step, or inside one that takes longer than ten seconds, and keeps the best
 model and the state. --resume continues from there. A warning at the end says where few of the preset's iterations
 were done, or where skin shows, and how to go on. A model that is worse than linear blend skinning on the validation
-motions is kept and warned of, and the exit code is 5. torchrun ends with its own code 1 then, and names this one.
+motions is kept and warned of, and so is one whose minutes ended before dynamic training began; the exit code is 5.
+torchrun ends with its own code 1 then, and names this one.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, TextReporter, silent
 from ..network.settings import ModelConfig, apply_overrides, setting_names
+from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
 from . import options as shared
@@ -52,7 +54,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         type=shared.NumberRange(1e-3, 1e6),
         metavar="M",
         help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
-        "schedule is scaled to the number that fits; one seed gives one model only for one such number",
+        "schedule is scaled to the number that fits; one seed gives one model only for one such number. With "
+        "--resume, they are those of the whole run: what it has had counts",
     )
     onward = verb.add_mutually_exclusive_group()
     onward.add_argument(
@@ -121,6 +124,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             {
                 "model": str(options.output),
                 "iterations": trained.iterations,
+                "the model is of iteration": trained.model_iteration,
                 "total [J]": round(trained.score.total, 5),
                 "linear blend skinning [J]": round(trained.lbs.total, 5),
                 ("lower by" if share >= 0 else "higher by"): percent(share),
@@ -137,10 +141,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report(Message(f"stopped at iteration {trained.iterations}; --resume continues from there."))
         return EXIT_INTERRUPTED
     done, asked = trained.iterations, job.train.iterations
-    lacking = shortcomings(str(options.output), trained.score, done, asked, trained.seconds)
+    lacking = shortcomings(str(options.output), trained.score, done, asked, trained.seconds, trained.moves)
     if lacking and job.is_trainable and group.size == 1:  # several processes take no minutes
         report(lacking)
-    return EXIT_WORSE if worse else EXIT_OK
+    return EXIT_OK if trained.moves and not worse else EXIT_WORSE
 
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
@@ -160,8 +164,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     scene = shared.load_scene(options, report)
     fabric = shared.fabric(options, scene.garment, report)
     if fabric.friction:
-        words = f"friction = {fabric.friction:g}: 'ssilk simulate' knows it; the network is trained without friction"
-        report(Message(words, "warning"))
+        report(Message(f"friction = {fabric.friction:g} is left out; {FRICTION}", "warning"))
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)

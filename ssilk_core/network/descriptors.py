@@ -14,7 +14,8 @@ descriptors from NCS, in which gravity stands for the root's rotation, as it doe
 
 Gravity also stands for wind. Drag is linear in the velocity of the air relative to the cloth, so that an even wind
 pulls on each vertex with the same acceleration, whatever it does. `Motion.gravity` holds the sum of both. The network
-sees it in units of the usual one, as `seen_gravity` compresses it.
+sees it in units of the usual one, as `seen_gravity` compresses it. How near colliders are comes first
+(`network.proximity`).
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ class PoseFeatures:
         down: world-to-joint rotations, which bring gravity into each joint's frame, shape (F, J', 3, 3).
         gravity: as the network sees it, shape (F, 3); None for the usual one, (0, -1, 0).
         earlier: likewise of the two frames before, shape (F, 2 J', 3, 3); none (F, 0, 3, 3) in relative ones.
+        proximity: to colliders, in the root's frame, shape (F, 3 M); None where none are looked for.
     """
 
     static: Floats
@@ -53,6 +55,7 @@ class PoseFeatures:
     down: Floats
     earlier: Floats
     gravity: Floats | None = None
+    proximity: Floats | None = None
 
 
 def seen_gravity(gravity: Floats) -> Floats:
@@ -108,12 +111,13 @@ def pose_features(
     local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
     static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
     gravity = None if motion.gravity is None else seen_gravity(motion.gravity)
+    near = None if motion.proximity is None else (motion.proximity @ root).reshape(len(local), -1)
     if kind == "absolute":
         axes, places = six_d(root), world[:, centre, :3, 3]
         past = [_past(static, steps) for steps in (1, 2)]
         seen = [_past(values, steps) for values in (axes, places) for steps in (0, 1, 2)]
         earlier = np.concatenate([_past(down, steps) for steps in (1, 2)], axis=1)
-        return PoseFeatures(static, np.concatenate([*past, *seen], axis=1), down, earlier, gravity)
+        return PoseFeatures(static, np.concatenate([*past, *seen], axis=1), down, earlier, gravity, near)
     rate, change = _differences(static, motion.fps)
     turn = [
         six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
@@ -121,7 +125,7 @@ def pose_features(
     acceleration = _differences(world[..., :3, 3], motion.fps)[1] / (RATE_TIME**2 * GRAVITY)
     acceleration = np.einsum("fba,fjb->fja", root, acceleration).reshape(len(local), -1)
     dynamic = np.concatenate([rate, change, *turn, acceleration], axis=1)
-    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity)
+    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity, near)
 
 
 def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:

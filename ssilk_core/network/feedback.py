@@ -29,21 +29,30 @@ UNIT, LIMIT = 0.05, 4.0  # [m] of a feature of one, and where features saturate
 
 
 def feedback_vertices(scene: Scene, config: ModelConfig) -> Ints:
-    """Return the vertices that S sees, spread over the cloth that is not pinned, shape (M,); empty without S.
+    """Return the vertices that S sees, shape (M,); empty without S."""
+    return spread_vertices(scene, config.feedback_points if SCHEMES[config.scheme].states else 0)
+
+
+def spread_vertices(scene: Scene, count: int) -> Ints:
+    """Return so many vertices, or all, spread over the cloth that is not pinned.
 
     The lowest one comes first, then always the one furthest from those before. Sums are taken in one order on every
     machine, so that each finds the same vertices.
     """
     free = np.flatnonzero(scene.classes != PINNED)
-    count = min(config.feedback_points, len(free)) if SCHEMES[config.scheme].states else 0
-    points = scene.garment.mesh.points[free]
+    return free[spread_rows(scene.garment.mesh.points[free], count)]
+
+
+def spread_rows(points: Floats, count: int) -> Ints:
+    """Return which of points (P, 3) `spread_vertices` chooses."""
+    count = min(count, len(points))
     chosen: list[int] = []
-    nearest = np.full(len(free), np.inf)
+    nearest = np.full(len(points), np.inf)
     while len(chosen) < count:
         chosen.append(int(nearest.argmax()) if chosen else int(points[:, 1].argmin()))
         x, y, z = (points - points[chosen[-1]]).T
         nearest = np.minimum(nearest, x * x + y * y + z * z)
-    return free[chosen]
+    return np.array(chosen, dtype=np.int64)
 
 
 def bends(origins: Floats) -> Floats:

@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
 
-from ..scene.assets import PINNED, Ints, Scene
+from ..scene.assets import PINNED, Floats, Ints, Scene
 from .descriptors import VECTORS, inner_joints
 from .feedback import feedback_size
+from .proximity import proximity_size
 from .schemes import SCHEMES
 from .settings import ModelConfig
 
@@ -24,7 +26,7 @@ OUTPUT_SCALE = np.array([1, 1, 1, 1, 1, 1, 0.1, 0.1, 0.1], dtype=np.float32)
 def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     """Return the shape of each parameter of `model.network.GarmentModel` by name."""
     free, proxies = int((scene.classes != PINNED).sum()), scene.rig.proxy_count
-    static, dynamic = descriptor_sizes(scene, joints, config.descriptors)
+    static, dynamic = descriptor_sizes(scene, joints, config)
     scheme, z, widths = SCHEMES[config.scheme], config.latent, config.widths
     inputs = scheme.states * z + static + dynamic + feedback_size(scene, config)
     reduced: Shapes = {"decoder.readout": (config.shapes, config.activation_count), "decoder.offset": (free, 3)}
@@ -39,12 +41,25 @@ def parameter_shapes(scene: Scene, config: ModelConfig, joints: Ints) -> Shapes:
     }
 
 
-def descriptor_sizes(scene: Scene, joints: Ints, kind: str = "relative") -> tuple[int, int]:
-    """Return the number of static features, including gravity, and that of dynamic features of a kind."""
+def descriptor_sizes(scene: Scene, joints: Ints, config: ModelConfig) -> tuple[int, int]:
+    """Return the number of static features, gravity and proximity included, and that of dynamic features."""
     inner = len(inner_joints(scene.character.skeleton, joints))
-    if kind == "absolute":
-        return 6 * inner + 3 * len(joints), 2 * (6 * inner + 3 * len(joints)) + 3 * VECTORS
-    return 6 * inner + 3 * len(joints), 12 * inner + 12 + 3 * len(joints)
+    posed = 6 * inner + 3 * len(joints)
+    dynamic = 2 * posed + 3 * VECTORS if config.descriptors == "absolute" else 12 * inner + 12 + 3 * len(joints)
+    return proximity_size(scene, config) + posed, dynamic
+
+
+def seeing_colliders(parameters: Mapping[str, Floats], config: ModelConfig, features: int) -> dict[str, Floats]:
+    """Return the parameters of a network that sees none with `features` of proximity, which count nothing yet."""
+    found = dict(parameters)
+    for name, before in (
+        ("initialiser.0.weight", 0),
+        ("stepper.0.weight", SCHEMES[config.scheme].states * config.latent),
+    ):
+        if name in found:
+            blank = np.zeros((len(found[name]), features), found[name].dtype)
+            found[name] = np.concatenate([found[name][:, :before], blank, found[name][:, before:]], axis=1)
+    return found
 
 
 def _layers(name: str, sizes: tuple[int, ...], bias: bool = True) -> Shapes:

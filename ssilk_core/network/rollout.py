@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from ..errors import fail
-from ..physics.constants import GRAVITY
 from ..scene.assets import Floats, GarmentPose, Motion
 from ..scene.kinematics import frames_at, motion_transforms, resample, run_up, skinning_matrices, split_at_cuts
 from .descriptors import pose_features
@@ -92,8 +91,8 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Rollo
 
 def _is_at_rest(seen: Motion, state: list[Tensor]) -> bool:
     """Return whether a character holds still in all frames of `seen`, and the garment in the last of `state`."""
-    felt = [] if seen.gravity is None else [seen.gravity / GRAVITY]
-    held = max(np.ptp(v, axis=0).max() for v in (seen.rotations, seen.translations, *felt)) < STILL_THRESHOLD
+    given = (seen.rotations, seen.translations, *seen.felt.values())
+    held = max(np.ptp(values, axis=0).max() for values in given) < STILL_THRESHOLD
     return len(state) == HISTORY and held and bool((state[-1] - state[-2]).abs().max() < REST_THRESHOLD)
 
 

@@ -12,6 +12,7 @@ from .schemes import need_scheme
 DESCRIPTORS = ("relative", "absolute")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
+PROXIMITY_POINTS = 24  # of networks that see colliders, where settings name no number
 STRONGEST_PULL = 4.0  # [g] of winds in training, beside gravity; the usual fabric feels it at 20 m/s
 
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.
@@ -51,6 +52,8 @@ class ModelConfig:
         feedback_points: points of the decoded cloth that S sees (`network.feedback`); zero for none.
         feedback_proxies: whether S sees the proxies of the last two states, as in the paper's Figure 2, which
             "spring_verlet" cannot take.
+        proximity_points: points of the garment, as the body carries them, at which the network sees how near
+            colliders are (`network.proximity`); zero for a network that sees none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
         velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
             and the rates of the pose allow (`model.integrators.SpringVerlet`).
@@ -69,6 +72,7 @@ class ModelConfig:
     max_latent_step: float = 1.0
     feedback_points: int = 64
     feedback_proxies: bool = False
+    proximity_points: int = 0
     stiffness: float = 0.2
     velocity_allowance: float = 0.05
     fps: float = 30.0
@@ -86,7 +90,7 @@ class ModelConfig:
             fail("model", f"widths = {self.widths}", f"each must be at least 1 and at most {MAX_SIZE}")
         need_between(self, 1, MAX_SIZE, "latent")
         need_between(self, 1, NO_BOUND, "fps")
-        need_between(self, 0, MAX_SIZE, "shapes", "activations", "feedback_points")
+        need_between(self, 0, MAX_SIZE, "shapes", "activations", "feedback_points", "proximity_points")
         need_between(self, 0, NO_BOUND, "latent_bound", "max_latent_step")
         need_between(self, 1e-6, 1, "stiffness")
         need_between(self, 0, 1, "velocity_allowance")

@@ -96,10 +96,11 @@ class KeptRows(Generic[Row]):
         with replacing(self.path, keep_same=True) as temporary:
             temporary.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
-    def tell_kept(self, count: int, report: Reporter) -> None:
-        """Tell that a measurement was interrupted, of which so many rows are kept."""
-        if self.path is not None and count:
-            report(Message(f"{self.path}: {count} rows are kept; other {GO_ON}"))
+    def tell_kept(self, count: int, report: Reporter, parts: int = 0) -> None:
+        """Tell that a measurement was interrupted, of which so many rows are kept, and parts of the next ones."""
+        if self.path is not None and (count or parts):
+            beside = ", and parts of the next" if parts else ""
+            report(Message(f"{self.path}: {count} rows are kept{beside}; other {GO_ON}"))
 
     def _row(self, document: Mapping[str, Any]) -> Row:
         """Return a row, without what the file tells beside its figures."""

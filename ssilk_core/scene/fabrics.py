@@ -182,6 +182,9 @@ def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:
     return replace(FABRICS["default"], name=surface.path.rpartition("/")[2], **said)  # type: ignore[arg-type]
 
 
+FRICTION = "'ssilk simulate' alone knows friction (--material friction=0.4); networks are trained without it"
+
+
 def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:
     """Return a sentence without its stop: what a fabric takes of a stage's physics material, and what it cannot."""
     default, units = FABRICS["default"], {"density": "kg/m2", "thickness": "m", "bending": "N m"}
@@ -200,7 +203,9 @@ def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:
     excess = stretch is not None and shear is not None and shear > stretch / 2 * (1 + 1e-6)
     beyond = ["shear that is stiffer than half the stretch"] if excess else []
     if lost := [*surface.others, *beyond]:
-        text += f"; it has no place for {', '.join(lost)}"
+        text += f"; it leaves out {', '.join(lost)}"
+    if any("friction" in name.lower() for name in surface.others):
+        text += f"; {FRICTION}"
     return text
 
 

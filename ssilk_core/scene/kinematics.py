@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -173,7 +174,7 @@ def resample(motion: Motion, fps: float, *, cover: bool = False) -> Motion:
         int(np.ceil(last * fps / motion.fps - 1e-6)) + 1 if cover else frames_at(motion.frame_count, motion.fps, fps)
     )
     position = np.minimum(np.arange(count) * motion.fps / fps, last)
-    return Motion(motion.path, fps, *sample_motion(motion, position), gravity=sample_gravity(motion, position))
+    return Motion(motion.path, fps, *sample_motion(motion, position), **sample_felt(motion, position))
 
 
 MAX_HOLD = 100  # frames for which a garment's pose is held
@@ -194,8 +195,8 @@ def run_up(motion: Motion, seconds: float) -> Motion:
     first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
     rotations = slerp(first.rotations, second.rotations, -away[:, None])
     translations = first.translations - away[:, None, None] * (second.translations - first.translations)
-    gravity = None if first.gravity is None else first.gravity.repeat(count, axis=0)
-    return Motion(motion.path, motion.fps, rotations, translations, gravity=gravity)
+    felt = {name: values.repeat(count, axis=0) for name, values in first.felt.items()}
+    return Motion(motion.path, motion.fps, rotations, translations, **felt)
 
 
 CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the hub was teleported, not animated
@@ -248,13 +249,16 @@ def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
     return rotations, translations
 
 
-def sample_gravity(motion: Motion, position: Floats) -> Floats | None:
-    """Return the gravity (N, 3) of a motion at fractional frames (N,); None where it is the usual one."""
-    if motion.gravity is None:
-        return None
+def sample_felt(motion: Motion, position: Floats) -> dict[str, Any]:
+    """Return `Motion.felt` at fractional frames (N,), linear between frames."""
     low = np.minimum(position.astype(int), motion.frame_count - 1)
-    high, t = np.minimum(low + 1, motion.frame_count - 1), (position - low)[:, None]
-    return motion.gravity[low] * (1 - t) + motion.gravity[high] * t
+    high = np.minimum(low + 1, motion.frame_count - 1)
+
+    def between(values: Floats) -> Floats:
+        t = (position - low).reshape(-1, *[1] * (values.ndim - 1))
+        return values[low] * (1 - t) + values[high] * t
+
+    return {name: between(values) for name, values in motion.felt.items()}
 
 
 def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:

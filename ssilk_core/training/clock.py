@@ -6,14 +6,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import inf
+from math import ceil, inf
 
 from .budget import Pace, affordable_validations, check_possible, fitting_iterations, scale_schedule
 from .job import TrainJob
+from .prediction import trained_frames
 from .settings import TrainConfig
 from .state import RunState
+from .step_times import StepTimes
 
 PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
+OF_A_MODEL = 2.0  # duration of a model's validation over that of linear blend skinning, until one was measured
 MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
 
 
@@ -35,7 +38,9 @@ class RunClock:
         self.job, self.state = job, state
         self.began = began - max(state.wall, state.seconds)
         self.validation_seconds = 0.0
+        self._validated = False
         self.pace: Pace | None = None
+        self._times = StepTimes(trained_frames(job.train) / job.train.pretraining_batch)
         self.start()
 
     @property
@@ -60,6 +65,48 @@ class RunClock:
         """Return the time left for steps [s], after the validations that are still to come."""
         to_come = max(0, self.state.validations - len(self.state.curve) - 1)  # the last is left out of `time_left`
         return max(0.0, self.time_left - to_come * self.validation_seconds)
+
+    def scored_lbs(self, seconds: float) -> None:
+        """Take in how long the validation of linear blend skinning took; a model is measured at more length."""
+        self.validation_seconds = OF_A_MODEL * seconds
+
+    def validated(self, seconds: float) -> None:
+        """Take in how long the validation of a model took; of those that are planned, only what it leaves stay."""
+        self.validation_seconds = max(self.validation_seconds, seconds) if self._validated else seconds
+        self._validated, state = True, self.state
+        if state.validations and self.job.minutes:
+            most = affordable_validations(self.job.train, 60 * self.job.minutes, self.validation_seconds)
+            state.validations = min(state.validations, max(most, len(state.curve) + 1))
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether steps of dynamic training were done, where any are asked for."""
+        state, asked = self.state, self.job.train
+        if self.job.model.scheme == "quasi_static" or asked.static_iterations >= asked.iterations:
+            return True
+        return state.iteration > (state.static or self.schedule.static_iterations)
+
+    def stepped(self) -> None:
+        """Take in that a step is done; on a GPU, perhaps only launched."""
+        iteration = self.state.iteration
+        is_static = iteration <= self.schedule.static_iterations
+        self._times.took(is_static, iteration, self.state.seconds + time.monotonic() - self._since)
+
+    def seconds_left(self) -> float | None:
+        """Return how long the run still takes, with its validations [s]; None while nothing is known."""
+        state, config = self.state, self.schedule
+        if self.pace:
+            self._times.ratio = self.pace.dynamic / self.pace.static
+        static = max(0, config.static_iterations - state.iteration)
+        left = self._times.left(static, max(0, config.iterations - state.iteration - static))
+        if left is None:
+            return None
+        every, last = config.validate_every, state.curve[-1].iteration if state.curve else 0
+        to_come = max(0, ceil(config.iterations / every) - last // every - 1)  # without the one at the end
+        if state.validations:
+            to_come = max(0, state.validations - len(state.curve) - 1)
+        left += to_come * self.validation_seconds
+        return min(left, max(0.0, self.time_left)) + self.validation_seconds
 
     def plan(self, pace: Pace, minutes: float) -> None:
         """Plan a new run of so many minutes at a pace.

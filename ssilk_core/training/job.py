@@ -13,7 +13,7 @@ import numpy as np
 
 from ..errors import fail
 from ..network.checkpoint import ModelFile
-from ..network.settings import ModelConfig
+from ..network.settings import PROXIMITY_POINTS, ModelConfig
 from ..scene.assets import LOOSE, PINNED, Motion, Scene
 from ..scene.fabrics import Fabric
 from ..scene.mesh.stitches import find_stitches
@@ -79,13 +79,23 @@ class TrainJob:
             # There is no P to train on single poses.
             train = replace(self.train, static_fraction=0, pretraining_batch=1, static_batch=1, initial_loss=False)
             object.__setattr__(self, "train", train)
+        if self.train.collider_fraction and not self.model.proximity_points:
+            if self.stepper_alone:  # nor does P, which stays as it is
+                object.__setattr__(self, "train", replace(self.train, collider_fraction=0))
+            else:
+                object.__setattr__(self, "model", replace(self.model, proximity_points=PROXIMITY_POINTS))
+        if not self.base and self.model.proximity_points and not self.train.collider_fraction:
+            found = f"proximity_points={self.model.proximity_points} and collider_fraction=0"
+            fail("training", found, "a network learns what it sees", "give --set collider_fraction=0.25 as well")
         if not self.has_loose and self.model.scheme == "spring_verlet":
             object.__setattr__(self, "model", replace(self.model, scheme="quasi_static"))
         if self.model.scheme == "quasi_static":  # there are no previous states to vary
             object.__setattr__(self, "train", replace(self.train, state_reuse=0, noise=0))
         if not self.is_trainable:
             object.__setattr__(
-                self, "model", replace(self.model, latent=1, widths=(1,), shapes=1, scheme="quasi_static")
+                self,
+                "model",
+                replace(self.model, latent=1, widths=(1,), shapes=1, scheme="quasi_static", proximity_points=0),
             )
             least = replace(
                 self.train,
@@ -93,6 +103,7 @@ class TrainJob:
                 batch=1,
                 pretraining_batch=1,
                 static_batch=1,
+                collider_fraction=0,
                 recombinations=0,
                 perturbations=0,
             )

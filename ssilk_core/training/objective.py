@@ -9,6 +9,7 @@ from torch import Tensor
 from ..network.model.network import GarmentModel
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.collision.contacts import no_planes
+from ..physics.collision.distance import signed_distance_to_planes
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
 from ..physics.intersections.contours import IntersectionContours
@@ -19,6 +20,7 @@ from .inner_garments import Beneath, InnerGarments
 from .latent_regularization import LATENT_SCALE, latent_distortion
 from .motion_bank import MotionBank
 from .newton_distance import NewtonDistance
+from .obstacles import ObstacleDrawer, Obstacles
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -40,6 +42,7 @@ class Objective:
         inner: garments beneath, which the garment lies on as on the body; none by default.
         buried: limbs that do not count in each frame of the bank, bool (L, F), where they are known
             (`LimbPoser.buried`).
+        drawer: of obstacles, which tells what the network sees of them; None for none.
     """
 
     def __init__(
@@ -55,10 +58,11 @@ class Objective:
         patches: bool = True,
         contours: IntersectionContours | None = None,
         inner: InnerGarments | None = None,
+        drawer: ObstacleDrawer | None = None,
     ) -> None:
         self.model, self.energy, self.bank = model, energy, bank
         self.surface, self.clearance, self.buried = surface, clearance, buried
-        self.contours, self.inner = contours, inner
+        self.contours, self.inner, self.drawer = contours, inner, drawer
         self.body, device = body, bank.static.device
         if body:
             self.contacts = Contacts(
@@ -87,17 +91,19 @@ class Objective:
         character: Tensor,
         buried: Tensor | None = None,
         beneath: Beneath | None = None,
+        obstacles: Obstacles | None = None,
     ) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity and wind (N, 3) [g].
 
         Args:
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
             beneath: inner garments in these frames, where there are any.
+            obstacles: likewise what else is there.
         """
         energy, root = self.energy, character[self.hub, :, 3]  # heights over the root keep the value of gravity small
         stretch, bending = energy.elastic(x)
         sampled = energy.cloth.positions(x)
-        planes = self._planes(sampled.detach(), character, buried, beneath)
+        planes = self._planes(sampled.detach(), character, buried, beneath, obstacles)
         gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * down.T, sampled, *planes)
         if self.newton:
             self.newton.planes = planes
@@ -109,7 +115,12 @@ class Objective:
         return terms
 
     def _planes(
-        self, x: Tensor, character: Tensor, buried: Tensor | None = None, beneath: Beneath | None = None
+        self,
+        x: Tensor,
+        character: Tensor,
+        buried: Tensor | None = None,
+        beneath: Beneath | None = None,
+        obstacles: Obstacles | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return the plane that each sample x (S, 3, N) can touch, moved outwards by the clearance.
 
@@ -122,21 +133,36 @@ class Objective:
             normal, offset = self.contacts.planes(x, self.body.pose(character, surface=self.surface, buried=buried))
         if self.inner and beneath:
             normal, offset = self.inner.deeper((normal, offset), x, beneath)
+        if obstacles:
+            distance, away = obstacles.nearest(x)
+            nearer = distance < signed_distance_to_planes(x, normal, offset)
+            offset = torch.where(nearer, (away * x).sum(1) - distance, offset)
+            normal = torch.where(nearer[:, None], away, normal)
         return normal, offset + self.clearance
 
     def _buried(self, frames: Tensor) -> Tensor | None:
         return None if self.buried is None else self.buried[:, frames]
 
-    def static(self, frames: Tensor, down: Tensor, beneath: Beneath | None = None) -> Terms:
+    def static(
+        self, frames: Tensor, down: Tensor, beneath: Beneath | None = None, obstacles: Obstacles | None = None
+    ) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1).
 
         Args:
             beneath: inner garments in these poses, where there are any.
+            obstacles: likewise what else is there.
         """
-        z = self.model.initial(self.bank.static_descriptor(frames, down))
+        z = self.model.initial(self._static_descriptor(frames, down, obstacles))
         character = self.bank.character(frames)
         x = self._vertices(z, character, 0)
-        return self.quasi_static_terms(x, down, character, self._buried(frames), beneath)
+        return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles)
+
+    def _static_descriptor(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,), with the proximity of obstacles where there are any."""
+        static = self.bank.static_descriptor(frames, down)
+        if obstacles is None or self.drawer is None:
+            return static
+        return torch.cat([self.drawer.seen(obstacles, frames), static], dim=1)
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -144,7 +170,12 @@ class Objective:
         return self.newton.attach(x, moving) if self.newton else x
 
     def window(
-        self, sampler: WindowSampler, noise: Tensor, frames: Tensor, single_down: Tensor
+        self,
+        sampler: WindowSampler,
+        noise: Tensor,
+        frames: Tensor,
+        single_down: Tensor,
+        single_obstacles: Obstacles | None = None,
     ) -> tuple[Terms, Terms, Tensor]:
         """Roll one window of every slot.
 
@@ -152,6 +183,7 @@ class Objective:
             sampler: frames and states of the windows.
             noise: added to the first two latents, shape (2, batch, latent).
             frames, single_down: single poses for the initialiser (M,), and their gravity and wind (M, 3) [g].
+            single_obstacles: around these, where there are any.
 
         Returns:
             Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
@@ -159,9 +191,10 @@ class Objective:
         """
         model, bank, length = self.model, self.bank, sampler.config.window
         batch = len(sampler.first)
-        times = (sampler.first + torch.arange(length, device=sampler.first.device)[:, None]).reshape(-1)
+        times = sampler.frames().reshape(-1)
         down = sampler.gravity().flatten(0, 1)
-        static = bank.static_descriptor(times, down)
+        around = sampler.obstacles and sampler.obstacles.repeated(length)
+        static = self._static_descriptor(times, down, around)
         heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
         pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
         # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
@@ -179,7 +212,7 @@ class Objective:
             with torch.no_grad():
                 seen = model.seen_from(before, now, bank.triples(times[2 * batch :]))
             rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        quiet = model.initial(bank.static_descriptor(frames, single_down))
+        quiet = model.initial(self._static_descriptor(frames, single_down, single_obstacles))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
@@ -188,7 +221,10 @@ class Objective:
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
         beneath = self.inner.window(sampler, frames, single_down) if self.inner else None
         pulled = torch.cat([down[2 * batch :], single_down])
-        terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath)
+        met = None
+        if sampler.obstacles and single_obstacles:
+            met = sampler.obstacles.repeated(length - 2).joined(single_obstacles)
+        terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath, met)
         if self.contours:
             terms[INTERSECTION] = self.contours.energy(x)
         count = (length - 2) * batch

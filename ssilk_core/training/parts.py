@@ -11,7 +11,10 @@ from torch import Tensor, nn
 
 from ..events import Message, Reporter, format_count, silent
 from ..network.checkpoint import ModelFile
+from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
+from ..network.parameters import seeing_colliders
+from ..network.proximity import proximity_size
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
@@ -24,6 +27,7 @@ from .job import TrainJob
 from .memory import searches_contours
 from .motion_bank import MotionBank, build_bank, usable_spans
 from .objective import Objective
+from .obstacles import ObstacleDrawer
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
@@ -84,11 +88,17 @@ class TrainingParts:
         """Return a new stepper with its own seed; a group of processes shares the batch."""
         group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
-        sampler = WindowSampler(self.bank, own, self.model.config.latent, generator)
+        drawer = None
+        if self.model.proximity and own.collider_fraction:
+            scene, joints = self.model.scene, self.model.joints
+            hub = place_of_hub(scene.character.skeleton, joints)
+            drawer = ObstacleDrawer(scene, self.model.config, self.bank, hub, own.collider_fraction, generator)
+        sampler = WindowSampler(self.bank, own, self.model.config.latent, generator, drawer)
         surface = config.closest_point == "triangles"
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
             self.buried if surface else None, config.contact_patches, self.validator.contours, self.inner,
+            drawer,
         )  # fmt: skip
         if self.inner:
             self.inner.attach(sampler)
@@ -117,7 +127,10 @@ def build_parts(
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed)
     if job.base and job.whole:
-        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in job.base.parameters.items()})
+        known = job.base.parameters
+        if added := model.proximity - proximity_size(scene, job.base.config):
+            known = seeing_colliders(known, job.base.config, added)
+        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)
         start = "goes on from that of the given model" if goes_on else "starts anew: it steps otherwise, or sees less"

@@ -20,13 +20,14 @@ from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
 from ..physics import loops
 from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
-from .budget import VALIDATION_SHARE, check_estimate, timed_pace
+from .budget import VALIDATION_SHARE, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
 from .first_steps import compile_loops
+from .fitting_batch import FittingBatch, need_enough_minutes
 from .job import TrainJob
-from .memory import StepMemory, decoded_frames, fits_in_memory, free_memory
+from .memory import fits_in_memory
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .parts import build_parts
 from .run_files import RunFiles
@@ -45,15 +46,23 @@ RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """Result of a run: `finished` is False if it was interrupted; `score` is that of the best model.
+    """Result of a run.
 
-    `seconds` is the wall time [s], with that before a resumption. It does not count in a comparison.
+    Attributes:
+        finished: False if it was interrupted.
+        iterations: that are done.
+        model_iteration: the one that the model on disk is of.
+        score, lbs: of that model, and of linear blend skinning.
+        moves: whether dynamic training had begun, where there is any.
+        seconds: wall time [s], with that before a resumption. It does not count in a comparison.
     """
 
     finished: bool
     iterations: int
+    model_iteration: int
     score: Score
     lbs: Score
+    moves: bool
     seconds: float = field(compare=False)
 
 
@@ -64,6 +73,7 @@ class TrainingRun:
 
     Attributes:
         clock: the run's progress and times, and its plan where it has minutes.
+        batch: as large as memory allows.
         lbs: score of linear blend skinning.
         saved: iteration of the state on disk.
     """
@@ -85,10 +95,11 @@ class TrainingRun:
         state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self.clock = RunClock(job, state, began)
         if job.minutes and job.is_trainable and not job.resume:
-            self._need_enough_minutes(job.minutes)
+            need_enough_minutes(job, self.config, self.device)
         self.parts = build_parts(job, self.device, group, report)
+        self.batch = FittingBatch(self.clock, self.parts, self.device, group, report)
         if not job.resume:
-            self._fit_batch()
+            self.batch.fit()
         if job.minutes and job.is_trainable and loops.available(self.device):
             report(Message("loops are compiled for this processor, or read where they were before"))
             compile_loops(self.parts, self.config)
@@ -96,6 +107,8 @@ class TrainingRun:
         if job.minutes and job.is_trainable:
             if job.resume:
                 self.clock.plan_rest(job.minutes)
+                left = max(0.0, job.minutes - self.clock.wall / 60)
+                report(Message(f"of {job.minutes:g} minutes for the whole run, {left:.1f} are left"))
             else:
                 self._plan(job.minutes)
         self._build_stepper()
@@ -120,26 +133,13 @@ class TrainingRun:
         """The schedule in use."""
         return self.clock.schedule
 
-    def _need_enough_minutes(self, minutes: float) -> None:
-        """Refuse minutes that the estimate does not allow, before anything is built.
-
-        The whole body is counted, so that the batch is no larger than the one that `_fit_batch` finds.
-        """
-        job, config = self.job, self.config
-        body = job.scene.character.merged_body().mesh.vertex_count
-        body += 2 * sum(one.file.scene.garment.mesh.vertex_count for one in job.over)
-        memory = StepMemory.of(job.scene, job.model, config, job.fabric, body)
-        batch, poses = memory.fitting_batch(config, free_memory(self.device))
-        fitting = replace(config, batch=batch, pretraining_batch=poses)
-        check_estimate(fitting, memory.samples, self.device.type, 60 * minutes, str(job.output))
-
     def _score_lbs(self) -> Score:
         """Return the score of linear blend skinning, whose validation is the first to be timed."""
         began = time.monotonic()
         count = format_count(len(self.job.held_out), "motions")
         self.report(Message(f"linear blend skinning is scored on {count} to validate on, to compare with"))
         score = self.parts.validator.lbs_score()
-        self.clock.validation_seconds = time.monotonic() - began
+        self.clock.scored_lbs(time.monotonic() - began)
         return score
 
     def _plan(self, minutes: float) -> None:
@@ -187,72 +187,11 @@ class TrainingRun:
         elif best and not self.job.output.is_file():
             self.state.best = None
 
-    def _fit_batch(self) -> None:
-        """Reduce the batch until the predicted memory fits, and report it."""
-        config, group, free = self.job.train, self.group, free_memory(self.device)
-        if self.device.type == "cpu":
-            free //= group.size
-        self._step_memory.check_one_window_fits(config, free)
-        fitting = group.gather(self._step_memory.fitting_batch(group.local_config(config), free))
-        batch, pretraining_batch = (group.size * min(counts) for counts in zip(*fitting))
-        if (batch, pretraining_batch) != (config.batch, config.pretraining_batch):
-            found = f"{self._memory() / 2**30:.1f} GiB needed, {free / 2**30:.1f} GiB free on {self.device}"
-            self._reduce_batch(found, batch, pretraining_batch)
-
-    def _memory(self) -> int:
-        """Predict the memory of a step in this process [bytes]."""
-        own = self.group.local_config(self.config)
-        frames = decoded_frames(own, own.batch)
-        return self._step_memory.needed(frames)
-
-    @property
-    def _step_memory(self) -> StepMemory:
-        energy = self.parts.energy
-        samples, stitches = len(energy.cloth.samples.area), len(energy.stitching or ())
-        contours = self.parts.validator.contours is not None
-        # Normals of cloth are computed anew in each frame, from its triangles.
-        met = self.parts.reached + (2 * self.parts.inner.vertex_count if self.parts.inner else 0)
-        return StepMemory(self.job.scene, self.job.model, met, samples, stitches, contours=contours)
-
-    def _reduce_batch(self, found: str, batch: int, pretraining_batch: int) -> None:
-        before, lowered = self.config, self.state.lowered
-        pace = lowered[-1].pace if lowered else 1.0
-        lowered.append(ReducedSettings(self.state.iteration, batch, pretraining_batch, pace))
-        self.report(
-            Message(
-                f"{found}: the batch is reduced from {before.batch} to {batch} windows and from "
-                f"{before.pretraining_batch} to {pretraining_batch} single poses.",
-                "warning",
-            )
-        )
-
     def _within_memory(self, work: Callable[[], None]) -> None:
-        """Run `work`, and halve the batch while the device runs out of memory.
-
-        Raises:
-            SsilkError: a batch of one does not fit, or other processes train with the same batch.
-        """
+        """Run `work`, and halve the batch while the device runs out of memory, as `FittingBatch.halve` does."""
         while not fits_in_memory(work):
-            config, found = self.config, f"iteration {self.state.iteration}: {self.device} is out of memory"
-            if self.group.size != 1:
-                fail(
-                    self.job.scene.garment.mesh.path,
-                    found,
-                    "a group of processes cannot change its batch",
-                    "train again with a smaller one (--set batch=...)",
-                )
-            if (
-                not (config.pretraining_batch if self.state.iteration < config.static_iterations else config.batch)
-                > 1
-            ):
-                fail(
-                    self.job.scene.garment.mesh.path,
-                    f"{found} with a batch of one",
-                    "a step needs more memory than is free",
-                    "use another device, or shorter windows (--set window=...)",
-                )
             self.state.skipped = int(self.stepper.skipped.count)
-            self._reduce_batch(found, max(1, config.batch // 2), max(1, config.pretraining_batch // 2))
+            self.batch.halve()
             self._rebuild_stepper(learned_tensors(self.stepper))
 
     def _announce(self) -> None:
@@ -273,20 +212,21 @@ class TrainingRun:
         if self.config.shape_smoothing and rough and not self.job.base:
             text = f"{path}: steps of blendshapes of more than {MOST_SMOOTHED_VERTICES:,} vertices are not smoothed."
             self.report(Message(text))
-        detail = {**self.parts.detail(), "memory predicted [MiB]": self._memory() >> 20}
+        detail = {**self.parts.detail(), "memory predicted [MiB]": self.batch.memory >> 20}
         self.report(Started("train", self.config.iterations, detail))
 
     def step(self) -> None:
         """Do one iteration."""
         self._within_memory(lambda: self.stepper.run(self.state.iteration))
         self.state.iteration += 1
+        self.clock.stepped()
         # On a processor steps are long, and those launched are done.
         if self.device.type == "cpu" and self.clock.measurement_due:
             self._measure_pace()
 
-    def check(self, seconds_left: float) -> None:
+    def check(self) -> None:
         """Report progress and skipped steps, follow the clock, and recover if training diverges."""
-        self.report_progress(seconds_left)
+        self.report_progress()
         self._measure_pace()
         if text := self.monitor.check():
             self.report(Message(text, "warning"))
@@ -300,10 +240,11 @@ class TrainingRun:
         """Whether nothing was said of the progress for long; a GPU would have to be waited for."""
         return self.device.type == "cpu" and time.monotonic() - self._reported_at >= REPORT_INTERVAL
 
-    def report_progress(self, seconds_left: float) -> None:
-        """Report the progress and the energies of the last batch."""
-        self._reported_at = time.monotonic()
-        self.report(Progress(self.state.iteration, self.config.iterations, seconds_left, self._batch_terms()))
+    def report_progress(self) -> None:
+        """Report the progress and the energies of the last batch, for which a GPU is waited for."""
+        self._reported_at, terms = time.monotonic(), self._batch_terms()
+        left = self.clock.seconds_left()
+        self.report(Progress(self.state.iteration, self.config.iterations, left, terms))
 
     def _batch_terms(self) -> dict[str, float]:
         """Return energies of the last batch [J]; this waits for the device."""
@@ -342,7 +283,7 @@ class TrainingRun:
 
     def end_early(self) -> None:
         """End because the time is up, with a validation if there were steps since the last one."""
-        self.report_progress(0.0)
+        self.report_progress()
         self.report(Message(f"time is up at iteration {self.state.iteration} of {self.config.iterations}"))
         if self.state.iteration != self.saved:
             self.validate()
@@ -351,9 +292,7 @@ class TrainingRun:
         found: list[Score] = []
         began = time.monotonic()
         self._within_memory(lambda: found.append(self.parts.validator.score(self.stepper.ema_model)))
-        # More is measured of a model than of linear blend skinning.
-        clock = self.clock
-        clock.validation_seconds = max(clock.validation_seconds, time.monotonic() - began)
+        self.clock.validated(time.monotonic() - began)
         return found[0]
 
     def _recover(self, found: str, broken: list[str]) -> None:
@@ -482,12 +421,14 @@ def train(
     if run.state.skipped:
         report(Message(f"{run.state.skipped} steps in total were skipped.", "warning"))
     score = run.final_score()
-    return TrainingResult(finished, run.state.iteration, score, run.lbs, run.clock.wall)
+    state, best = run.state, run.state.best
+    of = best.iteration if best else state.iteration
+    return TrainingResult(finished, state.iteration, of, score, run.lbs, run.clock.has_moved, run.clock.wall)
 
 
 def _loop(run: TrainingRun, stop: threading.Event) -> bool:
     """Iterate until all iterations are done, the time is up or `stop` is set; return False in the last case."""
-    began, steps = time.monotonic(), 0
+    steps = 0
     while run.state.iteration < (total := run.config.iterations) and not run.should_stop(stop):
         if run.clock.time_left <= 0:
             run.end_early()
@@ -496,11 +437,10 @@ def _loop(run: TrainingRun, stop: threading.Event) -> bool:
         if stop.is_set() and isinstance(stop, PatientStop):
             stop.obeyed()  # before a validation, which takes longer
         steps += 1
-        left = min((time.monotonic() - began) / steps * (total - run.state.iteration), max(0.0, run.clock.time_left))
         if run.state.iteration % CHECK_INTERVAL == 0 or run.state.iteration == total or steps == 1:
-            run.check(left)
+            run.check()
         elif run.report_due:
-            run.report_progress(left)
+            run.report_progress()
         if run.validation_due:
             run.validate()
         elif run.first_model_due:

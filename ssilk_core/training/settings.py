@@ -30,6 +30,8 @@ class TrainConfig:
         rotated_fraction: share of windows with a random rotation, uniform on SO(3); the others stay upright.
         wind_fraction: share of windows in which an even wind pulls on the cloth beside gravity, in any direction,
             with up to `network.settings.STRONGEST_PULL`; it changes now and then.
+        collider_fraction: share of windows and poses with obstacles around the character
+            (`training.obstacles`), which the network then sees (`network.proximity`).
         recombinations: number of extra motions for each motion, whose limbs move as in another motion; fewer where
             all poses would be more than `training.job.MOST_POSES`.
         perturbations: likewise with joints turned at random. About half go to and fro between these poses and the
@@ -86,6 +88,7 @@ class TrainConfig:
     state_reuse: float = 0.97
     rotated_fraction: float = 0.2
     wind_fraction: float = 0.0
+    collider_fraction: float = 0.0
     recombinations: int = 3
     perturbations: int = 1
     tumbling: float = 0.25
@@ -129,7 +132,15 @@ class TrainConfig:
         need_between(self, 0 if self.initial_loss else 1, NO_BOUND, "static_batch")
         need_between(self, 3, NO_BOUND, "valid_frames")
         need_between(
-            self, 0, 1, "state_reuse", "rotated_fraction", "wind_fraction", "noise_correlation", "noise_probability"
+            self,
+            0,
+            1,
+            "state_reuse",
+            "rotated_fraction",
+            "wind_fraction",
+            "collider_fraction",
+            "noise_correlation",
+            "noise_probability",
         )
         need_between(self, 0, 1, "shape_smoothing", "tumbling")
         need_between(self, 0, MOST_OF_ALL, "static_fraction", "ema_decay")
@@ -220,6 +231,7 @@ PRESETS = {
                 static_fraction=0.2,
                 intersection_weight=0.02,
                 wind_fraction=0.25,
+                collider_fraction=0.25,
                 shape_learning_rate_scale=1.0,
                 validate_every=1600,
             ),
@@ -232,6 +244,7 @@ PRESETS = {
                 static_fraction=0.2,
                 intersection_weight=0.02,
                 wind_fraction=0.25,
+                collider_fraction=0.25,
                 shape_learning_rate_scale=1.0,
                 validate_every=1600,
             ),
@@ -246,6 +259,7 @@ PRESETS = {
                 perturbations=24,
                 intersection_weight=0.02,
                 wind_fraction=0.25,
+                collider_fraction=0.25,
                 static_learning_rate=5e-4,
                 shape_learning_rate_scale=1.0,
                 weight_decay=0.5,

@@ -96,7 +96,8 @@ class Stepper:
         frames, direction = self.sampler.poses(self.config.pretraining_batch)
         inner = self.objective.inner
         beneath = inner.poses(frames, direction, self.sampler.generator) if inner else None
-        terms = self.objective.static(frames, direction, beneath)
+        obstacles = self.sampler.obstacles_at(frames, direction)
+        terms = self.objective.static(frames, direction, beneath, obstacles)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(total(terms, self._half), means, {"frames": frames, "directions": direction})
 
@@ -105,8 +106,9 @@ class Stepper:
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
         if self.config.initial_loss:
             poses = self.sampler.with_initial(*poses)
+        obstacles = self.sampler.obstacles_at(*poses)
         inner = {name: value.clone() for name, value in self.sampler.inner.items()}  # the window changes them
-        dynamic, static, latents = self.objective.window(self.sampler, noise, *poses)
+        dynamic, static, latents = self.objective.window(self.sampler, noise, *poses, obstacles)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
         loss = (total(dynamic, self._half) * moving + total(static, self._half) * still) / (moving + still)

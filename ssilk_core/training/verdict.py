@@ -18,6 +18,7 @@ NO_DYNAMICS = 2e-3  # [m]
 WORSE = 1e-3
 FEW = 0.5  # share of the iterations that were asked for, below which more minutes are advised
 ADVICE = "nothing dynamic is being learned: train longer, or check that the motions move"
+STATIC = "the time was up before dynamic training began, so that it has not learned to move"
 
 
 def lower_by(score: Score, lbs: Score) -> float:
@@ -53,14 +54,17 @@ def worse_message(model: str, score: Score, lbs: Score) -> Message:
     )
 
 
-def shortcomings(model: str, score: Score, done: int, asked: int, seconds: float) -> Message | None:
+def shortcomings(
+    model: str, score: Score, done: int, asked: int, seconds: float, moves: bool = True
+) -> Message | None:
     """Return a warning where minutes sufficed for few of the iterations, or where the eye finds skin that shows.
 
     Args:
         done, asked: iterations that were done, and those that were asked for.
         seconds: duration of the whole run [s].
+        moves: whether dynamic training had begun.
     """
-    found, shown = [], score.shown_skin
+    found, shown = [] if moves else [STATIC], score.shown_skin
     if done < FEW * asked:
         found.append(f"its minutes sufficed for {done} of {asked} iterations")
     if shown and shown.is_seen:

@@ -9,6 +9,7 @@ from torch import Tensor
 from ..errors import fail
 from ..network.settings import STRONGEST_PULL
 from .motion_bank import MotionBank
+from .obstacles import ObstacleDrawer, Obstacles
 from .settings import TrainConfig
 
 
@@ -54,11 +55,19 @@ class WindowSampler:
         heading: likewise how a slot is turned about gravity, for absolute descriptors; None for relative ones.
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
+        obstacles: around each slot's character; None where none are drawn.
         inner: what inner garments keep from window to window, by name (`InnerGarments.attach`); nothing by default.
     """
 
-    def __init__(self, bank: MotionBank, config: TrainConfig, latent: int, generator: torch.Generator) -> None:
-        self.bank, self.config, self.generator = bank, config, generator
+    def __init__(
+        self,
+        bank: MotionBank,
+        config: TrainConfig,
+        latent: int,
+        generator: torch.Generator,
+        drawer: ObstacleDrawer | None = None,
+    ) -> None:
+        self.bank, self.config, self.generator, self.drawer = bank, config, generator, drawer
         device = bank.static.device
         stops = bank.stops.repeat_interleave(bank.stops - bank.starts)
         frames = torch.arange(bank.frame_count, device=device)
@@ -78,6 +87,7 @@ class WindowSampler:
         self.heading = random_headings(self.direction, generator) if bank.is_absolute else None
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
+        self.obstacles = drawer.draw(self.frames(), self.direction) if drawer else None
         self.inner: dict[str, Tensor] = {}
 
     def _fresh(self) -> Tensor:
@@ -86,6 +96,14 @@ class WindowSampler:
 
     def _pulls(self) -> Tensor:
         return random_pulls(self.config.batch, self.config.wind_fraction, self.generator, self.candidates.device)
+
+    def frames(self) -> Tensor:
+        """Return the frames of the windows, shape (window, batch)."""
+        return self.first + torch.arange(self.config.window, device=self.first.device)[:, None]
+
+    def obstacles_at(self, frames: Tensor, gravity: Tensor) -> Obstacles | None:
+        """Draw obstacles for single poses (M,) under gravity and wind (M, 3); None where none are drawn."""
+        return self.drawer.draw(frames[None], gravity) if self.drawer else None
 
     def gravity(self) -> Tensor:
         """Return gravity and wind in each frame of the windows [g], shape (window, batch, 3)."""
@@ -143,13 +161,21 @@ class WindowSampler:
             self.pull.copy_(torch.stack([first, torch.where((go_on & ~gust)[:, None], self.pull[1], pull)]))
         if self.heading is not None:
             self.heading.copy_(torch.where(go_on[:, None], self.heading, random_headings(fresh, self.generator)))
+        if self.drawer and self.obstacles:
+            drawn = self.drawer.draw(self.frames(), self.direction)
+            kept = self.drawer.drawn_back(self.obstacles, self.frames())
+            for own, old, new in zip(self.obstacles.parts, kept.parts, drawn.parts):
+                own.copy_(torch.where(go_on.reshape(1, -1, *[1] * (own.ndim - 2)), old, new))
         self.latents.copy_(latents.detach())
         self.carried.copy_(go_on)
 
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
         names = ("first", "direction", "latents", "carried", "heading", "pull")
-        return {name: value for name in names if (value := getattr(self, name)) is not None} | self.inner
+        found = {name: value for name in names if (value := getattr(self, name)) is not None}
+        if self.obstacles:
+            found |= {f"obstacles.{name}": value for name, value in vars(self.obstacles).items()}
+        return found | self.inner
 
     def state(self) -> dict[str, Tensor]:
         """Return all that a resumed run needs to continue exactly, random state included."""

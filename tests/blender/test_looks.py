@@ -52,6 +52,25 @@ def test_what_a_mesh_loses_is_named(bpy, skirt, name, told, change):
     assert lost_looks([thing]) == [f"'{name}' loses {told}"]
 
 
+@pytest.mark.parametrize("name", ["Skirt", "Pillar"])
+def test_the_uv_map_that_is_rendered_is_handed_over_whichever_is_edited(bpy, skirt, name):
+    import numpy as np
+
+    from blender_addon.scene.gather import read_mesh
+    from blender_addon.scene.look import lost_looks
+
+    thing = bpy.data.objects[name]
+    thing.data.shade_smooth()
+    for place, kind in enumerate(("Bake", "Colour")):
+        layer = thing.data.uv_layers.new(name=kind)
+        layer.uv.foreach_set("vector", [float(place)] * 2 * len(layer.uv))
+    thing.data.uv_layers["Colour"].active_render = True
+    thing.data.uv_layers.active = thing.data.uv_layers["Bake"]
+    for mesh in (thing.data, thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).data):
+        np.testing.assert_array_equal(read_mesh(thing, mesh, "/Mesh").uvs, 1)
+    assert lost_looks([thing]) == [f"'{name}' loses the UV map 'Bake'"]
+
+
 def test_modifiers_that_shape_a_body_before_its_bones_are_not_lost(bpy, skirt):
     from blender_addon.scene.look import lost_looks
 

@@ -14,6 +14,7 @@ from pxr import Usd
 from ssilk_core.cli import main
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.quality.evaluation.kept_parts import KeptParts
 from ssilk_core.quality.evaluation.record import recorded
 
 WORLD = "--stage rigged.usda --motions clips"
@@ -69,7 +70,10 @@ def stopped(world, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr("ssilk_core.quality.evaluation.measured.recorded", interrupted)
         assert evaluated(words) == 130
-    assert "figures.json: 2 rows are kept; other rows are missing; the same command" in capsys.readouterr().err
+    assert (
+        "figures.json: 2 rows are kept, and parts of the next; other rows are missing; the same command"
+        in capsys.readouterr().err
+    )
 
     def counted(*args):
         measured.append(args)
@@ -107,6 +111,53 @@ def test_a_run_that_was_stopped_goes_on(world, stopped, capsys):
         **whole,
         "figures": [{**row, "model": row["model"] and "elsewhere/model.safetensors"} for row in whole["figures"]],
     }
+
+
+def test_a_run_that_is_cut_again_and_again_comes_to_the_same_figures(world, monkeypatch, capsys):
+    """It is cut after every third part: records, stops, loops, steps of simulations, single steps."""
+    words = f"{WORLD} --index index.json --solver -o"
+    assert evaluated(f"{words} whole.json") == 0
+    kept: list[str] = []
+    put = KeptParts.put
+
+    def cut(self, name, part):
+        put(self, name, part)
+        kept.append(json.dumps([*self.within, name]))
+        if len(kept) % 3 == 0:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(KeptParts, "put", cut)
+    monkeypatch.setattr("ssilk_core.quality.evaluation.kept_parts.EVERY", 0.0)
+    parts, runs = world / "cut.json.parts", 1
+    while (code := evaluated(f"{words} cut.json")) == 130:
+        assert parts.is_file() and len(kept) == 3 * runs
+        runs += 1
+    assert code == 0 and runs > 5 and not parts.exists()
+    assert {json.loads(name)[2] for name in kept} == {"records", "stops", "loops", "solver"}
+    repeated = {name for name in kept if kept.count(name) > 1}
+    assert all(json.loads(name)[-1] == "windows" for name in repeated)  # whose states follow each other
+    document, whole = (json.loads((world / name).read_text()) for name in ("cut.json", "whole.json"))
+    assert document == whole and any(row["figures"]["solver"] for row in whole["figures"])
+
+
+def test_a_file_in_the_place_of_parts_stays(world, stopped, capsys):
+    words, _ = stopped
+    parts = world / "figures.json.parts"
+    assert parts.is_file()
+    parts.write_text("notes")
+    assert evaluated(words) == 2
+    assert "figures.json.parts: not what a measurement keeps" in capsys.readouterr().err
+    assert parts.read_text() == "notes"
+
+
+def test_parts_of_other_inputs_are_begun_anew(world, stopped, capsys):
+    """Also where no row was finished."""
+    words, measured = stopped
+    (world / "figures.json").unlink()
+    _renoted(world / "model.safetensors")
+    assert evaluated(words) == 0 and len(measured) == 4
+    assert "warning: figures.json.parts: begun anew, its parts are of other inputs\n" in capsys.readouterr().err
+    assert not (world / "figures.json.parts").exists()
 
 
 def test_a_finished_file_is_taken_over_as_a_whole(world, stopped, capsys):

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 from pxr import Sdf
 from ssilk_usd.reading import visibility as read_visibility
-from ssilk_usd.shots import layers as layers_of_usd
+from ssilk_usd.shots import layers_animation, layers_asset
 
 from ssilk_core import files
 from ssilk_core.cli import main
@@ -134,13 +134,13 @@ def test_bad_input_fails_its_task_alone_and_what_is_done_stays_done(farm, capsys
 
 
 def test_a_chunk_writes_its_asset_once_while_it_stays_as_it_was(farm, monkeypatch):
-    written, write = [], layers_of_usd.write_asset
+    written, write = [], layers_asset.write_asset
 
     def counted(layout, *args, **options):
         written.append(layout.shot)
         return write(layout, *args, **options)
 
-    monkeypatch.setattr(layers_of_usd, "write_asset", counted)
+    monkeypatch.setattr(layers_asset, "write_asset", counted)
     assert task() == 0 and written == ["a"]
     folder, job = LayerFolder("out"), read_job("bundle/job.json").tasks
     folder.bake(job[0], again=True)
@@ -213,7 +213,7 @@ def test_the_last_step_removes_what_killed_workers_left(farm):
 def test_workers_that_bake_the_same_task_at_once_all_succeed(farm, monkeypatch):
     """A second worker begins each task, and ends it, while the first has written half of it: twice within."""
     assert run("task bundle/job.json -o quiet") == 0
-    (tasks, write, depth) = read_job("bundle/job.json").tasks, layers_of_usd.write_animation, []
+    (tasks, write, depth) = read_job("bundle/job.json").tasks, layers_animation.write_animation, []
 
     def interrupted(layout, *args, **options):
         options["path"].write_text("half")
@@ -225,7 +225,7 @@ def test_workers_that_bake_the_same_task_at_once_all_succeed(farm, monkeypatch):
         options["path"].unlink()
         return write(layout, *args, **options)
 
-    monkeypatch.setattr(layers_of_usd, "write_animation", interrupted)
+    monkeypatch.setattr(layers_animation, "write_animation", interrupted)
     assert task() == 0 and task("--check") == 0 and not unfinished()
     assert animations("out") == animations("quiet") and set(animations("out")) == set(SHOTS)
 

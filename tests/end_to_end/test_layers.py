@@ -502,13 +502,13 @@ def test_each_frame_of_a_short_shot_takes_bytes(copy):
 
 @pytest.mark.usefixtures("copy")
 def test_a_version_whose_asset_was_not_written_is_asked_for_again(monkeypatch):
-    from ssilk_usd.shots import layers
+    from ssilk_usd.shots import layers_asset
 
     def full(*words, **named):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr(layers, "write_asset", full)
+        broken.setattr(layers_asset, "write_asset", full)
         assert bake("--motion walk.usda --points -o layers --asset-version v015") != 0
     assert bake("--motion walk.usda --points -o layers --asset-version v015") == 0
     stage = Usd.Stage.Open("layers/shots/walk/shot.usda")

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from ssilk_usd.shots import layers as layers_of_usd
+from ssilk_usd.shots import layers_stage
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
@@ -134,7 +134,7 @@ def test_a_body_is_shown_whichever_levels_are_selected(copy, capsys):
 
 def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy, monkeypatch):
     """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
-    write, other = layers_of_usd.write_stage, []
+    write, other = layers_stage.write_stage, []
 
     def late(garments, needed=(), levels=None):
         if not other:
@@ -142,7 +142,7 @@ def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy
             assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
         return write(garments, needed, levels)
 
-    monkeypatch.setattr(layers_of_usd, "write_stage", late)
+    monkeypatch.setattr(layers_stage, "write_stage", late)
     gathering.write_shot_stage(Path("layers"), "walk")
     assert len(other) == 1 and garments() == ["overalls", "shirt"]
 

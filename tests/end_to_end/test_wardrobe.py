@@ -12,7 +12,8 @@ import socket
 import subprocess
 import sys
 import threading
-import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -216,6 +217,25 @@ def test_a_stop_asks_those_that_run_and_starts_no_more(tmp_path):
     assert sum(event == Message("stopped") for _, event in heard.said) == 2
 
 
+def test_a_task_that_is_stopped_before_it_listens_did_not_fail(tmp_path):
+    """Python dies of the signal while it loads its modules."""
+
+    class Stopping(Heard):
+        def tell(self, name: str, event: TaskEvent) -> None:
+            super().tell(name, event)
+            self.stop.set()
+
+    heard = Stopping([{}])
+    ends = heard.run(
+        task(
+            tmp_path,
+            "a",
+            "signal.signal(signal.SIGINT, signal.SIG_DFL)\nsay(event='message', text='begun')\ntime.sleep(60)",
+        )
+    )
+    assert ends["a"].code == 130
+
+
 def test_a_second_interrupt_ends_all_at_once(tmp_path):
     class Impatient(Heard):
         def tell(self, name: str, event: TaskEvent) -> None:
@@ -361,26 +381,49 @@ def world(toy, tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def interrupt_when(log: Path, word: str) -> threading.Thread:
-    """Interrupt this process as soon as a log has a word."""
+WAITING = """#!{python}
+import signal, sys, time
+from ssilk_core.cli import main
+from ssilk_core.training.run import TrainingRun
+
+step, before = TrainingRun.step, signal.default_int_handler
+
+def stepped(run):
+    step(run)
+    while run.state.iteration > 1 and signal.getsignal(signal.SIGINT) is not before:  # which is set by a wish to stop
+        time.sleep(0.01)
+
+TrainingRun.step = stepped
+sys.exit(main(sys.argv[3:]))
+"""
+
+
+@contextmanager
+def interrupting(log: Path, word: str) -> Iterator[None]:
+    """Interrupt this process as soon as a log has a word, of trainings that take two steps and wait for it."""
+    over, script = threading.Event(), Path("waiting.py").absolute()
+    script.write_text(WAITING.format(python=sys.executable))
+    script.chmod(0o755)
 
     def watch() -> None:
-        for _ in range(600):
+        while not over.wait(0.02):
             if log.exists() and word in log.read_text():
                 os.kill(os.getpid(), signal.SIGINT)
                 return
-            time.sleep(0.05)
 
     thread = threading.Thread(target=watch)
     thread.start()
-    return thread
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "executable", str(script))
+        yield
+    over.set()
+    thread.join()
 
 
 def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
     command = shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json")
-    watching = interrupt_when(Path("out/skirt.log"), '"progress"')
-    assert main(command) == 130
-    watching.join()
+    with interrupting(Path("out/skirt.log"), '"progress"'):
+        assert main(command) == 130
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
     assert states["skirt"] == "stopped" and Path("out/skirt.resume.safetensors").exists()

@@ -404,6 +404,112 @@ def test_the_uv_set_is_the_one_that_the_material_reads(hero, read, first):
     assert uvs is not None and uvs[0, 0] == first
 
 
+def shader(stage: Usd.Stage, path: str, kind: str, **inputs: object) -> UsdShade.Shader:
+    """A shader whose inputs are words, or other shaders with one output each."""
+    found = UsdShade.Shader.Define(stage, path)
+    found.CreateIdAttr(kind)
+    for name, given in inputs.items():
+        if isinstance(given, UsdShade.Shader):
+            found.CreateInput(name, TINT.Token).ConnectToSource(given.CreateOutput("out", TINT.Token))
+        else:
+            found.CreateInput(name, TINT.String).Set(given)
+    return found
+
+
+def of_plain_floats(stage: Usd.Stage, cape: Usd.Prim) -> None:
+    values = cape.GetAttribute("primvars:b").Get()
+    cape.RemoveProperty("primvars:b")
+    UsdGeom.PrimvarsAPI(cape).CreatePrimvar("b", TINT.Float2Array, "faceVarying").Set(values)
+    surface = shader(stage, "/Looks/New/S", "UsdPreviewSurface", diffuseColor=reads(stage, "b"))
+    bind_new(stage, cape, surface)
+
+
+def beside_a_light_map(stage: Usd.Stage, cape: Usd.Prim) -> None:
+    inputs = {"aoMap": reads(stage, "a"), "diffuseColor": reads(stage, "b")}
+    bind_new(stage, cape, shader(stage, "/Looks/New/S", "UsdPreviewSurface", **inputs))
+
+
+def beside_a_reader_that_nothing_reads(stage: Usd.Stage, cape: Usd.Prim) -> None:
+    reads(stage, "a")
+    bind_new(stage, cape, shader(stage, "/Looks/New/S", "UsdPreviewSurface", diffuseColor=reads(stage, "b")))
+
+
+def by_materialx(stage: Usd.Stage, cape: Usd.Prim) -> None:
+    reader = shader(stage, "/Looks/New/Geom", "ND_geompropvalue_vector2", geomprop="b")
+    image = shader(stage, "/Looks/New/Image", "ND_image_color3", texcoord=reader)
+    bind_new(stage, cape, shader(stage, "/Looks/New/S", "ND_standard_surface_surfaceshader", base_color=image))
+
+
+def for_final_renders_alone(stage: Usd.Stage, cape: Usd.Prim) -> None:
+    surface = shader(stage, "/Looks/New/S", "UsdPreviewSurface", diffuseColor=reads(stage, "b"))
+    bind_new(stage, cape, surface, "full")
+
+
+def reads(stage: Usd.Stage, name: str) -> UsdShade.Shader:
+    reader = shader(stage, f"/Looks/New/Read_{name}", "UsdPrimvarReader_float2", varname=name)
+    return shader(stage, f"/Looks/New/Image_{name}", "UsdUVTexture", st=reader)
+
+
+def bind_new(stage: Usd.Stage, cape: Usd.Prim, surface: UsdShade.Shader, purpose: str = "") -> None:
+    made = UsdShade.Material.Define(stage, "/Looks/New")
+    made.CreateSurfaceOutput("mtlx" if "ND_" in str(surface.GetShaderId()) else "").ConnectToSource(
+        surface.CreateOutput("surface", TINT.Token)
+    )
+    for prim in (cape, cape.GetChild("trim")):
+        prim.RemoveProperty("material:binding")
+    UsdShade.MaterialBindingAPI(cape).Bind(made, materialPurpose=purpose)
+
+
+READ = (
+    of_plain_floats,
+    beside_a_light_map,
+    beside_a_reader_that_nothing_reads,
+    by_materialx,
+    for_final_renders_alone,
+)
+
+
+@pytest.mark.parametrize("change", READ)
+def test_the_uv_set_is_the_one_that_colours_are_read_by(hero, change):
+    stage = Usd.Stage.Open(str(hero))
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    for name, start in (("a", 700), ("b", 900)):
+        values = [Gf.Vec2f(start + i, 0) for i in range(4 * COLUMNS * ROWS)]
+        UsdGeom.PrimvarsAPI(cape).CreatePrimvar(name, TINT.TexCoord2fArray, "faceVarying").Set(values)
+    change(stage, cape)
+    assert read_mesh(cape, np.eye(4)).uvs[0, 0] == 900
+
+
+@pytest.mark.parametrize(
+    ("kind", "interpolation", "given"),
+    [
+        ("TexCoord3fArray", "faceVarying", [Gf.Vec3f(i, 2, 3) for i in range(48)]),
+        ("FloatArray", "faceVarying", [1.0] * 48),
+        ("String", "constant", "map1"),
+        ("TexCoord2fArray", "constant", [Gf.Vec2f(0.5, 0.5)]),
+    ],
+)
+def test_whatever_is_called_st_is_read_as_what_it_is(hero, kind, interpolation, given):
+    """Two of three coordinates; what is no mapping is passed over for one that is."""
+    stage = Usd.Stage.Open(str(hero))
+    cape = stage.GetPrimAtPath("/Hero/Cape")
+    for prim in (cape, cape.GetChild("trim")):
+        prim.RemoveProperty("material:binding")
+    UsdGeom.PrimvarsAPI(cape).CreatePrimvar("st", getattr(TINT, kind), interpolation).Set(given)
+    expected = [1, 2] if kind == "TexCoord3fArray" else [1, -1]
+    np.testing.assert_array_equal(read_mesh(cape, np.eye(4)).uvs[1], expected)
+
+
+def test_a_primvar_that_is_blocked_stays_so(hero, tmp_path):
+    stage = Usd.Stage.Open(str(hero))
+    stage.GetPrimAtPath("/Hero/Cape").GetAttribute("primvars:lightmap").Block()
+    stage.Save()
+    shoot(worn(hero), tmp_path / "shot.usdc")
+    shot = Usd.Stage.Open(str(tmp_path / "shot.usdc"))
+    assert not UsdGeom.PrimvarsAPI(shot.GetPrimAtPath("/Hero/Cape")).GetPrimvar("lightmap").HasValue()
+    assert shot.GetPrimAtPath("/Hero/Body").GetAttribute("primvars:lightmap").HasValue()
+
+
 def test_a_package_holds_its_textures(hero, tmp_path):
     with packaged(tmp_path / "shot.usdz") as layer:
         shoot(worn(hero), layer)

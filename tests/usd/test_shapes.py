@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies and garments whose shape is a blendshape that is on: read as UsdSkel shows them."""
+"""Bodies and garments of a shape that is on: read as UsdSkel shows them. What shots change is told."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.reading.shapes import animated_shapes
+from ssilk_usd.reading.shown import shown_otherwise, tell_shown_otherwise
 
 from ssilk_core.scene import kinematics
 
@@ -140,3 +143,138 @@ def test_a_shape_of_a_body_that_a_joint_carries_is_read(tmp_path):
     stage.Save()
     (body,) = read_scene(path, garment="Cape")[0].bodies
     np.testing.assert_allclose(body.mesh.points, seen(path, "/Hero/Body", 1), atol=2e-6)
+
+
+def body(stage: Usd.Stage) -> UsdGeom.Mesh:
+    return UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body"))
+
+
+def sculpted(stage: Usd.Stage) -> None:
+    body(stage).GetPointsAttr().Set([point + Gf.Vec3f(0, 0, 5) for point in body(stage).GetPointsAttr().Get()])
+
+
+def cached(stage: Usd.Stage) -> None:
+    points = body(stage).GetPointsAttr().Get()
+    for code in (1, 5):
+        body(stage).GetPointsAttr().Set([point + Gf.Vec3f(0, 0, code - 1) for point in points], code)
+
+
+def unbound_cache(stage: Usd.Stage) -> None:
+    cached(stage)
+    UsdSkel.BindingAPI(body(stage)).GetSkeletonRel().SetTargets([])
+
+
+def breathing(stage: Usd.Stage) -> None:
+    """A corrective that the shot alone has."""
+    breath = UsdSkel.BlendShape.Define(stage, "/Hero/Body/Breath")
+    breath.CreateOffsetsAttr([Gf.Vec3f(0, 0, 4)] * 4)
+    binding = UsdSkel.BindingAPI(body(stage))
+    binding.GetBlendShapesAttr().Set(["Full", "Breath"])
+    binding.GetBlendShapeTargetsRel().AddTarget(breath.GetPath())
+    look = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Look"))
+    look.GetBlendShapesAttr().Set(["Other", "Full", "Breath"])
+    look.GetBlendShapeWeightsAttr().Set([0.0, 1.0, 0.0], 1)
+    look.GetBlendShapeWeightsAttr().Set([0.0, 1.0, 1.0], 5)
+
+
+def sculpted_shape(stage: Usd.Stage) -> None:
+    UsdSkel.BlendShape.Get(stage, "/Hero/Body/Full").GetOffsetsAttr().Set([Gf.Vec3f(0, 0, 9)] * 4)
+
+
+def over(folder: Path) -> tuple[str, Usd.Stage]:
+    hero = dressed(folder, [0.0, 1.0])
+    stage = Usd.Stage.CreateNew(str(folder / "shot.usda"))
+    stage.GetRootLayer().subLayerPaths.append("./hero.usda")
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    UsdGeom.SetStageUpAxis(stage, "Y")
+    return hero, stage
+
+
+@pytest.mark.parametrize("change", [sculpted, breathing, sculpted_shape])
+def test_a_body_of_another_shape_in_a_shot_is_told_with_how_far_it_is_off(tmp_path, change):
+    hero, stage = over(tmp_path)
+    change(stage)
+    stage.Save()
+    shot = str(tmp_path / "shot.usda")
+    rest = seen(hero, "/Hero/Body", 1)
+    off = max(np.linalg.norm(seen(shot, "/Hero/Body", code) - rest, axis=1).max() for code in (1, 5))
+    (told,) = shown_otherwise(hero, shot, garment="Cape")
+    assert told.startswith(f"it shapes Body otherwise, by up to {1000 * off:.3g} mm")
+
+
+def test_a_shape_that_is_told_by_its_name_is_told_once(tmp_path):
+    hero, stage = over(tmp_path)
+    UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Look")).GetBlendShapeWeightsAttr().Set([0.0, 0.5])
+    stage.Save()
+    told: list[str] = []
+    tell_shown_otherwise(hero, [str(tmp_path / "shot.usda")], lambda event: told.append(str(event)), garment="Cape")
+    assert len(told) == 1 and "'Full' of Body" in told[0]
+
+
+@pytest.mark.parametrize("name", ["Body", "Cape"])
+def test_a_part_that_a_shot_hides_is_told(tmp_path, name):
+    hero, stage = over(tmp_path)
+    visibility = UsdGeom.Imageable(stage.GetPrimAtPath(f"/Hero/{name}")).CreateVisibilityAttr()
+    visibility.Set("inherited", 1)
+    visibility.Set("invisible", 3)
+    stage.Save()
+    (told,) = shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")
+    assert told.startswith(f"{name} is hidden at time code 3; ")
+
+
+def test_a_part_that_the_character_itself_hides_in_time_is_told_beside_any_clip(tmp_path):
+    hero = dressed(tmp_path, [0.0, 1.0])
+    stage = Usd.Stage.Open(hero)
+    visibility = UsdGeom.Imageable(stage.GetPrimAtPath("/Hero/Body")).CreateVisibilityAttr()
+    visibility.Set("invisible", 1)
+    visibility.Set("inherited", 2)
+    stage.Save()
+    clip = Usd.Stage.CreateNew(str(tmp_path / "clip.usda"))
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Rig/Look", clip.GetRootLayer(), "/Look")
+    clip.Save()
+    (told,) = shown_otherwise(hero, str(tmp_path / "clip.usda"), garment="Cape")
+    assert told.startswith("Body is hidden at time code 1 of its own stage; ")
+
+
+def in_another_bind_pose(stage: Usd.Stage) -> None:
+    rig = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    moved = Gf.Matrix4d().SetTranslate(Gf.Vec3d(0, 30, 0))
+    rig.GetBindTransformsAttr().Set([bind * moved for bind in rig.GetBindTransformsAttr().Get()])
+    binding = UsdSkel.BindingAPI(body(stage))
+    binding.GetGeomBindTransformAttr().Set(binding.GetGeomBindTransformAttr().Get() * moved)
+
+
+def hidden_as_a_whole(stage: Usd.Stage) -> None:
+    UsdGeom.Imageable(stage.GetPrimAtPath("/Hero")).CreateVisibilityAttr().Set("invisible", 3)
+
+
+@pytest.mark.parametrize("change", [lambda stage: None, in_another_bind_pose, hidden_as_a_whole])
+def test_what_is_seen_as_the_character_has_it_is_not_told(tmp_path, change):
+    hero, stage = over(tmp_path)
+    change(stage)
+    stage.Save()
+    assert shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape") == []
+
+
+def test_a_body_that_is_a_point_cache_in_a_shot_is_told(tmp_path):
+    hero, stage = over(tmp_path)
+    unbound_cache(stage)
+    stage.Save()
+    (told,) = shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")
+    assert told.startswith("Body is a point cache, which is not followed; ")
+
+
+def test_later_points_of_a_skinned_mesh_are_not_shown_and_not_told(tmp_path):
+    hero, stage = over(tmp_path)
+    cached(stage)
+    stage.Save()
+    shot = str(tmp_path / "shot.usda")
+    np.testing.assert_array_equal(seen(shot, "/Hero/Body", 5), seen(hero, "/Hero/Body", 1))
+    assert shown_otherwise(hero, shot, garment="Cape") == []
+
+
+def test_a_motion_on_a_skeleton_without_bind_pose_is_no_fault(tmp_path):
+    hero, stage = over(tmp_path)
+    stage.GetPrimAtPath("/Hero/Rig").GetAttribute("bindTransforms").Block()
+    stage.Save()
+    assert shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape") == []

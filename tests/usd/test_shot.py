@@ -16,7 +16,9 @@ from ssilk_usd.reading.garment import read_garment
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.polygons import triangulate
 from ssilk_usd.reading.scene import read_scene
-from ssilk_usd.shots.layers import Layout, write_asset, write_points
+from ssilk_usd.shots.layers import Layout
+from ssilk_usd.shots.layers_animation import write_points
+from ssilk_usd.shots.layers_asset import write_asset
 from ssilk_usd.shots.play import Shot
 from ssilk_usd.shots.points import point_cache
 from ssilk_usd.shots.read import read_baked

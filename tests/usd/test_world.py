@@ -9,7 +9,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel, Vt
 from ssilk_usd.reading import colliders
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.posed import SkinnedMesh, skinning_of
-from ssilk_usd.reading.world import AskedWorld, find_world, read_world
+from ssilk_usd.reading.world import AskedWorld, find_world
 from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.errors import SsilkError
@@ -55,7 +55,8 @@ def codes() -> np.ndarray:
 def read(stage: Usd.Stage, *, garment: str | None = None, report=lambda event: None, **asked) -> ShotWorld | None:
     stage.GetRootLayer().Save()
     path = stage.GetRootLayer().realPath
-    return read_world(path, path, character(), motion(), AskedWorld(**asked), garment=garment, report=report)
+    found = find_world(path, path, character(), motion(), AskedWorld(**asked), garment=garment, report=report)
+    return found.read(report)
 
 
 def quad(stage: Usd.Stage, path: str, size: float = 100.0) -> UsdGeom.Mesh:
@@ -154,7 +155,7 @@ def test_a_skinned_collider_is_posed_by_usdskel(stage):
     colliding(body.GetPrim())
     stage.GetRootLayer().Save()
     path = f"{stage.GetRootLayer().realPath}:/Clip"
-    world = read_world(path, stage.GetRootLayer().realPath, character(), motion())
+    world = find_world(path, stage.GetRootLayer().realPath, character(), motion()).read()
     player = SkinnedMesh(body.GetPrim(), *skinning_of(stage)[body.GetPrim()])
     for frame, code in enumerate(codes()):
         expected = player.points(Usd.TimeCode(code), UsdGeom.XformCache(code)) @ TO_CORE["Z"].T * 0.01
@@ -286,7 +287,7 @@ def test_a_motion_is_written_with_its_gravity_and_wind(tmp_path, keyed):
     path, skeleton = tmp_path / "clip.usdc", character().skeleton
     write_motion(path, motion(), skeleton, world)
     again = read_motion(str(path), skeleton)
-    found = read_world(str(path), str(path), character(), again)
+    found = find_world(str(path), str(path), character(), again).read()
     np.testing.assert_allclose(found.gravity, pull, atol=1e-5)
     np.testing.assert_allclose(found.air.velocity, blown, atol=1e-5)
     np.testing.assert_allclose(found.air.gusts, np.abs(blown[:, 0]), atol=1e-5)
@@ -301,11 +302,11 @@ def test_the_stage_of_the_character_gives_what_the_shot_lacks(stage, tmp_path):
     home.GetRootLayer().Save()
     stage.GetRootLayer().Save()
     paths = stage.GetRootLayer().realPath, home.GetRootLayer().realPath
-    world = read_world(*paths, character(), motion())
+    world = find_world(*paths, character(), motion()).read()
     np.testing.assert_allclose(np.ptp(placed(world, 0), axis=0), [2, 2, 0])
     colliding(quad(stage, "/Floor", 50.0).GetPrim())
     stage.GetRootLayer().Save()
-    own = read_world(*paths, character(), motion())
+    own = find_world(*paths, character(), motion()).read()
     assert [each.path.rsplit("/", 1)[1] for each in own.colliders] == ["Floor"]
 
 
@@ -388,7 +389,7 @@ def test_the_body_of_another_character_of_a_crowd_is_met_by_each(stage, tmp_path
     stage.GetRootLayer().Save()
     shot, own = stage.GetRootLayer().realPath, home.GetRootLayer().realPath
     for name, other in ("Hero", "Twin"), ("Twin", "Hero"):
-        world = read_world(f"{shot}:/{name}/Walk", own, character(), motion())
+        world = find_world(f"{shot}:/{name}/Walk", own, character(), motion()).read()
         assert [each.path for each in world.colliders] == [f"{shot}:/{other}/Body"]
 
 

@@ -120,7 +120,7 @@ def _opened(path: Path, points: bool) -> ShotPlayer:
     """Open a shot, with the points that it offers beside joints where these are asked for."""
     if not points or path.suffix == GLB:
         return open_shot(path)
-    from ssilk_usd.shots.layers import with_points
+    from ssilk_usd.shots.layers_animation import with_points
 
     return with_points(path)
 

@@ -76,7 +76,7 @@ def write_glb_shot(
         provenance=provenance,
     )
     kept = "a glb keeps the garment's mean colour and one UV set of each mesh"
-    left = f"{kept}; other colours and sets, materials and subsets are left out"
+    left = f"{kept}; materials, subsets, sides, subdivision, other colours and sets are left out"
     told = summary(path, deformer, motion, TimeSpan.of(motion, start, samples_per_frame), shapes)
     return replace(told, left_out=left)
 

@@ -35,7 +35,8 @@ from .verification import verify_file
 from .write import result_of
 
 if TYPE_CHECKING:
-    from ssilk_usd.shots.layers import Layout, WrittenAsset
+    from ssilk_usd.shots.layers import Layout
+    from ssilk_usd.shots.layers_asset import WrittenAsset
     from ssilk_usd.writing.author import Asset
 
 
@@ -269,11 +270,11 @@ def _write_asset(
     layout: Layout, garment: LoadedGarment, task: BakeTask, use: GarmentUse, report: Reporter
 ) -> WrittenAsset:
     """Write the asset of a task where it is not there already; warn of changes that layers above may rely on."""
-    from ssilk_usd.shots import layers
+    from ssilk_usd.shots import layers_asset
 
     version, identifier = use.asset_version or garment.info.version, use.asset_identifier or ""
     riders = RiderJoints(garment.deformer, garment.riders, task.request.receiver.influences)
-    written = layers.write_asset(
+    written = layers_asset.write_asset(
         layout,
         riders.deformer,
         garment.units,
@@ -294,7 +295,7 @@ def _write_layer(
     layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter
 ) -> tuple[BakeResult, dict[Path, str]]:
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
-    from ssilk_usd.shots import layers
+    from ssilk_usd.shots import layers_animation
 
     rollout = refined(solved(rollout, report), report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
@@ -310,11 +311,11 @@ def _write_layer(
     }
     digests: dict[Path, str] = {}
     if task.points:
-        digests[layout.points] = layers.write_points(
+        digests[layout.points] = layers_animation.write_points(
             layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
         )
     with replacing(layout.animation) as unverified:
-        summary = layers.write_animation(
+        summary = layers_animation.write_animation(
             layout,
             asset,
             riders.deformer,

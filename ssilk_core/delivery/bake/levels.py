@@ -37,7 +37,7 @@ def _need_level(shot: Path, garment: str, base: str, levels: Mapping[str, str | 
     Args:
         levels: what each garment of the shot is a level of, None for nothing.
     """
-    from ssilk_usd.shots.layers import level_name
+    from ssilk_usd.shots.layers_stage import level_name
 
     where = f"{shot}: --level-of {base}"
     if complete and base not in levels:

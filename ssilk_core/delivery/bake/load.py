@@ -159,15 +159,19 @@ class LoadedGarment:
         return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
 
     def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
-        """Return a motion with the gravity and wind of its shot, where the network sees them."""
-        if not Sight.of(self.file).pull:
+        """Return a motion with the gravity, the wind and the colliders of its shot that the network sees."""
+        sight, scene = Sight.of(self.file), self.deformer.scene
+        if not (sight.pull or sight.colliders):
             return motion
-        from ...physics.world.felt import felt_gravity
+        from ...network.proximity import proximity, proximity_reach, proximity_vertices
+        from ...physics.world.felt import felt_gravity, felt_proximity
 
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
-        world = world_of(request.motion, request.stage, self.deformer.scene, motion, asked, colliders=False)
-        gravity = felt_gravity(world, motion, self.deformer.scene, self.file.fabric)
-        return motion if gravity is None else replace(motion, gravity=gravity)
+        world = world_of(request.motion, request.stage, scene, motion, asked, colliders=sight.colliders)
+        gravity = felt_gravity(world, motion, scene, self.file.fabric) if sight.pull else None
+        rows, reach = proximity_vertices(scene, self.file.config), proximity_reach(scene)
+        near = felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
+        return motion if gravity is near is None else replace(motion, gravity=gravity, proximity=near)
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""

@@ -18,7 +18,7 @@ from ...scene.kinematics import (
     deform,
     held_at_cuts,
     lbs_poses,
-    sample_gravity,
+    sample_felt,
     sample_motion,
     slerp,
     split_at_cuts,
@@ -211,8 +211,8 @@ class BakeRollout:
             driver = _from_fraction(source, skeleton, at[0])
             return driver if stop == self.lead + self.motion.frame_count else driver.clip(0, int(at[-1] - at[0]) + 2)
         position = held_at_cuts(source, skeleton, np.array(at).clip(0, source.frame_count - 1))
-        gravity, poses = sample_gravity(source, position), sample_motion(source, position)
-        return Motion(source.path, self.motion.fps / step, *poses, gravity=gravity)
+        felt, poses = sample_felt(source, position), sample_motion(source, position)
+        return Motion(source.path, self.motion.fps / step, *poses, **felt)
 
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
@@ -276,7 +276,7 @@ class BakeRollout:
 
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""
-        from ssilk_usd.reading.shapes import tell_animated_shapes
+        from ssilk_usd.reading.shown import tell_shown_otherwise
 
         from ...authoring.preflight.motion import joint_jumps, root_jumps
 
@@ -287,7 +287,7 @@ class BakeRollout:
             code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
-        tell_animated_shapes(self.request.stage, [self.source.path], report, root=self.request.root)
+        tell_shown_otherwise(self.request.stage, [self.source.path], report, root=self.request.root)
         if self.held_off:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
@@ -316,7 +316,5 @@ def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:
     rotations = slerp(motion.rotations[low], motion.rotations[high], part)
     step = motion.translations[high] - motion.translations[low]
     translations = motion.translations[low] + part[..., None] * step
-    start, gravity = motion.start + first - whole, motion.gravity
-    if gravity is not None:
-        gravity = gravity[low] + part[:, 0] * (gravity[high] - gravity[low])
-    return Motion(motion.path, motion.fps, rotations, translations, start, gravity)
+    felt = sample_felt(motion, low + part[:, 0] * (high - low))
+    return Motion(motion.path, motion.fps, rotations, translations, motion.start + first - whole, **felt)

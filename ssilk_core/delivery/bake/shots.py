@@ -37,7 +37,8 @@ def write_shot_stage(
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
             written.
     """
-    from ssilk_usd.shots.layers import Layout, write_stage
+    from ssilk_usd.shots.layers import Layout
+    from ssilk_usd.shots.layers_stage import write_stage
 
     # Several processes may finish at once. Each writes its record, then the stage from all records that it finds, and
     # does so again until it finds what it wrote the stage from. The last to rename its stage therefore sees every

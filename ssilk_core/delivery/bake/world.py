@@ -14,7 +14,7 @@ from ...files import split_location
 from ...scene.assets import Motion, Scene, ShotWorld
 
 if TYPE_CHECKING:
-    from ssilk_usd.reading.world import AskedWorld
+    from ssilk_usd.reading.world import AskedWorld, FoundWorld
 
     from ...network.checkpoint import ModelFile
 
@@ -66,12 +66,27 @@ def world_of(
     *,
     colliders: bool = True,
 ) -> ShotWorld | None:
-    """Return what surrounds a character at each frame of its motion, as `ssilk_usd.reading.world.read_world` does."""
-    from ssilk_usd.reading.world import read_world
+    """Return what surrounds a character at each frame of its motion; None where nothing does."""
+    return _found(source, stage, scene, motion, asked, report, colliders=colliders).read(report)
+
+
+def _found(
+    source: str,
+    stage: str,
+    scene: Scene,
+    motion: Motion,
+    asked: AskedWorld | None,
+    report: Reporter,
+    *,
+    colliders: bool = True,
+) -> FoundWorld:
+    """Return what `ssilk_usd.reading.world.find_world` finds around the character of a scene."""
+    from ssilk_usd.reading.world import find_world
 
     garment = split_location(scene.garment.mesh.path)[1]
-    found = scene.character, motion, asked
-    return read_world(source, stage, *found, garment=garment, colliders=colliders, report=report)
+    return find_world(
+        source, stage, scene.character, motion, asked, garment=garment, colliders=colliders, report=report
+    )
 
 
 @dataclass(frozen=True)
@@ -81,16 +96,18 @@ class Sight:
     Attributes:
         pull: whether it sees gravity and wind; absolute descriptors name the axes of the world.
         strength: whether it was trained under others than the usual gravity.
+        colliders: whether it sees them.
     """
 
     pull: bool
     strength: bool
+    colliders: bool
 
     @classmethod
     def of(cls, file: ModelFile) -> Sight:
         """Return that of a trained network."""
         blown = file.provenance.get("train", {}).get("wind_fraction", 0) > 0
-        return cls(file.config.descriptors == "relative", blown)
+        return cls(file.config.descriptors == "relative", blown, file.config.proximity_points > 0)
 
 
 def unseen(
@@ -111,14 +128,11 @@ def unseen(
     Args:
         drag: of the garment's fabric, by which air moves it.
     """
-    from ssilk_usd.reading.world import find_world
-
-    garment = split_location(scene.garment.mesh.path)[1]
-    found = find_world(source, stage, scene.character, motion, asked, garment=garment, report=report)
-    sees = {"wind": sight.pull and drag > 0, "its gravity": sight.pull}
+    found = _found(source, stage, scene, motion, asked, report)
+    sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
     told = [UNSEEN.format(" and ".join(missed))] if missed else []
-    if not sight.strength and len(missed) < len(found.parts):
+    if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
         told.append(STILL)
     return "; ".join(told)
 

@@ -224,7 +224,7 @@ class LatentShots:
         rest = model.initial(static)
         sound = rest.abs().amax(dim=1, keepdim=True) < DIVERGENCE_BOUND  # NaN is not less than anything
         rest = torch.where(sound, rest, torch.zeros_like(rest))
-        return rest, dynamic
+        return rest, model.completed(dynamic, model.described)
 
     def _advance(
         self,

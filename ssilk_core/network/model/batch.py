@@ -70,7 +70,14 @@ def _span_inputs(model: GarmentModel, motion: Motion) -> tuple[Tensor, ...]:
     static, pose = motion_descriptors(features, parameter)
     begins = torch.arange(motion.frame_count, device=parameter.device)[:, None] < REST_FRAMES
     origins = torch.as_tensor(world[:, skeleton.hub, :3, 3].copy()).to(parameter.device)
-    return model.initial(static), pose, body.matrices[..., 0], body.bend[..., 0], origins, begins
+    return (
+        model.initial(static),
+        model.completed(pose, model.described),
+        body.matrices[..., 0],
+        body.bend[..., 0],
+        origins,
+        begins,
+    )
 
 
 class BatchPlayer:

@@ -8,12 +8,16 @@ from torch import Tensor
 
 from ...scene.assets import Floats
 from ..descriptors import VECTORS, PoseFeatures
+from ..proximity import MOST
 
 DOWN = (0.0, -1.0, 0.0)  # where gravity points, but in training
 
 
 def motion_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, Tensor]:
-    """Return static descriptors (F, S) and dynamic ones (F, D) of frames under their own gravity, as `like` is."""
+    """Return static descriptors (F, S) and dynamic ones (F, D) of frames in their own surroundings, as `like` is.
+
+    Where no colliders are looked for, both lack the features of proximity (`GarmentModel.completed`).
+    """
 
     def tensor(values: Floats) -> Tensor:
         return torch.as_tensor(values).to(like)
@@ -22,6 +26,8 @@ def motion_descriptors(features: PoseFeatures, like: Tensor) -> tuple[Tensor, Te
     if features.gravity is not None:
         gravity = tensor(features.gravity)
     static = torch.cat([tensor(features.static), gravity_features(tensor(features.down), gravity)], dim=1)
+    if features.proximity is not None:
+        static = torch.cat([tensor(features.proximity), static], dim=1)
     earlier = gravity_features(tensor(features.earlier), gravity)
     return static, torch.cat([static, earlier, tensor(features.dynamic)], dim=1)
 
@@ -44,6 +50,17 @@ def turned_vectors(dynamic: Tensor, direction: Tensor, heading: Tensor) -> Tenso
 def gravity_features(down: Tensor, gravity: Tensor) -> Tensor:
     """Return gravity in each joint's frame: down (N, J', 3, 3), gravity as seen (N, 3), to (N, 3 J')."""
     return torch.einsum("njab,nb->nja", down, gravity).flatten(1)
+
+
+def proximity_length(distance: Tensor, reach: float) -> Tensor:
+    """Return the lengths of `network.proximity` at distances [m]."""
+    share = 1 - distance / reach
+    return torch.where(distance > 0, share.clamp_min(0) ** 2, (2 * share - 1).clamp_max(MOST))
+
+
+def proximity_features(vectors: Tensor, down: Tensor) -> Tensor:
+    """Return vectors (N, M, 3) in the root's frame (N, 3 M), from the world-to-root rotations (N, 3, 3)."""
+    return torch.einsum("nab,nmb->nma", down, vectors).flatten(1)
 
 
 def seen_gravity(units: Tensor) -> Tensor:

@@ -106,7 +106,7 @@ class FrameNetwork(nn.Module):
 def export_onnx(model: GarmentModel, path: str | Path) -> None:
     """Write the network as ONNX, atomically; the first dimension is a batch of any size."""
     network, config = FrameNetwork(model).eval(), model.config
-    static, rates = descriptor_sizes(model.scene, model.joints, config.descriptors)
+    static, rates = descriptor_sizes(model.scene, model.joints, config)
     sizes = (network.state_size, network.state_size, static, rates)
     frame = (*(torch.zeros(5, size) for size in sizes), torch.zeros(5, 1, dtype=torch.bool))
     inputs: tuple[str, ...] = INPUTS

@@ -13,6 +13,7 @@ from ...scene.assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ...scene.kinematics import ProxyAxes
 from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
+from ..proximity import proximity_size
 from ..settings import ModelConfig
 from .decoder import Decoder
 from .feedback import BodyFrames, DecodedState, Feedback
@@ -53,8 +54,9 @@ class GarmentModel(nn.Module):
         self.axes = ProxyAxes.of(scene)
         generator = torch.Generator().manual_seed(seed)
         self.decoder = Decoder(scene, config, generator)
-        static, dynamic = descriptor_sizes(scene, self.joints, config.descriptors)
-        z = config.latent
+        static, dynamic = descriptor_sizes(scene, self.joints, config)
+        self.proximity, self.described = proximity_size(scene, config), static + dynamic
+        self.static, z = static, config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
@@ -68,7 +70,13 @@ class GarmentModel(nn.Module):
 
     def initial(self, static: Tensor) -> Tensor:
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""
-        return self.integrator.bound(self.initialiser(static))
+        return self.integrator.bound(self.initialiser(self.completed(static, self.static)))
+
+    def completed(self, values: Tensor, size: int) -> Tensor:
+        """Return descriptors (..., size); those without features of proximity have nothing near."""
+        if self.proximity and values.shape[-1] == size - self.proximity:
+            return nn.functional.pad(values, (self.proximity, 0))
+        return values
 
     def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor.
@@ -76,7 +84,7 @@ class GarmentModel(nn.Module):
         Args:
             seen: what S sees of the cloth, as `seen` returns it.
         """
-        return self.integrator(self.stepper, before, now, rest, pose, seen)
+        return self.integrator(self.stepper, before, now, rest, self.completed(pose, self.described), seen)
 
     def decoded(self, z: Tensor, matrices: Tensor) -> DecodedState:
         """Return latents (N, latent) as the feedback looks back on them, under a character (J, 3, 4, N)."""
@@ -104,7 +112,7 @@ class GarmentModel(nn.Module):
             body: the character in the two frames before and in these, F + 2.
         """
         states, past = list(states), None
-        features = self.feedback.size
+        features, pose = self.feedback.size, self.completed(pose, self.described)
         precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1), features)
         if features and len(rest):
             past = self.decoded(states[-2], body.matrices[0]), self.decoded(states[-1], body.matrices[1])

@@ -21,7 +21,7 @@ class CharacterFrames:
     """Descriptors and skinning matrices of the character over F frames of a motion.
 
     Attributes:
-        static: static descriptors, gravity included, shape (F, S), float32.
+        static: static descriptors, proximity and gravity included, shape (F, S), float32.
         rates: dynamic part of the descriptors, shape (F, R), float32; relative ones are zero while the character
             holds still.
         all_matrices: skinning matrices relative to the root, of the two frames before and these, shape
@@ -51,18 +51,20 @@ class CharacterFrames:
 
 
 def character_frames(
-    motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0, kind: str = "relative"
+    motion: Motion, skeleton: Skeleton, joints: NDArray, lookback: int = 0, kind: str = "relative", seen: int = 0
 ) -> CharacterFrames:
     """Return descriptors and skinning matrices of a motion at the model's rate.
 
     Args:
         lookback: number of first frames, at most two, that only serve what looks back, and are none of the F frames.
         kind: of the descriptors.
+        seen: features of proximity, which are zero where the motion says of none.
     """
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, joints, world, kind)
     down, earlier = (_into(values, features.gravity) for values in (features.down, features.earlier))
-    static = np.concatenate([features.static, down], axis=1, dtype=np.float32)
+    near = np.zeros((len(down), seen)) if features.proximity is None else features.proximity
+    static = np.concatenate([near, features.static, down], axis=1, dtype=np.float32)
     rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback
     matrices, origins = _about_root(world[np.maximum(np.arange(-missing, len(world)), 0)], skeleton)

@@ -12,6 +12,7 @@ from ...errors import fail
 from ...scene.assets import Deformer
 from ..checkpoint import ModelFile
 from ..parameters import descriptor_sizes
+from ..proximity import proximity_size
 from .decoder import NumpyDecoder
 from .deformer import deformer
 from .feedback import ClothPoints
@@ -40,6 +41,7 @@ class NumpyGarment:
                 "play it in PyTorch with ssilk_core.network.rollout, or train with one of these",
             )
         self.file, self.skeleton = file, scene.character.skeleton
+        self.proximity = proximity_size(scene, config)  # features of it
         self.initialiser = layers(file.parameters, "initialiser")
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
@@ -47,7 +49,7 @@ class NumpyGarment:
         self.stepper: NumpyStepper[Any] | None = None
         if stepper := STEPPERS[config.scheme]:
             points = ClothPoints(file, self.decoder)
-            sizes = descriptor_sizes(scene, file.joints, config.descriptors)
+            sizes = descriptor_sizes(scene, file.joints, config)
             self.stepper = stepper(config, file.parameters, *sizes, points)
 
     def deformer(self) -> Deformer:

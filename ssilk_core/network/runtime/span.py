@@ -103,6 +103,7 @@ class RolledSpan:
             self.player.file.joints,
             lookback,
             self.player.file.config.descriptors,
+            self.player.proximity,
         )
 
     def _decoded(self, number: int) -> DecodedFrames:

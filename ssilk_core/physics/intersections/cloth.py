@@ -106,17 +106,8 @@ class ClothIntersections:
         Raises:
             ValueError: there is no frame.
         """
-        together = IntersectionCounts.joined([counts for _, counts in clips])
-        clip, worst = max(clips, key=lambda each: each[1].shares.max(initial=-1.0))
-        return SelfIntersections(
-            frames=len(together.shares),
-            triangles=len(self.mesh.faces),
-            mean=float(together.shares.mean()),
-            worst=float(worst.shares.max()),
-            clip=clip,
-            frame=float(worst.frames[worst.shares.argmax()]),
-            regions=self._regions(together.triangles),
-        )
+        triangles = IntersectionCounts.joined([counts for _, counts in clips]).triangles
+        return SelfIntersections.over(clips, len(self.mesh.faces), regions=self._regions(triangles))
 
     def _regions(self, triangles: Ints) -> dict[str, float]:
         """Return the shares of what intersects at the joints with the largest ones."""

@@ -97,18 +97,12 @@ class ClothLayers:
         Raises:
             ValueError: there is no frame.
         """
-        together = LayerCounts.joined([counts for _, counts in clips])
-        clip, worst = max(clips, key=lambda each: each[1].shares.max(initial=-1.0))
-        shown = together.shown
-        return LayerFigures(
+        shown = LayerCounts.joined([counts for _, counts in clips]).shown
+        return LayerFigures.over(
+            clips,
+            len(self.outer.faces),
             outer=self.names[0],
             inner=self.names[1],
-            frames=len(together.shares),
-            triangles=len(self.outer.faces),
-            mean=float(together.shares.mean()),
-            worst=float(worst.shares.max()),
-            clip=clip,
-            frame=float(worst.frames[worst.shares.argmax()]),
             shown=None if shown is None else float(shown.mean()),
             worst_shown=None if shown is None else float(shown.max()),
         )

@@ -55,10 +55,10 @@ class BlockedRays:
             if not len(rays):
                 break
             weights, distance = _meet(points[self.faces[at]], starts[rays], directions[rays])
-            through = (weights >= -EDGE_SLACK).all(axis=1)
+            through = weights.min(axis=0) >= -EDGE_SLACK
             hit = through & (distance >= low[rays]) & (distance <= high[rays])
             found[rays[hit]], distances[rays[hit]] = at[hit], distance[hit]
-            onward = self.neighbours[at, weights.argmin(axis=1)]
+            onward = self.neighbours[at, weights.argmin(axis=0)]
             on = ~through & (onward != NO_TRIANGLE)
             rays, at = rays[on], onward[on]
         missing = np.flatnonzero(found == NO_TRIANGLE)
@@ -74,9 +74,10 @@ class BlockedRays:
         found, distances = np.full(len(starts), NO_TRIANGLE), np.full(len(starts), np.inf)
         if not len(self.blocks):
             return found, distances
-        corners = points[self.faces[self.blocks]].reshape(len(self.blocks), -1, 3)
-        centres = (corners.min(axis=1) + corners.max(axis=1)) / 2
-        radii = np.linalg.norm(corners - centres[:, None], axis=2).max(axis=1) * (1 + EDGE_SLACK)
+        corners = np.ascontiguousarray(points.T)[:, self.faces[self.blocks].reshape(len(self.blocks), -1)]
+        centres = (corners.min(axis=2) + corners.max(axis=2)) / 2
+        radii = np.linalg.norm(corners - centres[..., None], axis=0).max(axis=1) * (1 + EDGE_SLACK)
+        centres = np.ascontiguousarray(centres.T)
         many = max(1, MAX_PAIRS // len(self.blocks))
         for first in range(0, len(starts), many):
             rays = slice(first, first + many)
@@ -87,7 +88,7 @@ class BlockedRays:
                 triangle = self.blocks[block[chosen]].reshape(-1)
                 weights, distance = _meet(points[self.faces[triangle]], starts[each], directions[each])
                 within = (distance >= low[each]) & (distance <= high[each])
-                hit = within & (weights >= -EDGE_SLACK).all(axis=1)
+                hit = within & (weights.min(axis=0) >= -EDGE_SLACK)
                 found[each[hit]], distances[each[hit]] = triangle[hit], distance[hit]
         return found, distances
 
@@ -110,23 +111,28 @@ def _meet(corners: Floats, starts: Floats, directions: Floats) -> tuple[Floats, 
         corners: (R, 3, 3); starts, directions: (R, 3).
 
     Returns:
-        Barycentric coordinates (R, 3) and distances along the lines (R,), not finite where they are parallel.
+        Barycentric coordinates (3, R) and distances along the lines (R,), not finite where they are parallel.
     """
-    a = corners[:, 0]
-    first, second, away = corners[:, 1] - a, corners[:, 2] - a, starts - a
-    across, turned = _cross(directions, second), _cross(away, first)
-    volume = (first * across).sum(axis=1)
+    # Long rows take numpy a fraction of the time of sums and minima over three columns.
+    a, b, c = (np.ascontiguousarray(corners[:, corner].T) for corner in range(3))
+    start, direction = np.ascontiguousarray(starts.T), np.ascontiguousarray(directions.T)
+    first, second, away = b - a, c - a, start - a
+    across, turned = _cross(direction, second), _cross(away, first)
+    volume = _dot(first, across)
     with np.errstate(divide="ignore", invalid="ignore"):
-        u = (away * across).sum(axis=1) / volume
-        v = (directions * turned).sum(axis=1) / volume
-        distance = (second * turned).sum(axis=1) / volume
-        return np.stack([1 - u - v, u, v], axis=1), distance
+        u, v = _dot(away, across) / volume, _dot(direction, turned) / volume
+        return np.stack([1 - u - v, u, v]), _dot(second, turned) / volume
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    """Return scalar products (R,) of vectors (3, R)."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _cross(a: Floats, b: Floats) -> Floats:
-    """Return cross products (R, 3); `numpy.cross` takes twice as long."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+    """Return cross products of vectors (3, R); `numpy.cross` takes twice as long."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def neighbouring_faces(faces: Ints) -> Ints:

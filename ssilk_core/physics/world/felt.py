@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gravity and wind as one acceleration for each frame, which networks are trained with.
+"""What cloth feels of the world around its character, as networks are trained with it.
+
+Gravity and wind are one acceleration for each frame.
 
 Drag pulls cloth of area density rho with (c / rho) (w - v), where v is its velocity and w that of the air. Networks
 are trained in air that moves with the character's root, w = r. Air that moves otherwise adds (c / rho) (w - r), which
 depends on no velocity of the cloth: where w is the same all over the garment, that is gravity of another strength and
 direction, and nothing else. An uneven wind is averaged over the garment as its body carries it.
+
+Colliders are seen from points of the garment that the body carries, too (`proximity`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from ...scene.assets import LOOSE, UP, Floats, Motion, Scene, ShotWorld, SkinWeights
+from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld, SkinWeights
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
 
 PLACES = 32  # vertices at which the air is averaged
+Proximity = Callable[[Floats, Floats], Floats]
 
 
 def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: Fabric) -> Floats | None:
@@ -33,17 +40,55 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     if world.gravity is not None:
         found = np.stack([world.between(world.gravity, float(each)) for each in seconds])
     if world.air and fabric.drag:
-        air, places = MovingAir(world.air, world.fps), _carried(motion, scene)
+        air, places = MovingAir(world.air, world.fps), _carried(motion, scene, _loose(scene))
         blown = np.stack([air.velocity(points, float(each)).mean(axis=0) for points, each in zip(places, seconds)])
         found += fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
     return found
 
 
-def _carried(motion: Motion, scene: Scene) -> Floats:
-    """Return some vertices of the loose cloth under linear blend skinning [m], shape (F, P, 3)."""
+def felt_proximity(
+    world: ShotWorld | None, motion: Motion, scene: Scene, rows: Ints, within: float, see: Proximity
+) -> Floats | None:
+    """Return how near colliders are to vertices `rows` (M,) in each frame of a motion, shape (F, M, 3).
+
+    Args:
+        world: as for `felt_gravity`.
+        within: distance up to which colliders count [m].
+        see: takes distances (M,) and directions away from what is nearest (M, 3), and returns vectors (M, 3).
+
+    Returns:
+        None where there are no colliders.
+    """
+    if world is None or not world.colliders or not len(rows):
+        return None
+    from .surroundings import VOTERS, Surroundings  # PyTorch, which live playback of wind and gravity does without
+
+    around, every = Surroundings([world], -GRAVITY * UP), np.arange(scene.garment.mesh.vertex_count)
+    points, voters = (_carried(motion, scene, some) for some in (rows, _spread(every, VOTERS)))
+    found = np.zeros((motion.frame_count, len(rows), 3))
+    for frame, (here, votes) in enumerate(zip(points, voters)):
+        distance, normal = np.full(len(rows), np.inf), np.zeros((len(rows), 3))
+        for collider in around.colliders(0, frame / motion.fps, np.zeros(3), votes):
+            near, met = collider.near(here, within)
+            closer = met.distance < distance[near]
+            distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
+        found[frame] = see(distance, normal)
+    return found
+
+
+def _loose(scene: Scene) -> Ints:
+    """Return some vertices of the loose cloth, or of all cloth where none is loose, shape (P,)."""
     loose = np.flatnonzero(scene.classes == LOOSE)
-    rows = loose if len(loose) else np.arange(scene.garment.mesh.vertex_count)
-    rows = rows[np.linspace(0, len(rows) - 1, min(PLACES, len(rows))).astype(int)]
+    return _spread(loose if len(loose) else np.arange(scene.garment.mesh.vertex_count), PLACES)
+
+
+def _spread(rows: Ints, count: int) -> Ints:
+    """Return so many of some vertices, or all."""
+    return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
+
+
+def _carried(motion: Motion, scene: Scene, rows: Ints) -> Floats:
+    """Return vertices of the cloth under linear blend skinning [m], shape (F, P, 3)."""
     skin, skeleton = scene.lbs_skin, scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])

@@ -192,11 +192,20 @@ class Surroundings:
             world = self._worlds[shot]
             at = self._gravity if world.gravity is None else world.between(world.gravity, seconds)
             gravity[frame] = at
-            own = [self._posed(each, world, seconds, roots[frame], points[..., frame]) for each in world.colliders]
-            colliders.append(tuple(each for each in own if each))
+            colliders.append(self.colliders(shot, seconds, roots[frame], points[..., frame]))
         down = torch.as_tensor(gravity.T.copy(), dtype=carried.dtype, device=carried.device)
         air = tuple(self._air[shot] for shot, _ in places)
         return PosedWorld(tuple(colliders), down, air, tuple(seconds for _, seconds in places), roots)
+
+    def colliders(self, shot: int, seconds: float, root: Floats, carried: Floats) -> tuple[PosedCollider, ...]:
+        """Return the colliders of a shot at a time, relative to a root (3,).
+
+        Args:
+            carried: vertices of the garment as the body carries it, relative to the root (V, 3).
+        """
+        world = self._worlds[shot]
+        own = [self._posed(each, world, seconds, root, carried) for each in world.colliders]
+        return tuple(each for each in own if each)
 
     def _posed(
         self, collider: Collider, world: ShotWorld, seconds: float, root: Floats, carried: Floats

@@ -20,6 +20,7 @@ from ...physics.simulate.characters import PosedCharacters
 from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.kinematics import first_place
+from .kept_parts import NOTHING_KEPT, KeptParts
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import mean_square
 
@@ -82,9 +83,22 @@ class Departures:
         return self.position[frames - 1]
 
 
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """Windows after some steps of a simulation: figures as `_departures` has them, and the state, None at the end."""
+
+    steps: int
+    figures: Tensor
+    state: StepHistory | None
+
+
 @torch.no_grad()
 def departures(
-    simulator: Simulator, windows: Sequence[MethodWindow], mass: Tensor, advanced: Callable[[int], object]
+    simulator: Simulator,
+    windows: Sequence[MethodWindow],
+    mass: Tensor,
+    advanced: Callable[[int], object],
+    kept: KeptParts = NOTHING_KEPT,
 ) -> Departures:
     """Simulate from the first two states of windows.
 
@@ -92,10 +106,11 @@ def departures(
         windows: of three frames or more, by decreasing length; the method is finite in all.
         mass: of the vertices [kg], shape (V,).
         advanced: called with the number of frames that were simulated since the last call.
+        kept: where simulations go on from, as far as they were simulated before.
     """
     frames = len(windows[0].x) - 2
     parts = [
-        _departures(simulator, windows[start : start + BATCH], mass.double(), advanced, frames)
+        _departures(simulator, windows[start : start + BATCH], mass.double(), advanced, frames, kept.of(start))
         for start in range(0, len(windows), BATCH)
     ]
     return Departures(*torch.cat(parts, dim=-1))
@@ -107,24 +122,41 @@ def _departures(
     mass: Tensor,
     advanced: Callable[[int], object],
     frames: int,
+    kept: KeptParts,
 ) -> Tensor:
     """Return the figures of `Departures` of one batch, shape (3, frames, N)."""
     found = torch.full((3, frames, len(windows)), torch.nan, dtype=torch.float64)
-    for step, (places, past, state) in enumerate(_steps(simulator, windows)):
+    begun = kept.get("windows", _Begun, windows[0].x.device)
+    if begun:
+        found[:, : begun.steps] = begun.figures[:, : begun.steps].cpu()
+        advanced(sum(min(len(window.x) - 2, begun.steps) for window in windows))
+    last = len(windows[0].x) - 2
+    for step, (places, past, state) in enumerate(_steps(simulator, windows, begun), begun.steps if begun else 0):
         away, moved = stacked(places, 0) - state.last, state.last - past.last
         lbs = state.lbs + state.root - past.lbs - past.root
         missed = [away, stacked(places, 0) - stacked(places, 1) - moved, lbs - moved]
         found[:, step, : len(places)] = torch.stack([mean_square(each, mass) for each in missed]).cpu()
         advanced(len(places))
+        if kept.due and step + 1 < last:
+            kept.put("windows", _Begun(step + 1, found, state))
+    if not begun or begun.state:
+        kept.put("windows", _Begun(last, found, None))
     return found
 
 
 def _steps(
-    simulator: Simulator, windows: Sequence[MethodWindow]
+    simulator: Simulator, windows: Sequence[MethodWindow], begun: _Begun | None = None
 ) -> Iterator[tuple[list[Place], StepHistory, StepHistory]]:
-    """Yield the places that are stepped to, and the simulator's states before and after each step."""
-    past = history(simulator, [(window, 2) for window in windows])
-    steps = [[(window, at) for window in windows if len(window.x) > at] for at in range(2, len(windows[0].x))]
+    """Yield the places that are stepped to, and the simulator's states before and after each step.
+
+    Args:
+        begun: whose steps are not taken again.
+    """
+    first = 2 + (begun.steps if begun else 0)
+    steps = [[(window, at) for window in windows if len(window.x) > at] for at in range(first, len(windows[0].x))]
+    if not steps:
+        return
+    past = begun.state if begun and begun.state else history(simulator, [(window, 2) for window in windows])
     states = simulator.carry_on(past, (poses_of(simulator, places) for places in steps))
     for places, state in zip(steps, states):
         yield places, past.first(len(places)), state

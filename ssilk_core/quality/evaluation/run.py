@@ -15,6 +15,7 @@ from ...network.model.network import GarmentModel
 from .asked import EvaluationClips, EvaluationOptions
 from .closed_loop import closed_loop
 from .figures import ClosedLoop, Figures, ResultRow, SolverErrors
+from .kept_parts import NOTHING_KEPT, KeptParts
 from .measured import MeasuredMethod, Probes
 from .methods import (
     CachedPoints,
@@ -40,16 +41,18 @@ def evaluate(
     options: EvaluationOptions | None = None,
     report: Reporter = silent,
     known: Sequence[ResultRow] = (),
+    kept: KeptParts = NOTHING_KEPT,
 ) -> Iterator[ResultRow]:
     """Yield the figures of linear blend skinning and of the simulator, where it has played, and of each method.
 
     Args:
         known: the first rows, as an evaluation of the same yielded them; they are not measured again.
+        kept: what an evaluation of the same measured of the others, bit for bit.
 
     Raises:
         SsilkError: no clip has four frames, a point cache is not of its clip, or two methods have one name.
     """
-    yield from _Run(dressed, methods, playlist, options or EvaluationOptions(), report, known).rows()
+    yield from _Run(dressed, methods, playlist, options or EvaluationOptions(), report, known, kept).rows()
 
 
 class _Run:
@@ -68,8 +71,10 @@ class _Run:
         options: EvaluationOptions,
         report: Reporter,
         known: Sequence[ResultRow],
+        kept: KeptParts,
     ) -> None:
         self.dressed, self.playlist, self.options, self.report = dressed, playlist, options, report
+        self.kept = kept
         skeleton, clips = dressed.scene.character.skeleton, playlist.clips.items()
         cut = [takes_of(name, motion, skeleton, dressed.fps, options.sequence) for name, motion in clips]
         self.takes = [take for takes in cut for take in takes]
@@ -90,7 +95,7 @@ class _Run:
             if place != (row.method, row.split):
                 break
             self.figures[place] = row.figures
-        left = sum(len(self._missing(name)) for name in self.methods)
+        left = sum(len(self._left(name)) for name in self.methods)
         total = sum(len(self._takes(name, playlist.splits)) for name in self.methods)
         self.told = Countdown(total, report, done=total - left)
         self._measured: dict[str, MeasuredMethod] = {}
@@ -109,10 +114,18 @@ class _Run:
         names &= self.playlist.simulated if method == SIMULATOR else names
         return [take for take in self.takes if take.clip in names]
 
-    def _missing(self, method: str) -> list[Take]:
-        """Return the takes of a method that rows are missing of."""
+    def _every(self, method: str) -> list[Take]:
+        """Return the takes of a method in all splits, known or not: in one batch of others, digits would differ."""
+        return self._takes(method, self.playlist.splits)
+
+    def _left(self, method: str) -> list[Take]:
+        """Return the takes of a method that are to be recorded."""
         missing = (split for name, split in self.planned if name == method and (name, split) not in self.figures)
-        return self._takes(method, missing)
+        clips, records = {take.clip for take in self._takes(method, missing)}, self._records(method)
+        return [take for n, take in enumerate(self._every(method)) if take.clip in clips and n not in records]
+
+    def _records(self, method: str) -> KeptParts:
+        return self.kept.of(method, "records")
 
     def rows(self) -> Iterator[ResultRow]:
         """Yield the rows, and let go of each method after its last."""
@@ -139,7 +152,7 @@ class _Run:
             **self._rested(method, split),
             pose_novelty=pose_novelty(tally, measured.distances) if measured.distances else None,
             loop_drift=joined_loop_drift(self._probed(method).loops.of(names)),
-            solver=self._solver_errors(measured, tally),
+            solver=self._solver_errors(measured, tally, self.kept.of(method, "solver", split)),
             closed_loop=self._closed_loop(measured, tally),
         )
 
@@ -164,11 +177,12 @@ class _Run:
         return self._method(method).tally(self.playlist.splits[split])
 
     def _method(self, name: str) -> MeasuredMethod:
-        """Return a method over all takes that its missing rows need."""
+        """Return a method over all its takes."""
         if name not in self._measured:
             playlist = replace(self.playlist, read=None) if name == SIMULATOR else self.playlist
-            takes = self._missing(name)
-            self._measured[name] = MeasuredMethod(self.dressed, self.methods[name], takes, playlist, self.told)
+            self._measured[name] = MeasuredMethod(
+                self.dressed, self.methods[name], self._every(name), playlist, self.told, self._records(name)
+            )
         return self._measured[name]
 
     def _probed(self, name: str) -> Probes:
@@ -177,25 +191,25 @@ class _Run:
             method = self.methods[name]
             if name == SIMULATOR:
                 method = replace(method, on=partial(Simulated, self.dressed))
-            self._probes[name] = Probes(self.dressed, method, self.takes, self.options)
+            self._probes[name] = Probes(self.dressed, method, self.takes, self.options, self.kept.of(name))
         return self._probes[name]
 
     def _rested(self, method: str, split: str) -> dict[str, Any]:
         """Return the figures of a method's stops in a split."""
         stops = self._probed(method).stops.of(self.playlist.splits[split])
         return {
-            "settling": joined_settling([after for after, _ in stops]),
-            "minimum": joined_minimum_errors([errors for _, errors in stops if errors]),
+            "settling": joined_settling([stop.settling for stop in stops]),
+            "minimum": joined_minimum_errors([stop.minimum for stop in stops if stop.minimum]),
         }
 
-    def _solver_errors(self, measured: MeasuredMethod, tally: Tally) -> SolverErrors | None:
+    def _solver_errors(self, measured: MeasuredMethod, tally: Tally, kept: KeptParts) -> SolverErrors | None:
         """Return how far a method is from the solver on some takes; None unless asked for, or for short takes."""
         takes, take_set = list(tally.records), measured.take_set
         windows = windows_of(self.dressed, take_set, takes) if self.options.solver else []
         if not windows:
             return None
         self.report(Message(f"the solver plays {len(windows)} windows and single steps from the method's own states"))
-        return solver_errors(self.dressed, take_set, measured.played, windows, self.report)
+        return solver_errors(self.dressed, take_set, measured.played, windows, self.report, kept)
 
     def _closed_loop(self, measured: MeasuredMethod, tally: Tally) -> ClosedLoop | None:
         """Return the closed loop of single steps on some takes; None but for networks with states of two frames."""

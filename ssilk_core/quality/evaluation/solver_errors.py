@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from ...events import Countdown, Reporter, silent
 from ...physics.simulate import Simulator
 from .figures import SolverErrors
+from .kept_parts import NOTHING_KEPT, KeptParts
 from .methods import EvaluationScene, LinearBlendSkinning, Method, TakeSet
 from .metrics import mean_square
 from .own_starts import MethodWindow, Place, Window, departures, history, poses_of, stacked
@@ -19,6 +21,14 @@ AFTER = (5, 10, 30, 60)  # frames after which the distance is measured
 LENGTH = 2 + AFTER[-1]  # frames of a window: two states that are given, and those simulated
 STEP_EVERY = 4  # frames between single steps
 BATCH = 64  # steps solved in parallel
+
+
+@dataclass(frozen=True, eq=False)
+class _SingleSteps:
+    """Energies above the minimum [J], and squared distances from it [m2], of N single steps, each (N,)."""
+
+    energy: Tensor
+    square: Tensor
 
 
 def windows_of(dressed: EvaluationScene, take_set: TakeSet, takes: Iterable[int]) -> list[Window]:
@@ -43,6 +53,7 @@ def solver_errors(
     method: Method,
     windows: Sequence[Window],
     report: Reporter = silent,
+    kept: KeptParts = NOTHING_KEPT,
 ) -> SolverErrors | None:
     """Measure single steps from the method's own past, and simulations from its own first two states.
 
@@ -50,6 +61,7 @@ def solver_errors(
 
     Args:
         windows: at least one, by decreasing length.
+        kept: what of them was measured before.
     """
     simulator = dressed.simulator
     played = [MethodWindow(dressed, take_set, method, window) for window in windows]
@@ -58,11 +70,14 @@ def solver_errors(
         return None
     singles = [(window, frame) for window in played for frame in range(2, len(window.x), STEP_EVERY)]
     told = Countdown(sum(len(window.x) - 2 for window in played) + len(singles), report)
-    away, steps = departures(simulator, played, dressed.energy.mass, told), []
+    away, steps = departures(simulator, played, dressed.energy.mass, told, kept), []
     for start in range(0, len(singles), BATCH):
-        steps.append(_single_steps(simulator, singles[start : start + BATCH], dressed.energy.mass))
-        told(len(steps[-1][0]))
-    energy, square = (torch.cat(values) for values in zip(*steps))
+        known = kept.get(f"single steps from {start}", _SingleSteps)
+        steps.append(known or _single_steps(simulator, singles[start : start + BATCH], dressed.energy.mass))
+        if not known:
+            kept.put(f"single steps from {start}", steps[-1])
+        told(len(steps[-1].energy))
+    energy, square = (torch.cat([getattr(each, name) for each in steps]) for name in ("energy", "square"))
     return SolverErrors(
         windows=len(played),
         lost=len(windows) - len(played),
@@ -76,11 +91,12 @@ def solver_errors(
     )
 
 
-def _single_steps(simulator: Simulator, places: Sequence[Place], mass: Tensor) -> tuple[Tensor, Tensor]:
-    """Return energies above the minimum [J] and squared distances from it [m2], each (N,)."""
+def _single_steps(simulator: Simulator, places: Sequence[Place], mass: Tensor) -> _SingleSteps:
+    """Solve one step to each place, from the method's own two states before it."""
     poses, past = poses_of(simulator, places), history(simulator, places)
     own = simulator.apply_pins(stacked(places, 0) - poses.root, poses)
     inputs, potential = simulator.inputs(poses, past), simulator.potential
     found = simulator.solve(own, inputs)
     energy = potential.energy(own, inputs, potential.body_distance(own, inputs))
-    return (energy - found.energy).cpu(), mean_square((own - found.x).double(), mass.double()).cpu()
+    away = mean_square((own - found.x).double(), mass.double())
+    return _SingleSteps((energy - found.energy).cpu(), away.cpu())

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,8 @@ class Motion:
         translations: local joint translations [m], shape (F, J, 3); roots are in world space.
         start: index of the first frame, counted from time zero at `fps`; it begins at `start / fps` seconds.
         gravity: acceleration that cloth feels, wind included [m/s2], shape (F, 3); None for the usual one.
+        proximity: to colliders at M points of a garment, as its network sees them (`network.proximity`), shape
+            (F, M, 3); None where it sees none.
     """
 
     path: str
@@ -30,6 +33,7 @@ class Motion:
     translations: Floats
     start: float = 0.0
     gravity: Floats | None = None
+    proximity: Floats | None = None
 
     def __post_init__(self) -> None:
         rotations, translations = frozen(self.rotations, np.float64), frozen(self.translations, np.float64)
@@ -55,23 +59,37 @@ class Motion:
                 fail(self.path, f"gravity of shape {gravity.shape}", f"({len(rotations)}, 3) is needed")
             need_finite(gravity, self.path, "frames of gravity")
             assign(self, gravity=gravity)
+        if self.proximity is not None:
+            proximity = frozen(self.proximity, np.float64)
+            if not (proximity.ndim == 3 and len(proximity) == len(rotations) and proximity.shape[2] == 3):
+                fail(self.path, f"proximity of shape {proximity.shape}", f"({len(rotations)}, points, 3) is needed")
+            need_finite(proximity, self.path, "frames of proximity")
+            assign(self, proximity=proximity)
 
     @property
     def frame_count(self) -> int:
         return len(self.rotations)
+
+    @property
+    def felt(self) -> dict[str, Any]:
+        """What cloth feels of the world around the character in each frame, by the name of its attribute."""
+        both = {"gravity": self.gravity, "proximity": self.proximity}
+        return {name: values for name, values in both.items() if values is not None}
 
     def same_frames(self, other: Motion) -> int:
         """Return in how many frames, from the first one on, another motion is the same; in none at another rate."""
         count = min(self.frame_count, other.frame_count)
         if self.fps != other.fps or self.rotations.shape[1] != other.rotations.shape[1]:
             return 0
-        if (self.gravity is None) != (other.gravity is None):
+        if {name: each.shape[1:] for name, each in self.felt.items()} != {
+            name: each.shape[1:] for name, each in other.felt.items()
+        }:
             return 0
         turned = (self.rotations[:count] != other.rotations[:count]).any(axis=(1, 2))
         moved = (self.translations[:count] != other.translations[:count]).any(axis=(1, 2))
         changed = turned | moved
-        if self.gravity is not None and other.gravity is not None:
-            changed |= (self.gravity[:count] != other.gravity[:count]).any(axis=1)
+        for own, others in zip(self.felt.values(), other.felt.values()):
+            changed |= (own[:count] != others[:count]).reshape(count, -1).any(axis=1)
         return int(np.append(changed, True).argmax())
 
     def clip(self, start: int, stop: int) -> Motion:
@@ -81,7 +99,7 @@ class Motion:
             rotations=self.rotations[start:stop],
             translations=self.translations[start:stop],
             start=self.start + start,
-            gravity=None if self.gravity is None else self.gravity[start:stop],
+            **{name: values[start:stop] for name, values in self.felt.items()},
         )
 
     def picked(self, frames: Ints | slice) -> Motion:
@@ -90,18 +108,16 @@ class Motion:
             self,
             rotations=self.rotations[frames],
             translations=self.translations[frames],
-            gravity=None if self.gravity is None else self.gravity[frames],
+            **{name: values[frames] for name, values in self.felt.items()},
         )
 
     def after(self, before: Motion) -> Motion:
-        """Return the frames of another motion, which feels gravity as this one does or not, followed by these."""
-        gravity = self.gravity
-        if gravity is not None and before.gravity is not None:
-            gravity = np.concatenate([before.gravity, gravity])
+        """Return the frames of another motion, which feels the world as this one does or not, followed by these."""
+        felt, earlier = self.felt, before.felt
         return replace(
             self,
             rotations=np.concatenate([before.rotations, self.rotations]),
             translations=np.concatenate([before.translations, self.translations]),
             start=self.start - before.frame_count,
-            gravity=gravity,
+            **{name: np.concatenate([earlier[name], felt[name]]) for name in felt if name in earlier},
         )

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...errors import EXIT_OK, EXIT_WORSE
+from ...errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ...events import Failed, Result, TaskEvent, read_event
 
 Slot = Mapping[str, str]  # environment variables that give a task its device
@@ -147,6 +147,8 @@ class Queue:
 
     def _end(self, running: _Running) -> None:
         code, task = running.process.wait(), running.task
+        if running.stopping and code == -signal.SIGINT:  # it was not yet listening
+            code = EXIT_INTERRUPTED
         if code not in (EXIT_OK, EXIT_WORSE) and not running.explained and not running.stopping:
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             self.tell(task.name, Failed(f"{task.log}: it ended by {how}; the last lines of this log say more."))

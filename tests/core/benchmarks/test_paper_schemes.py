@@ -120,7 +120,9 @@ def test_networks_roll_as_they_step_and_have_the_parameters_of_their_sizes(scene
     model = toy_model(scene, scheme=scheme)
     found = {name: tuple(value.shape) for name, value in model.state_dict().items()}
     assert parameter_shapes(scene, model.config, model.joints) == found
-    pose = torch.randn(6, 3, sum(descriptor_sizes(scene, model.joints)), generator=torch.Generator().manual_seed(1))
+    pose = torch.randn(
+        6, 3, sum(descriptor_sizes(scene, model.joints, model.config)), generator=torch.Generator().manual_seed(1)
+    )
     rest = model.initial(pose[..., : model.initialiser[0].in_features].flatten(0, 1)).unflatten(0, (6, 3))
     states = [rest[0], rest[0] + 0.1]
     body = toy_body(scene, 8, 3)

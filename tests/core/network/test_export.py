@@ -48,7 +48,7 @@ def exported(model, tmp_path_factory):
 
 def played(session, model, shots) -> list[np.ndarray]:
     """Play all shots at once; return weights (F, N, K + 1), rotations (F, N, P, 3, 3), translations (F, N, P, 3)."""
-    static = descriptor_sizes(model.scene, model.joints)[0]
+    static = descriptor_sizes(model.scene, model.joints, model.config)[0]
     sizes = {each.name: each.shape[1] for each in session.get_inputs()}
     before = now = np.zeros((shots.pose.shape[1], sizes["before"]), np.float32)
     names = [each.name for each in session.get_outputs()]

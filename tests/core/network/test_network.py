@@ -54,7 +54,7 @@ def test_the_seed_alone_decides_the_parameters(scene):
 def test_every_scheme_builds_and_steps(scene, scheme):
     model = fresh(scene, scheme=scheme)
     static = torch.randn(5, model.initialiser[0].in_features)
-    pose = torch.randn(5, sum(descriptor_sizes(scene, model.joints)))
+    pose = torch.randn(5, sum(descriptor_sizes(scene, model.joints, model.config)))
     rest = model.initial(static)
     assert model.step(rest, rest, rest, pose, torch.randn(5, 3 * model.feedback.count)).shape == (5, 8)
 
@@ -62,7 +62,9 @@ def test_every_scheme_builds_and_steps(scene, scheme):
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_rolling_windows_is_stepping_one_frame_after_the_other(scene, toy_model, toy_body, scheme):
     model = toy_model(scene, scheme=scheme)
-    pose = torch.randn(6, 3, sum(descriptor_sizes(scene, model.joints)), generator=torch.Generator().manual_seed(1))
+    pose = torch.randn(
+        6, 3, sum(descriptor_sizes(scene, model.joints, model.config)), generator=torch.Generator().manual_seed(1)
+    )
     rest = model.initial(pose[..., : model.initialiser[0].in_features].flatten(0, 1)).unflatten(0, (6, 3))
     states = [rest[0], rest[0] + 0.1]
     body = toy_body(scene, 8, 3)

@@ -180,7 +180,7 @@ def test_an_engine_plays_the_graph_alike(calm, scene, toy_motion, tmp_path, kind
     model, motion = calm(kind), toy_motion(scene, 20)
     export_onnx(model, tmp_path / "paper.onnx")
     session = onnxruntime.InferenceSession(tmp_path / "paper.onnx", providers=["CPUExecutionProvider"])
-    shots, static = motion_inputs(model, [motion]), descriptor_sizes(scene, model.joints, "absolute")[0]
+    shots, static = motion_inputs(model, [motion]), descriptor_sizes(scene, model.joints, model.config)[0]
     sizes = {each.name: each.shape[1] for each in session.get_inputs()}
     assert ("matrices" in sizes) == (model.feedback.count > 0)
     before = now = np.zeros((1, sizes["before"]), np.float32)

@@ -88,7 +88,7 @@ def test_derivatives_of_a_network_are_central_differences(scene, toy_model, toy_
     dice = torch.Generator().manual_seed(2)
     before, away, rest = 0.3 * torch.randn(3, 8, generator=dice, dtype=torch.float64)
     now = before + 0.2 * away
-    pose = torch.randn(sum(descriptor_sizes(scene, JOINTS)), generator=dice, dtype=torch.float64)
+    pose = torch.randn(sum(descriptor_sizes(scene, JOINTS, model.config)), generator=dice, dtype=torch.float64)
 
     def step(states: Tensor) -> Tensor:
         seen = model.seen_from(states[None, 0], states[None, 1], body)

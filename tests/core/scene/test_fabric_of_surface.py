@@ -12,7 +12,7 @@ import torch
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import Mesh, SurfaceMaterial
-from ssilk_core.scene.fabrics import FABRICS, fabric_of_surface, surface_message
+from ssilk_core.scene.fabrics import FABRICS, FRICTION, fabric_of_surface, surface_message
 
 YOUNG, POISSON, THICKNESS, WIDTH, LENGTH = 4e5, 0.25, 8e-4, 0.2, 0.5
 PLATE = SurfaceMaterial(
@@ -82,13 +82,15 @@ def test_stated_stiffnesses_go_before_young_and_what_is_not_said_is_the_default(
 
 def test_the_sentence_names_what_is_taken_and_what_is_lost():
     told = surface_message(PLATE, fabric_of_surface(PLATE))
-    assert "density 0.2 kg/m2" in told and "lame_mu 128 N/m" in told and "no place" not in told
+    assert "density 0.2 kg/m2" in told and "lame_mu 128 N/m" in told and "leaves out" not in told
     assert "1.07 times the lame_mu of the stiffest preset" in told
     odd = SurfaceMaterial(path="set.usda:/A", stretch=50.0, shear=40.0, others=("physics:dynamicFriction",))
     fabric = fabric_of_surface(odd)
     assert (fabric.lame_mu, fabric.lame_lambda) == (25.0, 0.0)
     told = surface_message(odd, fabric)
-    assert told.endswith("no place for physics:dynamicFriction, shear that is stiffer than half the stretch")
+    assert told.endswith(
+        f"leaves out physics:dynamicFriction, shear that is stiffer than half the stretch; {FRICTION}"
+    )
 
 
 @pytest.mark.parametrize(

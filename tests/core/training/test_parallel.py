@@ -261,6 +261,8 @@ def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path,
         score=Score({"stretch": total}, 0.0),
         lbs=Score({"stretch": 1.0}, 0.0),
         iterations=1,
+        model_iteration=1,
+        moves=True,
         finished=True,
         seconds=1.0,
     )

@@ -28,8 +28,9 @@ from ssilk_core.training.clock import RunClock
 from ssilk_core.training.parallel import ProcessGroup
 from ssilk_core.training.run import TrainingRun, train
 from ssilk_core.training.settings import PRESETS, TrainConfig
-from ssilk_core.training.state import load_state, state_path
+from ssilk_core.training.state import RunState, load_state, state_path
 from ssilk_core.training.step import learning_rate
+from ssilk_core.training.validation import Score, Validator
 
 from .test_training_run import SHORT, job  # noqa: F401  (a fixture)
 
@@ -185,10 +186,81 @@ def test_a_run_ends_with_its_time_and_goes_on_with_more(job, monkeypatch):  # no
     assert trained.finished and trained.iterations == 8
     assert any(event.text == "time is up at iteration 8 of 13" for event in said if isinstance(event, Message))
     progress = [event for event in said if isinstance(event, Progress)]
-    assert progress[-1].done == 8 and all(event.seconds_left <= 8 - event.done for event in progress)
+    assert progress[-1].done == 8
+    known = [(event.done, event.seconds_left) for event in progress if event.seconds_left is not None]
+    assert known and all(left < 8 - done + 1 for done, left in known)  # a validation ends it
     state, _ = load_state(state_path(job("early").output), job("early").identity())
     assert state.best and state.curve[-1].iteration == 8
-    assert train(job("early", minutes=9.0, resume=True), silent).iterations == 13
+    assert train(job("early", minutes=9.0, resume=True), said.append).iterations == 13
+    assert any(getattr(event, "text", "").startswith("of 9 minutes for the whole run, ") for event in said), said
+
+
+def test_the_countdown_foresees_dynamic_steps_and_validations(job, monkeypatch):  # noqa: F811
+    """Static steps of 1 s, the first of 30 s; dynamic ones of 4 s; validations of 5 s, and 2.5 s without a model."""
+    now, told = [0.0], []
+    monkeypatch.setattr(training.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(training, "CHECK_INTERVAL", 2)
+    monkeypatch.setattr(training, "FIRST_MODEL", inf)
+    asked = replace(
+        SHORT, iterations=20, static_fraction=0.5, validate_every=10, static_batch=2, pretraining_batch=2, batch=2,
+        window=5, initial_loss=False,
+    )  # fmt: skip
+    real, score, score_lbs = TrainingRun.step, Validator.score, Validator.lbs_score
+
+    def step(run: TrainingRun) -> None:
+        now[0] += 4.0 if run.state.iteration >= 10 else 1.0 if run.state.iteration else 30.0
+        real(run)
+
+    def scored(validator: Validator, model: object) -> Score:
+        now[0] += 5.0
+        return score(validator, model)
+
+    def scored_lbs(validator: Validator) -> Score:
+        now[0] += 2.5
+        return score_lbs(validator)
+
+    monkeypatch.setattr(TrainingRun, "step", step)
+    monkeypatch.setattr(Validator, "score", scored)
+    monkeypatch.setattr(Validator, "lbs_score", scored_lbs)
+    train(job("countdown", asked), lambda event: told.append((now[0], event)))
+    progress = [(at, event) for at, event in told if isinstance(event, Progress)]
+    assert [event.done for _, event in progress] == [1, *range(2, 21, 2)]
+    assert progress[0][1].seconds_left is None
+    for at, event in progress[2:]:
+        assert event.seconds_left == pytest.approx(now[0] - at, abs=0.5), event.done
+
+
+def test_validations_that_take_long_become_fewer(job):  # noqa: F811
+    clock = RunClock(job("long", minutes=2.0), RunState({}), training.time.monotonic())
+    clock.scored_lbs(1.0)
+    clock.state.validations = affordable_validations(PLAN, 120, clock.validation_seconds)
+    assert clock.state.validations == 6 and clock.validation_seconds == 2.0
+    clock.validated(30.0)
+    assert clock.state.validations == 1 and clock.validation_seconds == 30.0
+    clock.validated(10.0)  # not the one at the end
+    assert clock.validation_seconds == 30.0
+    quick = RunClock(job("long", minutes=2.0), RunState({}, validations=3), training.time.monotonic())
+    quick.scored_lbs(30.0)
+    quick.validated(1.0)
+    assert quick.state.validations == 3 and quick.validation_seconds == 1.0
+
+
+def test_a_run_whose_time_ends_in_static_training_has_not_moved(job, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(clock, "fitting_iterations", lambda *_: 13)
+    monkeypatch.setattr(budget, "MIN_ITERATIONS", 1)
+    asked = replace(SHORT, static_fraction=0.5)
+    for end, moves in ((3, False), (9, True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(RunClock, "time_left", property(lambda clock, end=end: end - clock.state.iteration))
+            trained = train(job(f"early_{end}", asked, minutes=1.0), silent)
+        assert trained.iterations == end and trained.moves == moves
+    still = train(job("still", replace(SHORT, iterations=2, static_fraction=0.99)), silent)
+    assert still.moves  # as it was asked for
+    quiet = job("quasi_static", asked, minutes=1.0)
+    quiet = replace(quiet, model=replace(quiet.model, scheme="quasi_static"))
+    with monkeypatch.context() as patch:
+        patch.setattr(RunClock, "time_left", property(lambda clock: 3 - clock.state.iteration))
+        assert train(quiet, silent).moves  # all that it can
 
 
 @pytest.mark.parametrize("resume", [False, True])

@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 from ssilk_core.cli import main
 from ssilk_core.cli import train as command
 from ssilk_core.devices import select_device
-from ssilk_core.errors import SsilkError
+from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import Checkpoint, Event, Message, Progress, Started, silent
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.network.model.network import GarmentModel
@@ -31,7 +31,7 @@ from ssilk_core.physics.intersections.contours import IntersectionContours
 from ssilk_core.physics.skin.covered_skin import CoveredSkin
 from ssilk_core.physics.skin.figures import ShownSkin
 from ssilk_core.scene.fabrics import Fabric
-from ssilk_core.training import divergence, validation
+from ssilk_core.training import divergence, fitting_batch, validation
 from ssilk_core.training import job as job_module
 from ssilk_core.training import run as training
 from ssilk_core.training.curve import CurvePoint, append_point, curve_path
@@ -347,7 +347,7 @@ def test_events_say_what_is_trained_and_how_it_goes(job, monkeypatch):
     assert started.total == 40 and started.detail["vertices"] == 60 and started.detail["proxies"] == 2
     progress = [event for event in events if isinstance(event, Progress)]
     assert [event.done for event in progress] == [1, 20, 40]
-    assert progress[-1].seconds_left == 0
+    assert progress[0].seconds_left is None and progress[-1].seconds_left > 0  # a validation is still to come
     assert set(progress[-1].terms) == {*TERMS, "drag"} - {"stitch"}  # a garment of one island has none
     judged = [event.text for event in events if isinstance(event, Message) and "validation at" in event.text]
     assert len(judged) == 2 and "under linear blend skinning's" in judged[0]
@@ -480,7 +480,7 @@ def test_what_stays_broken_stops_with_the_window_to_study(job, monkeypatch, scen
 
 def test_the_batch_is_lowered_to_fit_and_that_is_said(job, monkeypatch):
     small = job("lowered", replace(SHORT, batch=4000, pretraining_batch=90_000, iterations=1, static_fraction=0.0))
-    monkeypatch.setattr(training, "free_memory", lambda device: 1 << 30)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 1 << 30)
     events: list[Event] = []
     monkeypatch.setattr(Stepper, "run", lambda self, iteration: None)
     run = training.TrainingRun(small, events.append)
@@ -500,13 +500,13 @@ def test_a_run_lowered_to_fit_is_resumed_as_it_was(job, monkeypatch):
     )
     runs = []
     for megabytes in (400, 500, 330):
-        monkeypatch.setattr(training, "free_memory", lambda device, size=megabytes << 20: size)
+        monkeypatch.setattr(fitting_batch, "free_memory", lambda device, size=megabytes << 20: size)
         runs.append(training.TrainingRun(replace(big, resume=bool(runs)), silent).config)
     assert runs[0] == runs[1] == runs[2] and runs[0].batch < 4000
 
 
 def test_a_batch_of_one_that_cannot_fit_is_refused(job, monkeypatch):
-    monkeypatch.setattr(training, "free_memory", lambda device: 30 << 20)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 30 << 20)
     with pytest.raises(SsilkError, match=r"/toy/strip: a batch of one window of 5 poses needs .* GiB are free"):
         train(job("tiny"), silent)
 
@@ -590,7 +590,7 @@ def may_have(monkeypatch):
     if not torch.cuda.is_available():
         pytest.skip("needs a GPU")
     whole = torch.cuda.get_device_properties(0).total_memory
-    monkeypatch.setattr(training, "free_memory", lambda device: 1 << 50)
+    monkeypatch.setattr(fitting_batch, "free_memory", lambda device: 1 << 50)
     yield lambda size: torch.cuda.set_per_process_memory_fraction(min(1.0, size / whole))
     torch.cuda.set_per_process_memory_fraction(1.0)
 
@@ -843,12 +843,32 @@ def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goe
     for name in ("hero.usda", "walks"):
         (tmp_path / name).touch()
     model = tmp_path / "skirt.safetensors"
-    trained = training.TrainingResult(True, 86, shows, Score({"stretch": 1.0}, 0.0), 360.0)
+    trained = training.TrainingResult(True, 86, 80, shows, Score({"stretch": 1.0}, 0.0), True, 360.0)
     monkeypatch.setattr(training, "train", lambda *_: trained)
     ready = SimpleNamespace(train=TrainConfig(iterations=500), is_trainable=True)
     monkeypatch.setattr(command, "training_job", lambda *_: ready)
     words = ["train", "hero.usda", "--motions", "walks", "-o", str(model), "--device", "cpu"]
-    assert main(words) == 0 and "86 of 500 iterations" in capsys.readouterr().err
+    assert main(words) == 0
+    shown = capsys.readouterr().err
+    assert "86 of 500 iterations" in shown and "iterations: 86\n  the model is of iteration: 80\n" in shown
+    monkeypatch.setattr(training, "train", lambda *_: replace(trained, moves=False))
+    assert main(words) == EXIT_WORSE and "it has not learned to move" in capsys.readouterr().err
+
+
+def test_a_result_says_which_iteration_its_figures_are_of(job, monkeypatch):
+    """The second of two validations is worse."""
+    score, totals = Validator.score, iter([0.0, 1.0])
+
+    def scored(validator, model):
+        found = score(validator, model)
+        return replace(found, terms={**found.terms, "stretch": found.terms["stretch"] + next(totals)})
+
+    monkeypatch.setattr(Validator, "score", scored)
+    asked = job("second_is_worse", replace(SHORT, iterations=8, validate_every=4))
+    trained = train(asked, silent)
+    assert (trained.iterations, trained.model_iteration) == (8, 4)
+    assert load_model(asked.output).provenance["iteration"] == 4
+    assert load_model(asked.output).provenance["validation"]["total"] == pytest.approx(trained.score.total)
 
 
 def test_a_slow_training_has_a_model_before_its_first_validation(job, monkeypatch):

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convert UsdGeom meshes to core meshes: points, triangles, polygons and texture coordinates."""
+"""Convert UsdGeom meshes to core meshes: points, triangles and polygons, with texture coordinates of `uv_sets`."""
 
 from __future__ import annotations
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Mesh
@@ -12,7 +12,6 @@ from ssilk_core.scene.assets import Floats, Ints, Mesh
 from ..names import CLASS, GARMENT, GEOM_BIND, PROXIES, RIDES_ON, SKEL
 from ..opening.stage import (
     EARLIEST,
-    PRIMS,
     apply,
     column_matrix,
     has_value,
@@ -24,6 +23,7 @@ from ..opening.stage import (
 )
 from ..opening.times import change_times, visibility_attributes
 from .polygons import triangulate
+from .uv_sets import texture_coordinates
 
 
 def is_garment(prim: Usd.Prim) -> bool:
@@ -154,57 +154,3 @@ def placement(prim: Usd.Prim) -> Floats:
     bind = inherited(prim, GEOM_BIND)
     matrix = None if bind is None else bind.Get(EARLIEST)
     return np.eye(4) if matrix is None else column_matrix(matrix)
-
-
-def texture_coordinates(prim: Usd.Prim, indices: Ints) -> Floats | None:
-    """Return (u, v) for each face corner from the UV set of the mesh, or None."""
-    chosen = _uv_set(prim)
-    if chosen is None:
-        return None
-    uvs = np.array(chosen.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1, 2)
-    if chosen.GetInterpolation() == UsdGeom.Tokens.faceVarying:
-        expected, corners = len(indices), np.arange(len(indices), dtype=np.int64)
-    elif chosen.GetInterpolation() in (UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
-        expected, corners = len(value(prim, "points")), indices.astype(np.int64)
-    else:
-        return None  # one value per face or mesh is not a mapping
-    if len(uvs) != expected:
-        fail(
-            location(prim),
-            f"{chosen.GetName()} holds {len(uvs)} texture coordinates for {expected} "
-            f"({chosen.GetInterpolation()} interpolation)",
-            "one for each is needed",
-            "unwrap the mesh again, or remove them",
-        )
-    return uvs[corners]
-
-
-def _uv_set(prim: Usd.Prim) -> UsdGeom.Primvar | None:
-    """Return the UV set that the mesh's material reads, else `primvars:st`, else one of a usual name, else any."""
-    primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
-    sets = {str(each.GetPrimvarName()): each for each in primvars if each.GetTypeName() in _TEXTURE_TYPES}
-    st = [each for each in primvars if each.GetPrimvarName() == "st"]
-    read = [sets[name] for name in _names_read(prim) if name in sets]
-    usual = [sets[name] for name in _USUAL_UV_SETS if name in sets]
-    return next(iter([*read, *st, *usual, *sets.values()]), None)
-
-
-def _names_read(prim: Usd.Prim) -> list[str]:
-    """Return the primvars that the material of a mesh, or those of its subsets, look up for textures."""
-    names = []
-    for holder in (prim, *(subset.GetPrim() for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)))):
-        material, _ = UsdShade.MaterialBindingAPI(holder).ComputeBoundMaterial()
-        for each in Usd.PrimRange(material.GetPrim(), PRIMS) if material else ():
-            shader = UsdShade.Shader(each)
-            if shader and str(shader.GetIdAttr().Get() or "").startswith("UsdPrimvarReader_float2"):
-                found = UsdShade.Utils.GetValueProducingAttributes(shader.GetInput("varname"))
-                names += [str(attribute.Get()) for attribute in found]
-    return names
-
-
-_USUAL_UV_SETS = ("UVMap", "map1", "uv", "uv0", "UV0", "Texture_uv")
-_TEXTURE_TYPES = (
-    Sdf.ValueTypeNames.TexCoord2fArray,
-    Sdf.ValueTypeNames.TexCoord2dArray,
-    Sdf.ValueTypeNames.TexCoord2hArray,
-)

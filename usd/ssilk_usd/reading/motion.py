@@ -29,6 +29,7 @@ from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
 from .animation import PosedJoints, animation_source, posed_joints
 from .clips import LOOKED_AT, ClipSpace, Posture, clip_space, spread
+from .hierarchy import beneath_rest, placed_at_rest, to_parents_of
 from .skeleton import of_bodies, skeletons
 from .skin import match_joints, need_unique
 from .spaces import joints_to_core, need_similarity, similarity_scale
@@ -85,8 +86,8 @@ def read_motion(
     Frames run from the first to the last authored sample, whatever range the stage says; USD interpolates between
     samples. On a character, the root joints include the xforms above the skeleton, animated or not, and the animation
     poses the joints that UsdSkel poses; one that stands alone may be in the space of the character's skeleton
-    (`clips`). Joints are matched by path, then by unique leaf name. Joints that the animation lacks stay in the rest
-    pose.
+    (`clips`). Joints are matched by path, then by unique leaf name, and are where the motion has them, beneath
+    whichever parents (`hierarchy`). Joints that the animation lacks stay in the rest pose.
 
     Args:
         source: a file with a SkelAnimation, as "file[:/Prim/Path]", or a stage with an animated character.
@@ -133,10 +134,14 @@ def read_motion(
         if posed:
             at_rest = np.broadcast_to(posed.rest, (len(authored), *posed.rest.shape))
             authored = np.where((posed.source < 0)[:, None, None], at_rest, authored[:, posed.source])
-        authored = authored[:, match]
+        names, metres = posed.names if posed else joints, scale * units.meters_per_unit
+        authored = to_parents_of(skeleton, authored, names, match, metres, alone=placed is None)
         placement = placements[part] if placed else placements
         local = joints_to_core(authored, skeleton.parents, placement, units, scale)
         local[:, match < 0] = skeleton.rest_transforms[match < 0]
+        for joint in np.flatnonzero((match < 0) & (np.asarray(skeleton.parents) < 0)) if placed else ():
+            local[:, joint] = placed_at_rest(skeleton, joint, units.matrix @ placement, units.matrix)
+        beneath_rest(skeleton, local, names, match, units.matrix @ placement)
         if not first:
             kept = match >= 0
             _check_lengths(local[:, kept], skeleton.rest_transforms[kept], skeleton.parents[kept], where)
@@ -164,9 +169,12 @@ def clip_posture(motion: Motion, skeleton: Skeleton) -> Posture | None:
 
 def _space(animation: Usd.Prim, joints: tuple[str, ...], match: Ints, codes: Floats, skeleton: Skeleton) -> ClipSpace:
     """Return the space of an animation that stands alone, of a character whose Xforms place it."""
+    assert skeleton.placement is not None
     stage = animation.GetStage()
     turns, places = read_samples(animation, spread(codes, LOOKED_AT), len(joints), location(animation))
-    local = rigid(matrix_from_quaternion(turns), places)[:, match]
+    metres = similarity_scale(skeleton.placement)
+    authored = rigid(matrix_from_quaternion(turns), places)
+    local = to_parents_of(skeleton, authored, joints, match, metres, alone=True)
     says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
     return clip_space(local, match, StageUnits.of(stage), skeleton, says_axis=says_axis)
 

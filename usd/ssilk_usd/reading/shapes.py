@@ -25,9 +25,9 @@ from .spaces import SkelSource
 SAME = 1e-3  # difference of weights that nobody sees
 
 
-def shape_offsets(prim: Usd.Prim, skel: SkelSource) -> Floats | None:
+def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> Floats | None:
     """Return how far the blendshapes that are on move a mesh's points in its own space, (V, 3); None without any."""
-    weights = _weights(prim, skel)
+    weights = _weights(prim, skel, code)
     if weights is None or not np.any(weights):
         return None
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
@@ -39,15 +39,15 @@ def shape_offsets(prim: Usd.Prim, skel: SkelSource) -> Floats | None:
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
-def _weights(prim: Usd.Prim, skel: SkelSource) -> list[float] | None:
-    """Return the weight of each blendshape of a mesh at the earliest time; None where nothing weighs them."""
+def _weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:
+    """Return the weight of each blendshape of a mesh at a time; None where nothing weighs them."""
     cache = UsdSkel.Cache()
     cache.Populate(UsdSkel.Root(skel.root), PRIMS)
     query = cache.GetSkinningQuery(prim)
     animation = cache.GetSkelQuery(UsdSkel.Skeleton(skel.prim)).GetAnimQuery()
     if not (query and query.HasBlendShapes() and animation):
         return None
-    found, mapper = animation.ComputeBlendShapeWeights(EARLIEST), query.GetBlendShapeMapper()
+    found, mapper = animation.ComputeBlendShapeWeights(code), query.GetBlendShapeMapper()
     if found is None or mapper is None or mapper.IsNull():
         return None
     remapped = mapper.Remap(found)

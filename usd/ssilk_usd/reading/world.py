@@ -79,13 +79,7 @@ class FoundWorld:
         Raises:
             SsilkError: a collider cannot be one.
         """
-        if not self.parts:
-            return None
-        if self.met:
-            prims = [prim for prim, _ in self.met]
-            some = f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
-            report(Message(f"{stage_name(self.stage)}: cloth meets {some}"))
-        return ShotWorld(self.fps, tuple(read_colliders(self.met, self.codes)), self.gravity, self.air)
+        return _with_shapes(self.stage, self, report) if self.parts else None
 
 
 @explains_damage
@@ -137,26 +131,13 @@ def find_world(
 
 
 @explains_damage
-def read_world(
-    source: str,
-    stage: str,
-    character: Character,
-    motion: Motion,
-    asked: AskedWorld | None = None,
-    *,
-    garment: str | None = None,
-    colliders: bool = True,
-    report: Reporter = silent,
-) -> ShotWorld | None:
-    """Return what surrounds a character at each frame of its motion; None where nothing does.
-
-    Arguments are those of `find_world`.
-
-    Raises:
-        SsilkError: as `find_world` and `FoundWorld.read` do.
-    """
-    found = find_world(source, stage, character, motion, asked, garment=garment, colliders=colliders, report=report)
-    return found.read(report)
+def _with_shapes(stage: Usd.Stage, found: FoundWorld, report: Reporter) -> ShotWorld:
+    """Return what was found in a stage with its shapes."""
+    if found.met:
+        prims = [prim for prim, _ in found.met]
+        some = f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
+        report(Message(f"{stage_name(stage)}: cloth meets {some}"))
+    return ShotWorld(found.fps, tuple(read_colliders(found.met, found.codes)), found.gravity, found.air)
 
 
 def _colliding(

@@ -21,7 +21,8 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Garment, Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
-from ..reading.mesh import display_colour, is_garment, kept_faces, polygons, texture_coordinates
+from ..reading.mesh import display_colour, is_garment, kept_faces, polygons
+from ..reading.uv_sets import texture_coordinates
 from .body_faces import face_kind
 from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited_primvars
 from .look_spaces import keep_colour_space, move_spaces
@@ -35,7 +36,7 @@ _OTHER_SPACES = (
     *OTHER_PRIMVARS, "xformOp:", "skel:", "ssilk:", "physics:", "omniphysics:", "physx", "material:binding",
 )  # fmt: skip
 _LEFT = ("normals", "primvars:normals", "velocities", "accelerations")
-_METADATA = ("customData", "assetInfo", "displayName", "documentation", "kind")
+_METADATA = ("customData", "assetInfo", "displayName", "documentation", "comment", "hidden", "kind")
 _OTHER_SCHEMAS = ("Skel", "Ssilk", "MaterialBinding", "Physics", "Physx", "Omni", "Deformable")
 
 
@@ -316,7 +317,7 @@ def _keep_rows(layer: Sdf.Layer, look: LookSource, to: Sdf.Path, name: str) -> N
     spec = layer.GetAttributeAtPath(to)
     values, rows = spec.default, look.corners if kind == "corner" else look.faces
     size = UsdGeom.Primvar(look.prim.GetAttribute(name)).GetElementSize() if not name.endswith(":indices") else 1
-    if values is None or len(values) < size * len(rows):
+    if isinstance(values, Sdf.ValueBlock | None) or len(values) < size * len(rows):
         return
     chosen = (rows[:, None] * size + np.arange(size)).reshape(-1)
     if hasattr(values, "FromNumpy"):

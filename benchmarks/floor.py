@@ -1,0 +1,119 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much cloth lies below the floor: the network that sees it, and the same one where it does not.
+
+    python benchmarks/floor.py --stage character.usdc --motions FOLDER --index FOLDER/index.json --split test
+
+The floor of each clip is level and touches the lowest point that the body reaches in it. Told are the share of the
+garment's vertices that lie more than 5 mm below it in the first --frames of each clip, the worst frame, and how many
+frames have a vertex there; and how deep the deepest lies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from helpers.reports import table
+from helpers.subjects import Subject, open_subject
+from ssilk_usd.reading.motion import read_motion
+from ssilk_usd.stages import demo_body_path
+
+from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
+from ssilk_core.network.runtime import Player
+from ssilk_core.physics.world.felt import felt_proximity
+from ssilk_core.scene.assets import Collider, Floats, Motion, Scene, ShotWorld
+from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
+
+BELOW = 5e-3  # [m]
+SIZE = 100.0  # [m] of the floor
+PLACES = 1000  # vertices of the body that find its lowest point
+
+
+@dataclass(frozen=True)
+class Sunk:
+    """Cloth below a floor: mean and worst share of the vertices, share of the frames, and greatest depth [m]."""
+
+    mean: float
+    worst: float
+    frames: float
+    depth: float
+
+    @classmethod
+    def of(cls, heights: Floats) -> Sunk:
+        """Return that of vertices (F, V) above the floor [m]."""
+        below = heights < -BELOW
+        share = below.mean(axis=1)
+        return cls(share.mean(), share.max(), below.any(axis=1).mean(), max(0.0, -heights.min()))
+
+
+def floor_of(scene: Scene, motion: Motion) -> float:
+    """Return the height of the lowest point that a body reaches in a motion [m]."""
+    body, skeleton = scene.character.merged_body(), scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    rows = np.linspace(0, body.mesh.vertex_count - 1, min(PLACES, body.mesh.vertex_count)).astype(int)
+    skin = replace(body.skin, indices=body.skin.indices[rows], weights=body.skin.weights[rows])
+    return float(skin_points(body.mesh.points[rows], skin, matrices)[..., 1].min())
+
+
+def floor_world(motion: Motion, height: float) -> ShotWorld:
+    """Return a world with a floor at a height [m]."""
+    corners = np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]]) * SIZE + [0, height, 0]
+    faces, whole = np.array([[0, 1, 2], [0, 2, 3]]), np.ones(1, dtype=bool)
+    return ShotWorld(motion.fps, (Collider("the floor", faces, corners[None], np.eye(4)[None], whole),))
+
+
+def seeing(subject: Subject, motion: Motion, world: ShotWorld) -> Motion:
+    """Return a motion whose garment sees the colliders of a world."""
+    rows, reach = proximity_vertices(subject.scene, subject.file.config), proximity_reach(subject.scene)
+    near = felt_proximity(world, motion, subject.scene, rows, reach, partial(proximity, reach=reach))
+    return replace(motion, proximity=near)
+
+
+def heights_of(player: Player, motion: Motion, floor: float) -> Floats:
+    """Return how far vertices are above a floor [m], shape (F, V)."""
+    playback = player.play(motion)
+    return np.stack([playback.vertices(frame)[:, 1] for frame in range(motion.frame_count)]) - floor
+
+
+def main() -> None:
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("--model", type=Path, default=shipped_path("cape"), metavar="FILE")
+    found.add_argument("--stage", type=Path, default=demo_body_path(), help="USD file with the character")
+    found.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="of motion files CLIP.usdc")
+    found.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
+    found.add_argument("--split", default="test", help="of the clips (default test)")
+    found.add_argument("--frames", type=int, default=300, help="of each clip, at the model's rate (default 300)")
+    options = found.parse_args()
+    subject = open_subject(options.model, options.stage, "cpu")
+    player, rows = Player(subject.file), []
+    every: dict[str, list[Floats]] = {"sees it": [], "does not": []}
+    for entry in json.loads(options.index.read_text()):
+        if entry["split"] != options.split:
+            continue
+        motion = read_motion(options.motions / f"{entry['clip']}.usdc", subject.scene.character.skeleton)
+        motion = resample(motion, subject.file.config.fps).clip(0, options.frames)
+        floor = floor_of(subject.scene, motion)
+        for name, seen in ("sees it", seeing(subject, motion, floor_world(motion, floor))), ("does not", motion):
+            heights = heights_of(player, seen, floor)
+            every[name].append(heights)
+            rows.append([entry["clip"], name, *_cells(Sunk.of(heights))])
+    rows += [["all", name, *_cells(Sunk.of(np.concatenate(heights)))] for name, heights in every.items()]
+    print(table(["clip", "network", "mean [%]", "worst [%]", "frames [%]", "deepest [mm]"], rows))
+
+
+def _cells(sunk: Sunk) -> list[str]:
+    return [
+        f"{100 * sunk.mean:.3f}",
+        f"{100 * sunk.worst:.2f}",
+        f"{100 * sunk.frames:.1f}",
+        f"{1e3 * sunk.depth:.0f}",
+    ]
+
+
+if __name__ == "__main__":
+    main()

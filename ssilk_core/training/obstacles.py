@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Obstacles around the characters of a training run: floors and walls, boxes, capsules and balls.
+
+Each is a box with rounded edges: a capsule has one long half extent, a ball none, and a floor or a wall is a box so
+large that it has one face. Their distances have closed forms, of which those outside are exact:
+
+    q = |R^T (x - c)| - h,    d = |max(q, 0)| + min(max(q), 0) - r
+
+Bodies do not pass through floors and chairs, so that an obstacle is where the body does not come in the frames that
+it is drawn for: where it would, r shrinks until it does not, below zero at need. The same is done in each window that
+continues another: an obstacle that stands in the way draws back.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from ..network.feedback import spread_rows
+from ..network.model.descriptors import proximity_features, proximity_length
+from ..network.proximity import proximity_reach, proximity_vertices
+from ..network.settings import ModelConfig
+from ..physics.skinning import Skinning
+from ..scene.assets import Floats, Ints, Scene, SkinWeights
+from .motion_bank import MotionBank
+
+BODY_POINTS = 256  # spread over the body, by which it is kept out of obstacles
+SKIN = 0.005  # [m] between these and an obstacle that touches the body
+FLOORS, BOTH = 0.55, 0.25  # shares of poses with obstacles that have a floor or wall alone, and one beside something
+LYING = 0.6  # share of floors that the body touches
+LEVEL = 0.6  # share of floors that are level; others are tilted, or walls
+FURTHEST = 0.4  # of the reach, up to which others are away from the body
+LARGE = 50.0  # [m] half extents of a floor
+SMALLEST, LARGEST = 0.03, 0.5  # [m] half extents of boxes
+THINNEST, THICKEST = 0.02, 0.25  # [m] radii of capsules and balls
+OVERLAP, GAP = 0.2, 0.2  # [m] that what is drawn beside the garment reaches into it, and stays away from it
+TINY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """K rounded boxes in each of N frames.
+
+    Attributes:
+        turn: axes of the boxes as columns, shape (K, N, 3, 3).
+        centre, half: [m], shape (K, N, 3).
+        radius: [m], shape (K, N).
+    """
+
+    turn: Tensor
+    centre: Tensor
+    half: Tensor
+    radius: Tensor
+
+    def repeated(self, count: int) -> Obstacles:
+        """Return those of N frames again and again."""
+        return Obstacles(*(each.repeat(1, count, *[1] * (each.ndim - 2)) for each in self.parts))
+
+    def joined(self, other: Obstacles) -> Obstacles:
+        """Return the frames of both."""
+        return Obstacles(*(torch.cat(both, dim=1) for both in zip(self.parts, other.parts)))
+
+    @property
+    def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.turn, self.centre, self.half, self.radius
+
+    def distance(self, points: Tensor, box: int) -> Tensor:
+        """Return the distances of points (M, 3, N) to one box of each frame [m], shape (M, N)."""
+        outside = self._local(points, box).abs() - self.half[box].T
+        return self._length(outside) + outside.amax(dim=1).clamp(max=0) - self.radius[box]
+
+    def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distances of points (M, 3, N) to the nearest box [m], (M, N), and directions away, (M, 3, N)."""
+        found = [self._away(points, box) for box in range(len(self.radius))]
+        distance, away = found[0]
+        for other, direction in found[1:]:
+            nearer = other < distance
+            distance, away = torch.where(nearer, other, distance), torch.where(nearer[:, None], direction, away)
+        return distance, away
+
+    def _local(self, points: Tensor, box: int) -> Tensor:
+        return torch.einsum("nba,mbn->man", self.turn[box], points - self.centre[box].T)
+
+    @staticmethod
+    def _length(outside: Tensor) -> Tensor:
+        return torch.linalg.vector_norm(outside.clamp_min(0), dim=1)
+
+    def _away(self, points: Tensor, box: int) -> tuple[Tensor, Tensor]:
+        local = self._local(points, box)
+        outside = local.abs() - self.half[box].T
+        length, deepest = self._length(outside), outside.amax(dim=1)
+        # Inside, the nearest face is that which is least deep.
+        face = (outside == deepest[:, None]).to(local.dtype)
+        own = torch.where((length > TINY)[:, None], outside.clamp_min(0), face)
+        own = torch.copysign(nn.functional.normalize(own, dim=1, eps=TINY), local)
+        away = torch.einsum("nab,mbn->man", self.turn[box], own)
+        return length + deepest.clamp(max=0) - self.radius[box], away
+
+
+class ObstacleDrawer:
+    """Draws obstacles around the characters of a bank, and tells what the network sees of them.
+
+    Args:
+        scene: character and garment; config: of the network.
+        hub: the place of the skeleton's hub among the joints of the descriptors.
+        share: of windows and poses that have any.
+    """
+
+    def __init__(
+        self, scene: Scene, config: ModelConfig, bank: MotionBank, hub: int, share: float, generator: torch.Generator
+    ) -> None:
+        device = bank.static.device
+        body, mesh, skin = scene.character.merged_body(), scene.garment.mesh, scene.lbs_skin
+        self.bank, self.hub, self.share, self.generator = bank, hub, share, generator
+        self.reach = proximity_reach(scene)
+        rows = spread_rows(body.mesh.points, BODY_POINTS)
+        self._body = _Carried(body.mesh.points, body.skin, rows, device)
+        self._seen = _Carried(mesh.points, skin, proximity_vertices(scene, config), device)
+
+    def seen(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
+        """Return features of proximity (N, 3 M) in frames (N,), as `network.proximity` has them."""
+        distance, away = obstacles.nearest(self._seen(self.bank.character(frames)))
+        vectors = away * proximity_length(distance, self.reach)[:, None]
+        return proximity_features(vectors.permute(2, 0, 1), self.bank.down[frames, self.hub])
+
+    def draw(self, frames: Tensor, gravity: Tensor) -> Obstacles:
+        """Draw a floor or wall and another obstacle, or none, for N frames or windows.
+
+        Args:
+            frames: those in which the body stays outside, shape (T, N); obstacles are placed about the middle one.
+            gravity: its directions (N, 3).
+        """
+        count, middle = frames.shape[1], frames[len(frames) // 2]
+        chance = self._uniform(4, count)
+        floor = (chance[0] < self.share) & (chance[1] < FLOORS + BOTH)
+        other = (chance[0] < self.share) & (chance[1] > FLOORS)
+        points = self._seen(self.bank.character(middle))
+        parts = zip(self._floors(points, gravity).parts, self._others(points).parts)
+        found = Obstacles(*(torch.cat(both) for both in parts))
+        # A floor is at the body or further away, and others where they were put unless the body is there.
+        near, gap = self._clearance(found, frames), self._uniform(count) ** 2 * FURTHEST * self.reach
+        gap = torch.where(chance[2] < LYING, torch.zeros_like(gap), gap)
+        radius = found.radius.clone()
+        radius[0] += near[0] - gap
+        radius[1] -= (-near[1]).clamp_min(0)
+        radius = torch.where(torch.stack([floor, other]), radius, torch.full_like(radius, -2 * LARGE))
+        return Obstacles(found.turn, found.centre, found.half, radius)
+
+    def drawn_back(self, obstacles: Obstacles, frames: Tensor) -> Obstacles:
+        """Return obstacles that the body stays outside of in frames (T, N), too."""
+        inside = (-self._clearance(obstacles, frames)).clamp_min(0)
+        return Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius - inside)
+
+    def _clearance(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
+        """Return how far the body is outside of each obstacle in its frames (T, N), at least, [m], shape (K, N)."""
+        points = self._body(self.bank.character(frames.flatten()))
+        repeated = obstacles.repeated(len(frames))
+        least = [repeated.distance(points, box).amin(dim=0) for box in range(len(obstacles.radius))]
+        return torch.stack(least).unflatten(1, frames.shape).amin(dim=1) - SKIN
+
+    def _floors(self, points: Tensor, gravity: Tensor) -> Obstacles:
+        """Return floors and walls that pass through the middle of the garment."""
+        count, device = len(gravity), points.device
+        tilt = 0.2 * self._normal(count, 3)
+        anywhere, chance = self._normal(count, 3), self._uniform(2, count, 1)
+        up = nn.functional.normalize(-gravity, dim=1)
+        up = torch.where(chance[0] < LEVEL, up, torch.where(chance[1] < 0.5, up + tilt, anywhere))
+        turn = _frames_along(nn.functional.normalize(up, dim=1), self._normal(count, 3))
+        centre = points.mean(dim=0).T - LARGE * turn[..., 0]
+        half, radius = torch.full((count, 3), LARGE, device=device), torch.zeros(count, device=device)
+        return Obstacles(turn[None], centre[None], half[None], radius[None])
+
+    def _others(self, points: Tensor) -> Obstacles:
+        """Return boxes, capsules and balls beside points (M, 3, N) of the garment."""
+        count = points.shape[2]
+        draw, chance = self._uniform(4, count), self._uniform(2, count, 1)
+        turn = _frames_along(nn.functional.normalize(self._normal(count, 3), dim=1), self._normal(count, 3))
+        sizes = SMALLEST * (LARGEST / SMALLEST) ** self._uniform(count, 3)
+        long = torch.cat([sizes[:, :1], torch.zeros_like(sizes[:, 1:])], dim=1)
+        half = torch.where(chance[0] < 0.5, sizes, torch.where(chance[1] < 0.5, long, torch.zeros_like(sizes)))
+        round_ = THINNEST * (THICKEST / THINNEST) ** draw[0]
+        radius = torch.where(chance[0, :, 0] < 0.5, torch.full_like(round_, SKIN), round_)
+        pick = (draw[1] * len(points)).long().clamp_max(len(points) - 1)
+        beside = points.permute(2, 0, 1)[torch.arange(count, device=pick.device), pick]
+        way = nn.functional.normalize(self._normal(count, 3), dim=1)
+        extent = ((turn.mT @ way[..., None])[..., 0].abs() * half).sum(dim=1) + radius
+        away = extent + draw[2] * (OVERLAP + GAP) - OVERLAP
+        return Obstacles(turn[None], (beside + away[:, None] * way)[None], half[None], radius[None])
+
+    def _uniform(self, *shape: int) -> Tensor:
+        return torch.rand(*shape, generator=self.generator, device=self.bank.static.device)
+
+    def _normal(self, *shape: int) -> Tensor:
+        return torch.randn(*shape, generator=self.generator, device=self.bank.static.device)
+
+
+class _Carried:
+    """Some vertices of a mesh, carried by linear blend skinning."""
+
+    def __init__(self, points: Floats, skin: SkinWeights, rows: Ints, device: torch.device) -> None:
+        self._skin = Skinning(SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])).to(device)
+        self._rest = torch.tensor(points[rows], dtype=torch.float32, device=device)
+
+    def __call__(self, character: Tensor) -> Tensor:
+        """Return positions (M, 3, N) [m] under skinning matrices (J, 3, 4, N)."""
+        with torch.no_grad():
+            return self._skin(self._rest, None, self._skin.weights, character)
+
+
+def _frames_along(first: Tensor, other: Tensor) -> Tensor:
+    """Return rotations (N, 3, 3) whose first column is `first` (N, 3), and whose second is towards `other`."""
+    second = nn.functional.normalize(other - (other * first).sum(1, keepdim=True) * first, dim=1)
+    return torch.stack([first, second, torch.linalg.cross(first, second, dim=1)], dim=2)
