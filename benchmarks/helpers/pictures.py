@@ -31,6 +31,7 @@ class PlayedMesh:
     faces: Ints
     is_garment: bool
     colour: tuple[float, float, float] | None = None
+    is_rider: bool = False
 
 
 class PlayedShot:
