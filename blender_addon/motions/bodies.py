@@ -12,18 +12,23 @@ from itertools import groupby
 
 import bpy
 import numpy as np
+from mathutils.bvhtree import BVHTree
 
 from ..scene.armature import leader_of
 from ..scene.garment import carrier_of, is_carried, rest_world
 from ..scene.linked import local_copy
 from ..scene.meshes import world_points
-from ..scene.modifiers import bones_place, reshapes
+from ..scene.modifiers import REFINING, bones_place, rendered_refining, reshapes
 from ..scene.weights import read_groups
 from .evaluating import evaluating
 from .sources import Source, frames_of, playing
 
 LOOKS = 8  # frames that are looked at, of all motions together
 STILL = 1e-4  # of a body's size, by which it may be off unseen
+NEAR = 0.2  # of a body's size, within which refined skin is that of the place beneath it
+FINEST = 2  # levels of subdivision that viewports do not show and that are looked at: they have sculpted shapes
+MOST = 200_000  # vertices, to which these levels are limited
+LOOKED_AT = 20_000  # vertices of refined skin, spread over it
 
 
 @dataclass
@@ -34,12 +39,15 @@ class LookedAt:
         changes: whether modifiers change its shape before its bones move it.
         away: how far a vertex is from where bones move it at most, in Blender's units; zero where nobody sees it.
         frame, motion: where that was.
+        outside: how far renders show its skin at most outside of what cloth meets, in Blender's units, in the first
+            look: where modifiers that refine it thicken it or are sculpted.
     """
 
     changes: bool = False
     away: float = 0.0
     frame: int = 0
     motion: str = ""
+    outside: float = 0.0
 
 
 def look_at(
@@ -98,10 +106,11 @@ class _Probe:
                 before = self.reshaped and (place is None or index < place)
                 if not before and modifier.type not in kept:
                     copy.modifiers.remove(modifier)
+        self.refined = _as_rendered(body) if rendered_refining(body) else None
 
     @property
-    def copies(self) -> tuple[bpy.types.Object, bpy.types.Object]:
-        return self.shape, self.moved
+    def copies(self) -> tuple[bpy.types.Object, ...]:
+        return (self.shape, self.moved, *((self.refined,) if self.refined else ()))
 
     def remove(self) -> None:
         for copy in self.copies:
@@ -109,7 +118,7 @@ class _Probe:
 
     def look(self, depsgraph: bpy.types.Depsgraph, turns: dict[str, np.ndarray], frame: int, motion: str) -> None:
         """Compare what is evaluated now with the first look, and with where bones have it."""
-        shape, moved = (copy.evaluated_get(depsgraph) for copy in self.copies)
+        shape, moved = (copy.evaluated_get(depsgraph) for copy in (self.shape, self.moved))
         if moved.hide_viewport:  # by keys
             return
         points = np.empty(len(shape.data.vertices) * 3, dtype=np.float32)
@@ -121,6 +130,9 @@ class _Probe:
             weights = read_groups(self.shape, shape.data, self.bones).astype(np.float64)
             self.total = weights.sum(axis=1, keepdims=True)
             self.weights = weights / np.where(self.total > 0, self.total, 1)
+            if self.refined:
+                self.found.outside = _outside(moved, self.refined.evaluated_get(depsgraph))
+                self.refined.hide_viewport = True  # from now on it is not evaluated
         if len(points) != len(self.first):
             self.found.changes = True
             return
@@ -137,3 +149,29 @@ class _Probe:
         away = float(np.abs(shown - wanted).max(initial=0)) if len(shown) == len(wanted) else np.inf
         if away > max(self.still, self.found.away):
             self.found.away, self.found.frame, self.found.motion = away, frame, motion
+
+
+def _as_rendered(body: bpy.types.Object) -> bpy.types.Object:
+    """Return a copy of a body with what refines it as renders have it, but no finer than its shape can be seen."""
+    copy, coarse = local_copy(body), len(body.data.vertices)
+    copy.hide_viewport = False
+    for modifier in copy.modifiers:
+        if modifier.type in REFINING:
+            modifier.show_viewport = modifier.show_render
+        if modifier.type in ("MULTIRES", "SUBSURF") and modifier.levels != modifier.render_levels:
+            levels = min(modifier.render_levels, max(modifier.levels, FINEST))
+            modifier.levels = next(each for each in range(levels, -1, -1) if each < 2 or coarse * 4**each < MOST)
+    return copy
+
+
+def _outside(met: bpy.types.Object, refined: bpy.types.Object) -> float:
+    """Return how far a refined body lies outside of the surface that cloth meets at most; both are evaluated."""
+    points, faces = world_points(met), [tuple(face.vertices) for face in met.data.polygons]
+    surface, near = BVHTree.FromPolygons(points.tolist(), faces), NEAR * float(np.ptp(points, axis=0).max(initial=0))
+    outward, farthest = np.sign(np.linalg.det(np.array(met.matrix_world)[:3, :3])), 0.0
+    shown = world_points(refined)
+    for point in shown[:: len(shown) // LOOKED_AT + 1]:
+        place, normal, _, _ = surface.find_nearest(point, near)
+        if place is not None:
+            farthest = max(farthest, float(outward * np.dot(point - place, normal)))
+    return farthest

@@ -10,10 +10,18 @@ import bpy
 from ..scene.armature import leader_of
 from ..scene.garment import armature_of, bodies_of, follow_bodies, need_left, no_meshes
 from ..scene.meshes import PREFIX
-from ..scene.modifiers import bones_place, reshapes, shown_or_rendered_alone, unmet_modifiers
+from ..scene.modifiers import (
+    bones_place,
+    rendered_refining,
+    reshapes,
+    shown_or_rendered_alone,
+    unmet_modifiers,
+)
 from .bodies import look_at
 from .keys import changing_paths
 from .sources import TIMELINE, Source, playing
+
+THICK = 0.002  # [m] by which renders may show skin outside of what cloth meets, untold
 
 
 def changing_shapes(thing: bpy.types.Object) -> list[str]:
@@ -92,6 +100,15 @@ def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str
                 f"Blender shows '{body.name}' up to {size:.1f} mm from where the bones of '{armature.name}' move it "
                 f"({where}); cloth meets it where these have it. Look at its modifiers, its parent, keys of its own, "
                 "and envelopes of bones."
+            )
+        elif scale * found.outside > THICK and not unmet_modifiers(body) + shown_or_rendered_alone(body):
+            first, *more = (f"'{each.name}'" for each in rendered_refining(body))
+            text = (
+                f"Renders show '{body.name}' up to {1000 * scale * found.outside:.1f} mm outside of what cloth meets"
+            )
+            yield (
+                f"{text}, by its modifier{'s' if more else ''} {', '.join([first, *more])}. Move what thickens or is "
+                "sculpted above the Armature modifier, with the same levels in viewports as in renders, or apply it."
             )
     names = list(dict.fromkeys(_changing_in(motions, armature, [*bodies, garment])))
     if names:

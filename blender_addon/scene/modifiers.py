@@ -151,6 +151,11 @@ def unmet_modifiers(body: bpy.types.Object) -> list[str]:
     return [modifier.name for modifier in after if modifier.show_viewport and modifier.type not in passed]
 
 
+def rendered_refining(body: bpy.types.Object) -> list[bpy.types.Modifier]:
+    """Return the modifiers that refine a body where it is rendered, and may bring its skin out, as sculpting does."""
+    return [each for each in body.modifiers if each.type in REFINING - {"MASK"} and each.show_render]
+
+
 def shown_or_rendered_alone(body: bpy.types.Object) -> list[str]:
     """Return the names of modifiers that shape a body in viewports alone, or in renders alone."""
     passed = HARMLESS | REFINING

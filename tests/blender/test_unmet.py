@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 from typing import Any
 
@@ -265,6 +266,64 @@ def test_a_body_whose_shape_renders_show_otherwise_is_told(bpy, moving):
         "The modifier 'Early' of 'Pillar' is switched on in viewports or in renders alone; cloth meets the body as "
         "viewports show it."
     )
+
+
+def thicker(bpy: Any, pillar: Any) -> Any:
+    late = pillar.modifiers.new("Finer", "SOLIDIFY")
+    late.offset, late.thickness = 1.0, 0.02
+    return late
+
+
+def sculpted(bpy: Any, pillar: Any) -> Any:
+    """Give a pillar a Multiresolution modifier in which it is 20 mm thicker."""
+    multires = pillar.modifiers.new("Finer", "MULTIRES")
+    activate(bpy, pillar)
+    for _ in range(2):
+        assert bpy.ops.object.multires_subdivide(modifier="Finer") == {"FINISHED"}
+    pillar.modifiers["Armature"].show_viewport = False
+    shown = pillar.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    sculpt = bpy.data.objects.new("Sculpt", bpy.data.meshes.new_from_object(shown))
+    bpy.context.collection.objects.link(sculpt)
+    for vertex in sculpt.data.vertices:
+        radius = vertex.co.xy.length
+        vertex.co.xy *= (radius + 0.02) / radius if radius else 1
+    sculpt.select_set(True)
+    assert bpy.ops.object.multires_reshape(modifier="Finer") == {"FINISHED"}
+    bpy.data.objects.remove(sculpt)
+    pillar.modifiers["Armature"].show_viewport = True
+    return multires
+
+
+@pytest.mark.parametrize("change", [thicker, sculpted])
+@pytest.mark.parametrize("where", ["below", "in renders alone", "above", "above, at another level"])
+def test_a_body_that_is_refined_outwards_is_told(bpy, moving, change, where):
+    pillar = bpy.data.objects["Pillar"]
+    refining = change(bpy, pillar)
+    bpy.data.objects["Rig"].animation_data_clear()
+    for bone in bpy.data.objects["Rig"].pose.bones:
+        bone.matrix_basis.identity()
+    radius = np.linalg.norm(shown_at_rest(bpy, pillar)[:, [0, 2]], axis=1).max()
+    if where == "in renders alone":
+        refining.show_viewport = False
+    elif where.startswith("above"):
+        pillar.modifiers.move(1, 0)
+    if where == "above, at another level" and change is sculpted:
+        refining.levels = 0
+    elif where.startswith("above"):
+        assert not said_of(moving)  # cloth meets it as it is seen
+        return
+    (told,) = said_of(moving)
+    found = float(re.search(r"^Renders show 'Pillar' up to ([0-9.]+) mm outside of what cloth meets, ", told)[1])
+    assert radius - 0.151 < found / 1000 < radius - 0.147  # from the pillar's edges, or the middle of its faces
+    assert found > 12 and "by its modifier 'Finer'. Move" in told
+
+
+@pytest.mark.parametrize(
+    "kind", ["BEVEL", "DECIMATE", "EDGE_SPLIT", "MASK", "SOLIDIFY", "SUBSURF", "TRIANGULATE", "WELD"]
+)
+def test_a_body_that_is_refined_where_it_is_is_not_told(bpy, moving, kind):
+    bpy.data.objects["Pillar"].modifiers.new("Finer", kind)
+    assert not said_of(moving)
 
 
 def bound_fine_mesh(bpy, cage) -> Any:

@@ -6,7 +6,7 @@ Blendshapes that it weighs otherwise or alone has, points that it has moved, poi
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
@@ -66,7 +66,7 @@ def shown_otherwise(
 ) -> list[str]:
     """Return in words what a motion's stage shows of a character's meshes otherwise than the character's stage.
 
-    A motion that stands alone shows no mesh. Meshes are the same where their names are.
+    A motion that stands alone shows no mesh. Meshes are the same where their names are, or where their faces are.
 
     Args:
         source, motion, root, garment: as for `animated_shapes`.
@@ -85,15 +85,16 @@ def shown_otherwise(
         return [*filter(None, found)]
     if there.prim == skel.prim:
         return [*filter(None, found)]
-    for mesh in _caches(there, own):
-        found.append(
-            f"{mesh.GetName()} is a point cache, which is not followed; cloth meets it as its joints move it"
-        )
-    for mesh in _meshes(there):
-        name = mesh.GetName()
-        if name not in own:
+    same = _same_meshes(there, own)
+    for mesh, original in same.items():
+        if not is_garment(original) and _is_cache(mesh, there):
+            text = f"{mesh.GetName()} is a point cache, which is not followed"
+            found.append(f"{text}; cloth meets it as its joints move it")
+    for mesh, original in same.items():
+        if bound_skeleton(mesh) != there.prim:
             continue
-        if not is_garment(own[name]) and name not in known and (away := _moved(own[name], skel, mesh, there)):
+        name, known_by = mesh.GetName(), original.GetName()
+        if not is_garment(original) and known_by not in known and (away := _moved(original, skel, mesh, there)):
             text = f"it shapes {name} otherwise, by up to {1000 * away:.3g} mm"
             found.append(f"{text}; cloth meets the shape of the character's stage throughout")
         found.append(_hidden(mesh, there))
@@ -107,12 +108,33 @@ def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
             yield prim
 
 
-def _caches(skel: SkelSource, names: Container[str]) -> Iterator[Usd.Prim]:
-    """Yield the meshes of these names that no joint moves, and whose points change over time."""
-    for prim in Usd.PrimRange(skel.root, PRIMS):
-        known = prim.IsA(UsdGeom.Mesh) and prim.GetName() in names and not is_garment(prim)
-        if known and not is_skinned(prim, skel) and len(change_times([UsdGeom.Mesh(prim).GetPointsAttr()])) > 1:
-            yield prim
+def _same_meshes(there: SkelSource, own: Mapping[str, Usd.Prim]) -> dict[Usd.Prim, Usd.Prim]:
+    """Return for meshes of a shot which of a character's own meshes they are.
+
+    They have its name, or its faces alone: programs add a namespace to names, or a number.
+    """
+    meshes = [prim for prim in Usd.PrimRange(there.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    found = {mesh: own[mesh.GetName()] for mesh in meshes if mesh.GetName() in own}
+    others = [mesh for mesh in meshes if mesh not in found]
+    missing = [mesh for mesh in own.values() if others and mesh not in found.values()]
+    for faces in dict.fromkeys(map(_faces, missing)):
+        pairs = [[mesh for mesh in each if _faces(mesh) == faces] for each in (others, missing)]
+        if len(pairs[0]) == len(pairs[1]):  # such as two shoes, in the order of their stages
+            found.update(zip(*pairs))
+    return found
+
+
+def _faces(mesh: Usd.Prim) -> tuple[bytes, bytes]:
+    """Return the faces of a mesh, to be compared."""
+    described = UsdGeom.Mesh(mesh)
+    values = (described.GetFaceVertexCountsAttr().Get(EARLIEST), described.GetFaceVertexIndicesAttr().Get(EARLIEST))
+    counts, indices = (np.array(each or [], dtype=np.int32).tobytes() for each in values)
+    return counts, indices
+
+
+def _is_cache(mesh: Usd.Prim, skel: SkelSource) -> bool:
+    """Return whether no joint moves a mesh, and its points change over time."""
+    return not is_skinned(mesh, skel) and len(change_times([UsdGeom.Mesh(mesh).GetPointsAttr()])) > 1
 
 
 def _moved(own: Usd.Prim, skel: SkelSource, other: Usd.Prim, there: SkelSource) -> float:
