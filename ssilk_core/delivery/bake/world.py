@@ -9,7 +9,7 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 from ...errors import fail
-from ...events import Reporter, silent
+from ...events import Message, Reporter, silent
 from ...files import split_location
 from ...scene.assets import Motion, Scene, ShotWorld
 
@@ -22,6 +22,9 @@ Vector = tuple[float, float, float]
 
 GUSTS = "RMS[,SIZE[,SEED]]"
 UNSEEN = "the network does not see {}: it plays without; --refine N or --quality hero solve for it"
+UNSOLVED = (
+    "the solver in latents does not know colliders: it lets cloth fall through; --refine N or --quality hero do"
+)
 STILL = (
     "the network was trained in still air: it knows where wind and gravity pull, but not how cloth swings under more"
 )
@@ -120,18 +123,23 @@ def unseen(
     *,
     sight: Sight,
     drag: float,
+    in_latents: bool = False,
 ) -> str:
     """Return what a network misses of the world around its character, in words; empty where that is nothing.
 
-    No shape of a collider is read for it.
+    No shape of a collider is read for it. Colliders that the network sees are reported.
 
     Args:
         drag: of the garment's fabric, by which air moves it.
+        in_latents: whether its states are solved for in latents.
     """
     found = _found(source, stage, scene, motion, asked, report)
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
     told = [UNSEEN.format(" and ".join(missed))] if missed else []
+    if found.met and sight.colliders:
+        report(Message(f"{source}: the network sees {found.colliders}"))
+        told += [UNSOLVED] if in_latents else []
     if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
         told.append(STILL)
     return "; ".join(told)

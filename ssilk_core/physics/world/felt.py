@@ -61,11 +61,8 @@ def felt_proximity(
     """
     if world is None or not world.colliders or not len(rows):
         return None
-    from .surroundings import (
-        VOTERS,
-        Nearby,
-        Surroundings,
-    )  # PyTorch, which live playback of wind and gravity does without
+    # PyTorch, which live playback of wind and gravity does without.
+    from .surroundings import VOTERS, Nearby, Surroundings
 
     around, every = Surroundings([world], -GRAVITY * UP), np.arange(scene.garment.mesh.vertex_count)
     points, voters = (_carried(motion, scene, some) for some in (rows, _spread(every, VOTERS)))

@@ -163,7 +163,7 @@ class PosedWorld:
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """What lies up to a distance `within` [m] from the box of some points, whose corners are `low` and `high` (3,)."""
+    """What lies up to a distance `within` [m] from a box of corners `low` and `high` (3,)."""
 
     low: Floats
     high: Floats
@@ -171,7 +171,7 @@ class Nearby:
 
     @classmethod
     def of(cls, points: Floats, within: float) -> Nearby:
-        """Return that of points (P, 3)."""
+        """Return that of the box around points (P, 3)."""
         return cls(points.min(axis=0), points.max(axis=0), within)
 
     def gap(self, place: Floats) -> float:
