@@ -23,7 +23,8 @@ Vector = tuple[float, float, float]
 GUSTS = "RMS[,SIZE[,SEED]]"
 UNSEEN = "the network does not see {}: it plays without; --refine N or --quality hero solve for it"
 UNSOLVED = (
-    "the solver in latents does not know colliders: it lets cloth fall through; --refine N or --quality hero do"
+    "the solver in latents does not know colliders, and cloth falls into them; "
+    "--refine N or --quality hero solve for them"
 )
 STILL = (
     "the network was trained in still air: it knows where wind and gravity pull, but not how cloth swings under more"
