@@ -3,10 +3,12 @@
 
 One call computes one frame of any number of characters. Inputs are the states of the two previous frames, the
 descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py) and a flag for the first two
-frames of a shot. Where the stepper sees points of the cloth, the skinning matrices of the character's joints about
-its root follow, and the root's position less twice the last one plus the one before. Outputs are the new state, the
-weights of the blendshapes and the local rotations of the proxy joints, as in a shot. Where proxies move, their local
-translations follow. Blendshapes and skinning weights are those of any baked shot.
+frames of a shot. Where the network sees colliders, static ones begin with their proximity to some vertices, which are
+told with the distance from which on it is zero (see ssilk_core/network/proximity.py). Where the stepper sees points
+of the cloth, the skinning matrices of the character's joints about its root follow, and the root's position less
+twice the last one plus the one before. Outputs are the new state, the weights of the blendshapes and the local
+rotations of the proxy joints, as in a shot. Where proxies move, their local translations follow. Blendshapes and
+skinning weights are those of any baked shot.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..network.checkpoint import load_model, network
     from ..network.model.export import FrameNetwork, export_onnx
     from ..network.parameters import descriptor_sizes
+    from ..network.proximity import proximity_reach, proximity_vertices
 
     output: Path = options.output
     if output.suffix != ".onnx":
@@ -39,6 +42,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     model = network(file)
     export_onnx(model, output)
     static, rates = descriptor_sizes(file.scene, file.joints, file.config)
+    seen = proximity_vertices(file.scene, file.config).tolist()
+    near = {"sees colliders at vertices": seen, "and up to [m]": proximity_reach(file.scene)} if seen else {}
     report(
         Result(
             "export",
@@ -48,6 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "numbers in a state": FrameNetwork(model).state_size,
                 "static descriptors": static,
                 "dynamic descriptors": rates,
+                **near,
                 "weights": file.config.shapes + model.decoder.has_constant,
                 "proxies": file.scene.rig.proxy_count,
                 "frames per second": file.config.fps,

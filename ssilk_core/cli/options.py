@@ -185,7 +185,8 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
                       help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
                            "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip
-    add_world(verb, "with --refine and --quality hero; the network alone feels wind and gravity, and no colliders")
+    add_world(verb, "with --refine and --quality hero; the network alone feels wind and gravity, and sees colliders "
+                    "where it was trained with some")  # fmt: skip
     _add_names(verb)
     _add_output(verb)
 

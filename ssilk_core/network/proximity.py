@@ -34,6 +34,11 @@ def proximity_size(scene: Scene, config: ModelConfig) -> int:
     return 3 * min(config.proximity_points, int((scene.classes != PINNED).sum()))
 
 
+def sees_at(features: int) -> tuple[str, str]:
+    """Return what is allowed where a motion has the proximity of another garment, and what to do."""
+    return f"this network sees it at {features // 3}", "look for colliders at this garment's own points, or at none"
+
+
 def proximity_reach(scene: Scene) -> float:
     """Return the distance from which on colliders are not seen [m]."""
     return scene.garment.mesh.diagonal

@@ -146,9 +146,13 @@ def test_nothing_is_interpolated_across_a_cut_where_the_grids_of_motion_and_shot
     source, skeleton = rollout.source, rollout.deformer.scene.character.skeleton
     moved = source.translations.copy()
     moved[:, 0, 0] = 0.9 * np.arange(len(moved)) + 100 * (np.arange(len(moved)) > 40)  # at 54 m/s
-    driver = _from_fraction(replace(source, translations=moved), skeleton, 0.25).translations[:, 0, 0]
+    felt = np.where(np.arange(len(moved)) > 40, 1.0, -1.0)  # gravity and colliders of either side alone
+    given = {"gravity": felt[:, None] * [0, 9.81, 0], "proximity": felt[:, None, None] * np.ones((2, 3))}
+    found = _from_fraction(replace(source, translations=moved, **given), skeleton, 0.25)
     later = np.arange(len(moved)) + 0.25
-    np.testing.assert_allclose(driver, 0.9 * later + 100 * (later > 40), atol=1e-9)
+    np.testing.assert_allclose(found.translations[:, 0, 0], 0.9 * later + 100 * (later > 40), atol=1e-9)
+    for values in (found.gravity[:, 1] / 9.81, found.proximity[:, 1, 2]):
+        np.testing.assert_allclose(values, np.where(later > 40, 1, -1), atol=1e-12)
 
 
 @pytest.mark.parametrize(("words", "span"), [("", (28, 38)), ("--handles 8", (20, 46)), ("--handles 40", (0, 47))])

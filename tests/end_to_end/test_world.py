@@ -22,7 +22,7 @@ from ssilk_core.network.parameters import seeing_colliders
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
 from ssilk_core.network.runtime import Player
 from ssilk_core.physics.world.felt import felt_proximity
-from ssilk_core.scene.kinematics import hub_places
+from ssilk_core.scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices
 
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
 
@@ -105,6 +105,45 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
     assert "does not see" not in capsys.readouterr().err
+
+
+def let_it_see(path: str) -> None:
+    """Make a model's network see colliders, somehow."""
+    file, dice = load_model(path), np.random.default_rng(3)
+    config = replace(file.config, proximity_points=6)
+    blind, parameters = file.parameters, seeing_colliders(file.parameters, config, 18)
+    for name, value in parameters.items():
+        if value.shape != blind[name].shape:
+            parameters[name] = value + (value == 0) * dice.normal(0, 0.2, value.shape).astype(value.dtype)
+    save_model(path, replace(file, config=config, parameters=parameters))
+
+
+def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says_so(stage, capsys):
+    let_it_see("model.safetensors")
+    told = {}
+    for name, more in (("plain", []), ("floored", []), ("latent", ["--latent-iterations", "1"])):
+        clip = "plain.usda" if name == "plain" else "floored.usda"
+        assert main([*BAKE, clip, "-o", f"{name}.usdc", *more]) == 0
+        told[name] = capsys.readouterr().err
+    assert "colliders" not in told["plain"] and "the network sees" not in told["plain"]
+    assert "floored.usda: the network sees /Set/Floor" in told["floored"]
+    assert "know colliders" not in told["floored"] and "does not see" not in told["floored"]
+    assert "the solver in latents does not see colliders" in told["latent"]
+    player = Player.load("model.safetensors")
+    motion, scene = (
+        read_motion("floored.usda", player.skeleton),
+        load_rollout(BakeRequest(model="model.safetensors", stage="rigged.usda", motion="plain.usda")).deformer.scene,
+    )
+    rows, reach = proximity_vertices(scene, player.file.config), proximity_reach(scene)
+    matrices = skinning_matrices(motion_transforms(motion, player.skeleton.parents), player.skeleton.bind_transforms)
+    skin = scene.lbs_skin
+    own = replace(skin, indices=skin.indices[rows], weights=skin.weights[rows])
+    above = skin_points(scene.garment.mesh.points[rows], own, matrices)[..., 1] - FLOOR
+    seen = proximity(above, np.tile([0.0, 1.0, 0.0], (*above.shape, 1)), reach)
+    playback = player.play(replace(motion, proximity=seen))
+    expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+    np.testing.assert_allclose(points_of("floored.usdc"), expected, atol=1e-5)
+    assert np.abs(points_of("plain.usdc") - expected).max() > 1e-3
 
 
 def test_gusts_are_the_same_in_whatever_range_of_a_shot(toy, stage):

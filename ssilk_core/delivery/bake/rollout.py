@@ -316,5 +316,5 @@ def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:
     rotations = slerp(motion.rotations[low], motion.rotations[high], part)
     step = motion.translations[high] - motion.translations[low]
     translations = motion.translations[low] + part[..., None] * step
-    felt = sample_felt(motion, low + part[:, 0] * (high - low))
+    felt = sample_felt(motion, np.clip(frames + first - whole, begin, end))
     return Motion(motion.path, motion.fps, rotations, translations, motion.start + first - whole, **felt)

@@ -9,7 +9,7 @@ from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 from ...errors import fail
-from ...events import Reporter, silent
+from ...events import Message, Reporter, silent
 from ...files import split_location
 from ...scene.assets import Motion, Scene, ShotWorld
 
@@ -128,7 +128,7 @@ def unseen(
 ) -> str:
     """Return what a network misses of the world around its character, in words; empty where that is nothing.
 
-    No shape of a collider is read for it.
+    No shape of a collider is read for it. Colliders that the network sees are reported.
 
     Args:
         drag: of the garment's fabric, by which air moves it.
@@ -137,6 +137,8 @@ def unseen(
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
     told = [UNSEEN.format(sight.who, " and ".join(missed))] if missed else []
+    if found.met and sight.colliders:
+        report(Message(f"{source}: the network sees {found.colliders}"))
     if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
         told.append(STILL)
     return "; ".join(told)

@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ...errors import fail
 from ...scene.assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
 from ...scene.kinematics import ProxyAxes
 from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
-from ..proximity import proximity_size
+from ..proximity import proximity_size, sees_at
 from ..settings import ModelConfig
 from .decoder import Decoder
 from .feedback import BodyFrames, DecodedState, Feedback
@@ -73,10 +74,15 @@ class GarmentModel(nn.Module):
         return self.integrator.bound(self.initialiser(self.completed(static, self.static)))
 
     def completed(self, values: Tensor, size: int) -> Tensor:
-        """Return descriptors (..., size); those without features of proximity have nothing near."""
-        if self.proximity and values.shape[-1] == size - self.proximity:
-            return nn.functional.pad(values, (self.proximity, 0))
-        return values
+        """Return descriptors (..., size); those without features of proximity have nothing near.
+
+        Raises:
+            SsilkError: they have the proximity of another number of points.
+        """
+        near = values.shape[-1] - size + self.proximity
+        if near not in (0, self.proximity):
+            fail(self.scene.garment.mesh.path, f"proximity at {near // 3} points", *sees_at(self.proximity))
+        return values if near == self.proximity else nn.functional.pad(values, (self.proximity, 0))
 
     def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor.

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import fail
 from ...scene.assets import Floats, Motion, Skeleton
 from ...scene.kinematics import motion_transforms, skinning_matrices
 from ..descriptors import pose_features
 from ..feedback import bends
+from ..proximity import sees_at
 
 HISTORY = 2  # frames before others that their descriptors, and what S sees of the cloth, look back on
 
@@ -59,11 +61,16 @@ def character_frames(
         lookback: number of first frames, at most two, that only serve what looks back, and are none of the F frames.
         kind: of the descriptors.
         seen: features of proximity, which are zero where the motion says of none.
+
+    Raises:
+        SsilkError: the motion has the proximity of another number of points.
     """
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, joints, world, kind)
     down, earlier = (_into(values, features.gravity) for values in (features.down, features.earlier))
     near = np.zeros((len(down), seen)) if features.proximity is None else features.proximity
+    if near.shape[1] != seen:
+        fail(motion.path, f"proximity at {near.shape[1] // 3} points", *sees_at(seen))
     static = np.concatenate([near, features.static, down], axis=1, dtype=np.float32)
     rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback

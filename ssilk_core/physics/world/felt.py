@@ -61,14 +61,16 @@ def felt_proximity(
     """
     if world is None or not world.colliders or not len(rows):
         return None
-    from .surroundings import VOTERS, Surroundings  # PyTorch, which live playback of wind and gravity does without
+    # PyTorch, which live playback of wind and gravity does without.
+    from .surroundings import VOTERS, Nearby, Surroundings
 
     around, every = Surroundings([world], -GRAVITY * UP), np.arange(scene.garment.mesh.vertex_count)
     points, voters = (_carried(motion, scene, some) for some in (rows, _spread(every, VOTERS)))
     found = np.zeros((motion.frame_count, len(rows), 3))
     for frame, (here, votes) in enumerate(zip(points, voters)):
         distance, normal = np.full(len(rows), np.inf), np.zeros((len(rows), 3))
-        for collider in around.colliders(0, frame / motion.fps, np.zeros(3), votes):
+        close = Nearby.of(here, within)
+        for collider in around.colliders(0, frame / motion.fps, np.zeros(3), votes, close):
             near, met = collider.near(here, within)
             closer = met.distance < distance[near]
             distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]

@@ -161,6 +161,24 @@ class PosedWorld:
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Nearby:
+    """What lies up to a distance `within` [m] from a box of corners `low` and `high` (3,)."""
+
+    low: Floats
+    high: Floats
+    within: float
+
+    @classmethod
+    def of(cls, points: Floats, within: float) -> Nearby:
+        """Return that of the box around points (P, 3)."""
+        return cls(points.min(axis=0), points.max(axis=0), within)
+
+    def gap(self, place: Floats) -> float:
+        """Return how far a place (3,) is outside [m]; negative or zero inside."""
+        return float(np.linalg.norm(place - place.clip(self.low, self.high))) - self.within
+
+
 class Surroundings:
     """The worlds of shots, each prepared once.
 
@@ -174,6 +192,7 @@ class Surroundings:
         self._air = [MovingAir(world.air, world.fps) if world.air else None for world in self._worlds]
         self._surfaces: dict[int, CollisionSurface] = {}
         self._still: dict[int, PosedSurface] = {}
+        self._balls: dict[int, tuple[Floats, float]] = {}  # around each collider in all frames, before it is placed
 
     def around(self, places: Sequence[tuple[int, float]], root: Tensor, carried: Tensor) -> PosedWorld:
         """Return what surrounds N characters.
@@ -197,24 +216,41 @@ class Surroundings:
         air = tuple(self._air[shot] for shot, _ in places)
         return PosedWorld(tuple(colliders), down, air, tuple(seconds for _, seconds in places), roots)
 
-    def colliders(self, shot: int, seconds: float, root: Floats, carried: Floats) -> tuple[PosedCollider, ...]:
+    def colliders(
+        self, shot: int, seconds: float, root: Floats, carried: Floats, near: Nearby | None = None
+    ) -> tuple[PosedCollider, ...]:
         """Return the colliders of a shot at a time, relative to a root (3,).
 
         Args:
             carried: vertices of the garment as the body carries it, relative to the root (V, 3).
+            near: leaves out what is further away; by default nothing is.
         """
         world = self._worlds[shot]
-        own = [self._posed(each, world, seconds, root, carried) for each in world.colliders]
+        own = [self._posed(each, world, seconds, root, carried, near) for each in world.colliders]
         return tuple(each for each in own if each)
 
     def _posed(
-        self, collider: Collider, world: ShotWorld, seconds: float, root: Floats, carried: Floats
+        self,
+        collider: Collider,
+        world: ShotWorld,
+        seconds: float,
+        root: Floats,
+        carried: Floats,
+        near: Nearby | None,
     ) -> PosedCollider | None:
         """Return a collider at a time; None where cloth does not meet it then."""
         frame = min(max(int(seconds * world.fps + 1e-6), 0), len(collider.present) - 1)
         if not collider.present[frame]:
             return None
         key = id(collider)
+        place = _placed(collider.placements, world, seconds)
+        if near:
+            if key not in self._balls:
+                low, high = collider.points.min(axis=(0, 1)), collider.points.max(axis=(0, 1))
+                self._balls[key] = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+            centre, radius = self._balls[key]
+            if near.gap(place[:3, :3] @ centre + place[:3, 3] - root) > radius:
+                return None
         if key not in self._surfaces:
             self._surfaces[key] = CollisionSurface(collider.path, collider.points[0], collider.faces)
         if len(collider.points) > 1:
@@ -223,7 +259,6 @@ class Surroundings:
             if key not in self._still:
                 self._still[key] = self._surfaces[key].at(collider.points[0])
             surface = self._still[key]
-        place = _placed(collider.placements, world, seconds)
         return PosedCollider(surface, place[:3, :3], place[:3, 3] - root, carried)
 
 

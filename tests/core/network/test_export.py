@@ -18,6 +18,7 @@ from ssilk_core.network.model.batch import motion_inputs
 from ssilk_core.network.model.export import export_onnx
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import descriptor_sizes
+from ssilk_core.network.proximity import proximity_reach, proximity_vertices
 from ssilk_core.network.rollout import garment_poses
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.scene.assets import TIGHT, ProxyRig, Scene
@@ -106,6 +107,26 @@ def test_what_goes_in_and_comes_out_is_told(exported, model):
     sizes = {each.name: each.shape[1] for each in session.get_inputs()}
     assert (sizes["static"], sizes["rates"]) == (told["static descriptors"], told["dynamic descriptors"])
     assert session.get_outputs()[1].shape[1] == told["weights"] == model.config.shapes + 1
+
+
+def test_a_network_that_sees_colliders_is_exported_and_where_it_sees_them_told(
+    scene, toy_model, toy_motion, tmp_path, capsys
+):
+    seeing = toy_model(scene, scale=0.1, proximity_points=5).eval()
+    save_model(tmp_path / "toy.safetensors", model_file(seeing, FABRICS["silk"], {}))
+    assert main(["export", str(tmp_path / "toy.safetensors"), "-o", str(tmp_path / "toy.onnx"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]
+    assert told["sees colliders at vertices"] == proximity_vertices(scene, seeing.config).tolist()
+    assert told["and up to [m]"] == pytest.approx(proximity_reach(scene))
+    session = onnxruntime.InferenceSession(tmp_path / "toy.onnx", providers=["CPUExecutionProvider"])
+    plain = toy_motion(scene, FRAMES)
+    near = np.sin(np.arange(FRAMES * 15)).reshape(FRAMES, 5, 3)
+    found = []
+    for motion in (plain, replace(plain, proximity=near)):
+        found.append(played(session, seeing, motion_inputs(seeing, [motion]))[0][:, 0])
+        (expected,) = garment_poses(seeing, motion, motion.fps)
+        np.testing.assert_allclose(found[-1], expected.weights, atol=2e-5)
+    assert np.abs(found[0] - found[1]).max() > 1e-3
 
 
 def test_other_suffixes_are_refused(tmp_path, capsys):

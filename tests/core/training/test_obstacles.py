@@ -172,6 +172,37 @@ def test_the_network_sees_in_training_what_it_sees_of_the_same_collider_in_a_sho
     assert felt_proximity(ShotWorld(30.0), motion, scene, rows, reach, lambda d, n: n) is None
 
 
+def test_colliders_beyond_the_reach_are_not_searched(scene, seeing, toy_motion, monkeypatch) -> None:
+    """A stage may have a thousand props; those near the character count, wherever they move."""
+    motion, whole, still = toy_motion(scene, 6), np.ones(1, dtype=bool), np.eye(4)[None]
+    rows, reach = proximity_vertices(scene, seeing.config), proximity_reach(scene)
+    box = trimesh.creation.box((0.2, 0.3, 0.4))
+
+    def prop(name: str, place, moves: np.ndarray = still) -> Collider:
+        return Collider(name, np.array(box.faces), (np.array(box.vertices) + place)[None], moves, whole)
+
+    def seen(*props: Collider) -> np.ndarray:
+        found = felt_proximity(
+            ShotWorld(30.0, props), motion, scene, rows, reach, lambda d, n: proximity(d, n, reach)
+        )
+        assert found is not None
+        return found
+
+    comes = np.tile(np.eye(4), (6, 1, 1))
+    comes[:3, 0, 3] = 40.0
+    near = prop("/near", (0.1, 0.7, 0.3)), prop("/comes", (0.3, 0.6, 0.0), comes)
+    alone = seen(*near)
+    assert np.abs(alone[2] - alone[3]).max() > 0.1
+    built: list[str] = []
+    start = CollisionSurface.__init__
+    monkeypatch.setattr(
+        CollisionSurface, "__init__", lambda own, path, *rest: (built.append(path), start(own, path, *rest))[1]
+    )
+    far = [prop(f"/far{number}", (30.0 + number, 0.0, 0.0)) for number in range(5)]
+    np.testing.assert_array_equal(seen(*far, *near), alone)
+    assert built == ["/near", "/comes"]
+
+
 def test_proximity_is_nothing_from_the_reach_on_and_points_out_of_what_holds_it() -> None:
     normal = np.array([[0.0, 1.0, 0.0]] * 5)
     found = proximity(np.array([2.0, 1.0, 0.5, 0.0, -3.0]), normal, 1.0)

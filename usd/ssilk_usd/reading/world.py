@@ -73,6 +73,12 @@ class FoundWorld:
         parts = ("colliders", self.met), ("wind", self.air), ("its gravity", self.gravity is not None)
         return tuple(name for name, there in parts if there)
 
+    @property
+    def colliders(self) -> str:
+        """Their paths, the first few of many."""
+        prims = [prim for prim, _ in self.met]
+        return f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
+
     def read(self, report: Reporter = silent) -> ShotWorld | None:
         """Return it with its shapes; None where nothing surrounds the character.
 
@@ -134,9 +140,7 @@ def find_world(
 def _with_shapes(stage: Usd.Stage, found: FoundWorld, report: Reporter) -> ShotWorld:
     """Return what was found in a stage with its shapes."""
     if found.met:
-        prims = [prim for prim, _ in found.met]
-        some = f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
-        report(Message(f"{stage_name(stage)}: cloth meets {some}"))
+        report(Message(f"{stage_name(stage)}: cloth meets {found.colliders}"))
     return ShotWorld(found.fps, tuple(read_colliders(found.met, found.codes)), found.gravity, found.air)
 
 
