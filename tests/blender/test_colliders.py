@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colliders: what live playback sees of Blender's meshes is what bakes see of them."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bpy", reason="the bpy module is not installed: `make test-blender`")
+
+from .conftest import activate, add_mesh
+from .scenes import shown
+
+EXACT = 2e-5  # [m], between live playback and a bake
+SEEN = 1e-5  # of what Blender's Python and libigl see of colliders
+FRAMES = range(1, 41)
+SEEING = """
+import sys
+from dataclasses import replace
+import numpy as np
+from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.parameters import seeing_colliders
+from ssilk_core.network.proximity import proximity_size
+file, rng = load_model(sys.argv[1]), np.random.default_rng(5)
+config = replace(file.config, proximity_points=12)
+features = proximity_size(file.scene, config)
+seeing = seeing_colliders(file.parameters, file.config, features)
+for name, more in seeing.items():
+    if more.shape != file.parameters[name].shape:
+        blank = (more == 0).all(axis=0)
+        assert blank.sum() == features
+        more[:, blank] = rng.normal(0, 0.3, (len(more), features)).astype(more.dtype)
+save_model(sys.argv[2], replace(file, config=config, parameters=seeing))
+"""
+PROXIMITY = """
+import sys
+import numpy as np
+from ssilk_core.delivery.bake import BakeRequest, load_rollout
+model, stage, motion, output = sys.argv[1:]
+near = load_rollout(BakeRequest(model=model, stage=stage, motion=motion)).source.proximity
+np.save(output, np.zeros(0) if near is None else near)
+"""
+
+
+@pytest.fixture
+def seeing(ready, trained, ssilk_python) -> Any:
+    """The trained skirt with a model that colliders move, too."""
+    from blender_addon.playback.models import model_of
+
+    before = model_of(trained)
+    path = before.with_name("seeing.safetensors")
+    if not path.exists():
+        subprocess.run([ssilk_python, "-c", SEEING, str(before), str(path)], check=True)
+    trained.ssilk.model = str(path)
+    return trained
+
+
+def collide(ready: Any, garment: Any, thing: Any) -> Any:
+    """Give an object Collision physics."""
+    thing.modifiers.new("Collision", "COLLISION")
+    ready.context.view_layer.update()
+    activate(ready, garment)
+    return thing
+
+
+def a_floor(ready: Any, garment: Any) -> Any:
+    ready.ops.mesh.primitive_plane_add(size=100, location=(3, 2, 0.62))
+    return collide(ready, garment, ready.context.object)
+
+
+def a_box_that_moves(ready: Any, garment: Any) -> Any:
+    ready.ops.mesh.primitive_cube_add(size=0.5, location=(0.9, 0.1, 0.9), scale=(1, 0.6, 2))
+    box = ready.context.object
+    box.keyframe_insert("location", frame=1)
+    box.keyframe_insert("rotation_euler", frame=1)
+    box.location, box.rotation_euler = (0.2, -0.1, 1.0), (0.4, 0.9, 1.3)
+    box.keyframe_insert("location", frame=40)
+    box.keyframe_insert("rotation_euler", frame=40)
+    return collide(ready, garment, box)
+
+
+def a_box_that_grows(ready: Any, garment: Any) -> Any:
+    box = a_box_that_moves(ready, garment)
+    box.keyframe_insert("scale", frame=1)
+    box.scale = (-1.4, 0.6, 2)
+    box.keyframe_insert("scale", frame=40)
+    return box
+
+
+def a_wall(ready: Any, garment: Any) -> Any:
+    """Open, of many faces, mirrored and turned."""
+    ready.ops.mesh.primitive_grid_add(x_subdivisions=9, y_subdivisions=7, size=2, location=(-0.5, 0, 1.1))
+    wall = ready.context.object
+    wall.rotation_euler, wall.scale = (0.3, np.pi / 2 - 0.1, 0.2), (-0.7, 1, 1)
+    return collide(ready, garment, wall)
+
+
+def a_sea(ready: Any, garment: Any) -> Any:
+    """A grid that waves, finer by a modifier, and switched off for a while."""
+    ready.ops.mesh.primitive_grid_add(x_subdivisions=12, y_subdivisions=12, size=4, location=(0.2, 0, 0.7))
+    sea = ready.context.object
+    wave = sea.modifiers.new("Wave", "WAVE")
+    wave.height, wave.width, wave.time_offset = 0.3, 0.8, -40
+    sea.modifiers.new("Finer", "SUBSURF").levels = 1
+    collide(ready, garment, sea)
+    for frame, on in ((1, True), (11, False), (21, True)):
+        sea.collision.use = on
+        sea.keyframe_insert("collision.use", frame=frame)
+    ready.context.scene.frame_set(1)
+    return sea
+
+
+def near_live(garment: Any) -> np.ndarray | None:
+    from blender_addon.playback import playing
+
+    return playing.live(garment)._near
+
+
+def live(ready: Any, garment: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return what is shown in all frames, (F, V, 3), and how near colliders are, (F, M, 3)."""
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    near = near_live(garment)
+    found = shown(ready, garment, FRAMES)
+    assert ready.ops.ssilk.stop_live() == {"FINISHED"}
+    return found, near
+
+
+def near_in_bake(python: str, garment: Any, folder: Path) -> np.ndarray:
+    from blender_addon.playback.models import model_of
+
+    model, output = model_of(garment), folder / "near.npy"
+    words = [model, model.parent / "dressed.usdc", model.parent / "bake" / "motion.usdc", output]
+    subprocess.run([python, "-c", PROXIMITY, *map(str, words)], check=True)
+    return np.load(output)
+
+
+@pytest.mark.parametrize("made", [a_floor, a_box_that_moves, a_box_that_grows, a_wall, a_sea])
+def test_live_playback_sees_and_shows_what_a_bake_does(ready, seeing, ssilk_python, tmp_path, made):
+    alone, none = live(ready, seeing)
+    assert none is None
+    made(ready, seeing)
+    met, near = live(ready, seeing)
+    assert np.abs(met - alone).max() > 1e-3 and np.linalg.norm(near, axis=2).max() > 0.5
+    if made is a_sea:
+        off = (near == 0).all(axis=(1, 2))
+        assert off[10:20].all() and not off[:10].any() and not off[20:].any()
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    np.testing.assert_allclose(near_in_bake(ssilk_python, seeing, tmp_path), near, atol=SEEN)
+    assert np.abs(shown(ready, seeing, FRAMES) - met).max() < EXACT
+
+
+def test_nearest_points_are_those_of_all_triangles(bpy):
+    """Of two triangles of 100 m, and of a crumpled ball far from the origin, to what double precision allows."""
+    from blender_addon.motions.nearest import on_triangles, tree_nearest
+
+    rng = np.random.default_rng(2)
+    quad = np.array([[-50, 0, -50], [50, 0, -50], [50, 0, 50], [-50, 0, 50]], dtype=float)
+    ball = rng.normal(size=(300, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True) * rng.uniform(1, 1.2, (300, 1))
+    crumpled = rng.integers(0, 300, (500, 3))
+    crumpled = crumpled[(crumpled != np.roll(crumpled, 1, axis=1)).all(axis=1)]
+    for points, faces in ((quad, np.array([[0, 1, 2], [0, 2, 3]])), (ball + 200, crumpled)):
+        queries = points.mean(axis=0) + rng.uniform(-2, 2, (400, 3))
+        queries[:100, 2] += queries[:100, 0] - queries[:100, 2] + 1e-3 * rng.normal(size=100)  # by the diagonal
+        squares, face, found = tree_nearest(points, faces)(queries)
+        every = [on_triangles(np.tile(points[each], (400, 1, 1)), queries)[0] for each in faces]
+        np.testing.assert_allclose(np.sqrt(squares), np.sqrt(np.min(every, axis=0)), atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(queries - found, axis=1), np.sqrt(squares), atol=1e-9)
+        np.testing.assert_allclose(on_triangles(points[faces[face]], found)[0], 0, atol=1e-12)
