@@ -26,6 +26,7 @@ from .keys import changing_paths
 from .sampling import SLICE
 
 KIND, USE = "COLLISION", "collision.use"
+NAMED = 3  # colliders, in a line
 RIGID = 2e-6  # what axes may differ from turned ones; matrices in Blender are of single precision
 SAME = 1e-5  # of the distance from the world's origin, and of 1 m, by which points differ that were moved
 MOST_POINTS = 40_000_000  # of what changes its shape, over all frames: 1 GB
@@ -45,6 +46,15 @@ def unmet(garment: bpy.types.Object) -> list[str]:
     """Return in words what in the collection of a garment's colliders is no mesh, and so is not met."""
     chosen = garment.ssilk.colliders
     return [said for thing in (chosen.all_objects if chosen else ()) if (said := no_mesh(thing))]
+
+
+def unseen(garment: bpy.types.Object, armature: bpy.types.Object, who: str) -> str:
+    """Return in words that something, as "The network", plays a garment without its colliders; empty without any."""
+    names = [f"'{thing.name}'" for thing in colliders_of(garment, armature)]
+    if not names:
+        return ""
+    listed = ", ".join(names[:NAMED]) + (f" and {len(names) - NAMED} more" if len(names) > NAMED else "")
+    return f"{who} does not see {len(names)} collider{'s' * (len(names) > 1)}, {listed}; a bake as Hero meets them"
 
 
 def signature(garment: bpy.types.Object, armature: bpy.types.Object) -> tuple[object, ...]:

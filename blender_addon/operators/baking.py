@@ -23,7 +23,7 @@ from ssilk_core.scene.assets import Collider
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
-from ..motions.colliders import MetColliders
+from ..motions.colliders import MetColliders, unseen
 from ..motions.freedom import freedom, is_held
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
@@ -177,6 +177,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
         tell_changing_shapes(self, garment)
+        if not self.meets_colliders and (missed := unseen(garment, armature, "The bake")):
+            self.report({"WARNING"}, f"{missed}.")
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         if self.to_usd:

@@ -19,6 +19,7 @@ import bpy
 import numpy as np
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
 from ssilk_core.network.runtime import Player
 from ssilk_core.physics.world.felt import ColliderSight
@@ -164,6 +165,7 @@ class TrainingProgress:
         return bool(self.state and self.state.alive)
 
 
+_sees: dict[Path, tuple[float, bool]] = {}  # when a model was written that was read, and whether it sees colliders
 _known: dict[int, tuple[Question, TrainingProgress | None]] = {}
 
 
@@ -250,6 +252,19 @@ def told_renames(joints: Joints) -> str:
     name = next(iter(found))
     count = "1 bone is" if len(found) == 1 else f"{len(found)} bones are"
     return f" ({count} called otherwise than in the training and matched, as '{name}', which was '{found[name]}')"
+
+
+def sees_colliders(garment: bpy.types.Object) -> bool:
+    """Return whether a garment's model was trained to see colliders; the file is read where it is another by now.
+
+    Raises:
+        SsilkError: there is no model, or it cannot be read.
+    """
+    path = model_of(garment)
+    written = path.stat().st_mtime
+    if _sees.get(path, (0.0, False))[0] != written:
+        _sees[path] = written, load_model(path).config.proximity_points > 0
+    return _sees[path][1]
 
 
 class TrainedGarment:

@@ -76,7 +76,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     colliders: PointerProperty(
         type=bpy.types.Collection,
         name="Colliders",
-        description="Meshes that the garment meets besides its bodies, beside those with Collision physics",
+        description="Meshes that the garment meets besides its bodies, with Collision physics or without",
         override=SHOTS,
     )
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")

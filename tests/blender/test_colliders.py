@@ -171,3 +171,151 @@ def test_nearest_points_are_those_of_all_triangles(bpy):
         np.testing.assert_allclose(np.sqrt(squares), np.sqrt(np.min(every, axis=0)), atol=1e-9)
         np.testing.assert_allclose(np.linalg.norm(queries - found, axis=1), np.sqrt(squares), atol=1e-9)
         np.testing.assert_allclose(on_triangles(points[faces[face]], found)[0], 0, atol=1e-12)
+
+
+def colliders(garment: Any) -> list[str]:
+    from blender_addon.motions.colliders import colliders_of
+    from blender_addon.scene.garment import armature_of
+
+    return [thing.name for thing in colliders_of(garment, armature_of(garment))]
+
+
+def test_bodies_garments_and_what_is_off_are_no_colliders(ready, seeing):
+    """A chosen collection counts without physics; what stands in it and is no mesh is told."""
+    from blender_addon.motions.colliders import unmet
+
+    collide(ready, seeing, ready.data.objects["Pillar"])
+    collide(ready, seeing, seeing)
+    floor = a_floor(ready, seeing)
+    assert colliders(seeing) == [floor.name]
+    floor.collision.use = False
+    assert colliders(seeing) == []
+    floor.collision.use, floor.modifiers["Collision"].show_viewport = True, False
+    assert colliders(seeing) == []
+    chosen = ready.data.collections.new("Props")  # which no scene has
+    chosen.objects.link(floor)
+    curve = ready.data.objects.new("Rail", ready.data.curves.new("Rail", "CURVE"))
+    chosen.objects.link(curve)
+    chosen.objects.link(ready.data.objects["Pillar"])
+    seeing.ssilk.colliders = chosen
+    assert colliders(seeing) == [floor.name]
+    assert unmet(seeing) == ["'Rail' is no mesh, and cloth does not meet it; convert it (Object > Convert)"]
+    other = add_mesh(ready, "Other Skirt", np.eye(3), np.array([[0, 1, 2]]))
+    other.ssilk.armature = ready.data.objects["Rig"]
+    chosen.objects.link(other)
+    floor.hide_viewport = True
+    assert colliders(seeing) == []
+
+
+def test_what_carries_a_body_of_chosen_bodies_is_a_collider_where_it_is_named(ready, seeing):
+    """A mesh of the character that is none of its chosen bodies counts where the artist says so, and else not."""
+    pillar = ready.data.objects["Pillar"]
+    shell = ready.data.objects.new("Shell", pillar.data.copy())
+    ready.context.collection.objects.link(shell)
+    shell.modifiers.new("Armature", "ARMATURE").object = ready.data.objects["Rig"]
+    collide(ready, seeing, shell)
+    bodies = ready.data.collections.new("Bodies")
+    bodies.objects.link(pillar)
+    assert colliders(seeing) == []
+    seeing.ssilk.bodies = bodies
+    assert colliders(seeing) == []
+    seeing.ssilk.colliders = ready.data.collections.new("Props")
+    seeing.ssilk.colliders.objects.link(shell)
+    assert colliders(seeing) == ["Shell"]
+
+
+def played(garment: Any) -> Any:
+    from blender_addon.playback import playing
+
+    return playing.live(garment)
+
+
+def moved_by_hand(ready: Any, box: Any) -> None:
+    box.location.x -= 0.1
+
+
+def edited(ready: Any, box: Any) -> None:
+    for vertex in box.data.vertices:
+        vertex.co.x *= 1.2
+    box.data.update()
+
+
+def otherwise_modified(ready: Any, box: Any) -> None:
+    box.modifiers["Displace"].strength = 0.1
+
+
+def another(ready: Any, box: Any) -> None:
+    ready.ops.mesh.primitive_plane_add(size=4, location=(0, 0, 0.5))
+    ready.context.object.modifiers.new("Collision", "COLLISION")
+    ready.context.object.select_set(False)
+
+
+def deleted(ready: Any, box: Any) -> None:
+    ready.data.objects.remove(box)
+
+
+def switched_off(ready: Any, box: Any) -> None:
+    box.collision.use = False
+
+
+@pytest.mark.parametrize("change", [moved_by_hand, edited, otherwise_modified, another, deleted, switched_off])
+def test_a_change_of_a_collider_is_noticed_and_read(ready, seeing, change):
+    box = a_box(ready, seeing)
+    ready.context.scene.frame_set(5)
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    before = near_live(seeing)
+    ready.context.view_layer.update()
+    ready.context.scene.frame_set(6)
+    assert not played(seeing).stale and not played(seeing).behind
+    change(ready, box)
+    ready.context.view_layer.update()
+    assert played(seeing).stale or played(seeing).behind
+    activate(ready, seeing)
+    assert ready.ops.ssilk.refresh_live() == {"FINISHED"}
+    ready.context.scene.frame_set(7)
+    assert not played(seeing).stale and not played(seeing).behind
+    now = near_live(seeing)
+    assert now is None if change in (deleted, switched_off) else np.abs(now - before).max() > 1e-3
+    assert ready.ops.ssilk.stop_live() == {"FINISHED"}
+
+
+def a_box(ready: Any, garment: Any) -> Any:
+    ready.ops.mesh.primitive_cube_add(size=0.4, location=(0.7, 0.1, 0.9))
+    box = ready.context.object
+    box.modifiers.new("Displace", "DISPLACE").strength = 0.01
+    return collide(ready, garment, box)
+
+
+def test_a_keyed_collider_that_is_dragged_is_read_again_once(ready, seeing):
+    """What keys take back differs from what was read for as long as it is dragged: it is no reason to read on."""
+    box = a_box_that_moves(ready, seeing)
+    ready.context.scene.frame_set(5)
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    box.location.x += 0.3
+    ready.context.view_layer.update()
+    assert played(seeing).stale
+    assert ready.ops.ssilk.refresh_live() == {"FINISHED"}
+    assert not played(seeing).stale
+    box.update_tag()
+    ready.context.view_layer.update()
+    assert not played(seeing).stale
+    ready.context.scene.frame_set(6)
+    assert not played(seeing).stale
+    assert ready.ops.ssilk.stop_live() == {"FINISHED"}
+
+
+def test_a_pose_that_differs_is_seen_by_colliders_where_it_is(ready, seeing):
+    """As an artist poses the hips during playback: the frame's own distances are measured again."""
+    a_wall(ready, seeing)
+    ready.context.scene.frame_set(5)
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    before = near_live(seeing)
+    hips = ready.data.objects["Rig"].pose.bones["Hips"]
+    hips.location.x += 0.2
+    ready.context.view_layer.update()
+    play = played(seeing)
+    play.show(ready.context.scene, ready.context.evaluated_depsgraph_get())
+    now = near_live(seeing)
+    assert np.abs(now[4] - before[4]).max() > 1e-2
+    np.testing.assert_array_equal(np.delete(now, 4, axis=0), np.delete(before, 4, axis=0))
+    assert ready.ops.ssilk.stop_live() == {"FINISHED"}
