@@ -20,7 +20,7 @@ from ..errors import SetupError
 from ..scene.garment import is_garment, is_own_body, no_mesh
 from ..scene.meshes import triangles_of
 from ..scene.modifiers import moves_by_itself
-from ..scene.objects import found_again, is_disabled, scene_units
+from ..scene.objects import is_disabled, scene_units
 from .evaluating import evaluating
 from .keys import changing_paths
 from .sampling import SLICE
@@ -118,9 +118,16 @@ class _Sampled:
     places: list[np.ndarray] = field(default_factory=list)
     present: list[bool] = field(default_factory=list)
 
+    def object(self) -> bpy.types.Object:
+        """Return it, which may be in no scene; raise `SetupError` if it was deleted."""
+        for thing in bpy.data.objects:
+            if thing.session_uid == self.uid and thing.users_collection:
+                return thing
+        raise SetupError(f"'{self.name}' was deleted while it was read; play or bake again.")
+
     def take(self, depsgraph: bpy.types.Depsgraph, frame: int) -> int:
         """Take a frame as it is evaluated; return how many points were kept for it."""
-        thing = found_again(self.uid, self.name).evaluated_get(depsgraph)
+        thing = self.object().evaluated_get(depsgraph)
         there = _is_there(thing, named=self.named)
         self.present.append(there)
         if not there:  # nor evaluated
@@ -237,7 +244,7 @@ class MetColliders:
         done, kept, waiting = 0, 0, self._waiting
         while waiting and done < len(self._frames):
             until = time.monotonic() + SLICE
-            with evaluating(*(found_again(each.uid, each.name) for each in waiting)) as at:
+            with evaluating(*(each.object() for each in waiting)) as at:
                 while done < len(self._frames):
                     depsgraph = at(self._frames[done])
                     kept += sum(each.take(depsgraph, self._frames[done]) for each in waiting)

@@ -153,6 +153,138 @@ def test_live_playback_sees_and_shows_what_a_bake_does(ready, seeing, ssilk_pyth
     assert np.abs(shown(ready, seeing, FRAMES) - met).max() < EXACT
 
 
+def a_prop_in_no_scene(ready: Any, garment: Any) -> Any:
+    """A hidden sphere of a chosen collection, in centimetres and without physics, that appears in frame 20."""
+    ready.ops.mesh.primitive_uv_sphere_add(segments=12, ring_count=8, radius=30, location=(0.6, 0, 0.8))
+    ball = ready.context.object
+    ball.scale = (0.01, 0.01, 0.01)
+    for collection in ball.users_collection:
+        collection.objects.unlink(ball)
+    garment.ssilk.colliders = ready.data.collections.new("Props")
+    garment.ssilk.colliders.objects.link(ball)
+    for frame, hidden in ((1, True), (20, False)):
+        ball.hide_viewport = hidden
+        ball.keyframe_insert("hide_viewport", frame=frame)
+    ready.context.view_layer.update()
+    activate(ready, garment)
+    return ball
+
+
+def test_a_prop_of_a_chosen_collection_is_met_while_it_is_there(ready, seeing, ssilk_python, tmp_path):
+    a_prop_in_no_scene(ready, seeing)
+    met, near = live(ready, seeing)
+    off = (near == 0).all(axis=(1, 2))
+    assert off[:19].all() and not off[19:].any()
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    np.testing.assert_allclose(near_in_bake(ssilk_python, seeing, tmp_path), near, atol=SEEN)
+    assert np.abs(shown(ready, seeing, FRAMES) - met).max() < EXACT
+
+
+def evaluations(ready: Any, do: Any) -> tuple[int, int]:
+    """Return how often Blender evaluates another frame while something is done, and how often it updates one."""
+    counts = [0, 0]
+    handlers = ready.app.handlers
+
+    def frame(*_: Any) -> None:
+        counts[0] += 1
+
+    def update(*_: Any) -> None:
+        counts[1] += 1
+
+    handlers.frame_change_post.append(frame)
+    handlers.depsgraph_update_post.append(update)
+    try:
+        do()
+    finally:
+        handlers.frame_change_post.remove(frame)
+        handlers.depsgraph_update_post.remove(update)
+    return counts[0], counts[1]
+
+
+def test_colliders_cost_nothing_where_none_is_there_or_none_is_seen(ready, seeing):
+    """Bit by bit, file by file, and frame by frame of Blender's."""
+    from blender_addon.playback.models import model_of
+
+    path, found, files, counts = seeing.ssilk.model, {}, {}, {}
+    motion = model_of(seeing).parent / "bake" / "motion.usdc"
+    for around in (False, True):
+        if around:
+            a_floor(ready, seeing)
+        for model in ("", path):
+            seeing.ssilk.model = model
+            key = around, bool(model)
+            ready.context.view_layer.update()  # what was changed here
+            counts[key] = evaluations(ready, lambda key=key: found.setdefault(key, live(ready, seeing)))
+            if key != (True, True):
+                assert found[key][1] is None
+            assert ready.ops.ssilk.bake() == {"FINISHED"}
+            files[key] = motion.read_bytes()
+    np.testing.assert_array_equal(found[True, False][0], found[False, False][0])
+    assert files[True, False] == files[False, False] == files[False, True] != files[True, True]
+    assert counts[True, False] == counts[False, False] == counts[False, True]
+    assert counts[True, True][0] == counts[False, False][0] + len(FRAMES)
+
+
+def test_panels_name_the_colliders_that_are_not_seen(ready, seeing):
+    from blender_addon.panels.playback import unseen_line, unsolved_line
+
+    path = seeing.ssilk.model
+    assert unseen_line(seeing) == unsolved_line(seeing) == ""
+    floor = a_floor(ready, seeing).name
+    assert unseen_line(seeing) == unsolved_line(seeing) == ""
+    seeing.ssilk.live_quality = "latent"
+    missed = f"does not see 1 collider, '{floor}'; a bake as Hero meets them"
+    assert (unseen_line(seeing), unsolved_line(seeing)) == ("", f"The solver in latents {missed}")
+    seeing.ssilk.live_quality, seeing.ssilk.model = "NETWORK", ""
+    assert (unseen_line(seeing), unsolved_line(seeing)) == (f"The network {missed}", "")
+    seeing.ssilk.model = path + " that is gone"
+    assert unseen_line(seeing) == ""
+
+
+@pytest.mark.parametrize(
+    ("quality", "seen", "handed"), [("WHOLE", False, False), ("hero", False, True), ("latent", True, False)]
+)
+def test_a_bake_meets_colliders_where_its_network_or_its_solver_does(ready, seeing, quality, seen, handed):
+    """Of six frames, since the solver takes its time; what is not met is told."""
+    from blender_addon.playback.models import model_of
+    from ssilk_usd.opening.stage import open_stage
+
+    a_floor(ready, seeing)
+    ready.context.scene.frame_end = 6
+    seeing.ssilk.model = seeing.ssilk.model if seen else ""
+    motion = model_of(seeing).parent / "bake" / "motion.usdc"
+    assert ready.ops.ssilk.bake(quality=quality, pre_roll=0.0) == {"FINISHED"}
+    assert bool(open_stage(str(motion)).GetPrimAtPath("/Colliders")) == handed
+
+
+def grows(ready: Any, floor: Any) -> str:
+    array = floor.modifiers.new("Array", "ARRAY")
+    array.keyframe_insert("count", frame=1)
+    array.count = 5
+    array.keyframe_insert("count", frame=40)
+    return f"Modifiers give '{floor.name}' other faces at frame .* than before"
+
+
+def is_a_cloth(ready: Any, floor: Any) -> str:
+    floor.modifiers.new("Flag", "CLOTH")
+    return f"The modifier 'Flag' simulates '{floor.name}', which cloth is to meet"
+
+
+def is_edges(ready: Any, floor: Any) -> str:
+    floor.data.clear_geometry()
+    floor.data.from_pydata([(0, 0, 0), (1, 0, 0)], [(0, 1)], [])
+    return f"'{floor.name}' has no faces that cloth could meet"
+
+
+@pytest.mark.parametrize("change", [grows, is_a_cloth, is_edges])
+def test_what_cannot_be_a_collider_is_refused_in_one_sentence(ready, seeing, change):
+    said = change(ready, a_floor(ready, seeing))
+    with pytest.raises(RuntimeError, match=said):
+        ready.ops.ssilk.play_live()
+    with pytest.raises(RuntimeError, match=said):
+        ready.ops.ssilk.bake()
+
+
 def test_nearest_points_are_those_of_all_triangles(bpy):
     """Of two triangles of 100 m, and of a crumpled ball far from the origin, to what double precision allows."""
     from blender_addon.motions.nearest import on_triangles, tree_nearest
