@@ -175,7 +175,7 @@ def own_points(thing: bpy.types.Object) -> np.ndarray:
 
 
 def _corners(mesh: bpy.types.Mesh) -> np.ndarray:
-    """Return the vertices of all polygons, one after the other, and where each begins; the latter count from -1 down."""
+    """Return what a mesh's triangles follow from: vertices of all polygons, where each begins, how many there are."""
     corners, starts = np.empty(len(mesh.loops), np.int32), np.empty(len(mesh.polygons), np.int32)
     mesh.loops.foreach_get("vertex_index", corners)
     mesh.polygons.foreach_get("loop_start", starts)
@@ -183,7 +183,7 @@ def _corners(mesh: bpy.types.Mesh) -> np.ndarray:
 
 
 def _moves(places: np.ndarray) -> np.ndarray | None:
-    """Return what turns and moves the mesh of the first frame, about its origin, (F, 4, 4); None where it is not rigid.
+    """Return what turns the mesh of the first frame about its origin and moves it, (F, 4, 4); None if not rigid.
 
     Args:
         places: object to world, shape (F, 4, 4).
@@ -267,8 +267,8 @@ class MetColliders:
         """
         if frame not in self._frames:
             return False
-        known = [thing for thing in things if thing.session_uid in self._met]
-        return any([self._differs(thing, depsgraph, self._frames.index(frame)) for thing in known])
+        known, index = [thing for thing in things if thing.session_uid in self._met], self._frames.index(frame)
+        return bool([thing for thing in known if self._differs(thing, depsgraph, index)])
 
     def _differs(self, thing: bpy.types.Object, depsgraph: bpy.types.Depsgraph, index: int) -> bool:
         sampled, now = self._met[thing.session_uid][0], thing.evaluated_get(depsgraph)

@@ -246,8 +246,9 @@ def test_panels_name_the_colliders_that_are_not_seen(ready, seeing):
 )
 def test_a_bake_meets_colliders_where_its_network_or_its_solver_does(ready, seeing, quality, seen, handed):
     """Of six frames, since the solver takes its time; what is not met is told."""
-    from blender_addon.playback.models import model_of
     from ssilk_usd.opening.stage import open_stage
+
+    from blender_addon.playback.models import model_of
 
     a_floor(ready, seeing)
     ready.context.scene.frame_end = 6
