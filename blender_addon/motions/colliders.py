@@ -304,7 +304,8 @@ def _need_plain(thing: bpy.types.Object) -> None:
         cache = getattr(modifier, "point_cache", None)
         simulated = moves_by_itself(modifier) and modifier.type not in ("MESH_CACHE", "MESH_SEQUENCE_CACHE", "OCEAN")
         if modifier.show_viewport and simulated and not (cache is not None and cache.is_baked):
+            todo = "put a mesh cache, as from Alembic, in its place" if cache is None else "bake it"
             raise SetupError(
                 f"The modifier '{modifier.name}' simulates '{thing.name}', which cloth is to meet, as frames are "
-                "played; bake it, or switch the Collision of the object off."
+                f"played; {todo}, or take it from the colliders."
             )
