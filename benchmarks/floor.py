@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much cloth lies below the floor: the network that sees it, and the same one where it does not.
 
-    python benchmarks/floor.py --stage character.usdc --motions FOLDER --index FOLDER/index.json --split test
+    python benchmarks/floor.py sunk --stage character.usdc --motions FOLDER --index FOLDER/index.json --split test
+    python benchmarks/floor.py look --motions FOLDER --clip dm_cartwheel --simulation floor.npz -o sheet.png
 
 The floor of each clip is level and touches the lowest point that the body reaches in it. Told are the share of the
 garment's vertices that lie more than 5 mm below it in the first --frames of each clip, the worst frame, and how many
-frames have a vertex there; and how deep the deepest lies.
+frames have a vertex there; and how deep the deepest lies. `look` draws simulator, network and plain skinning in one
+clip over its floor; --simulation is read, or written where there is no such file.
 """
 
 from __future__ import annotations
@@ -17,12 +19,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from helpers.pictures import add_pictures, draw_rows, simulated_worlds
 from helpers.reports import table
 from helpers.subjects import Subject, open_subject
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.demo.shipped import shipped_path
+from ssilk_core.events import TextReporter
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
 from ssilk_core.network.runtime import Player
 from ssilk_core.physics.world.felt import felt_proximity
@@ -74,36 +78,67 @@ def seeing(subject: Subject, motion: Motion, world: ShotWorld) -> Motion:
     return replace(motion, proximity=near)
 
 
-def heights_of(player: Player, motion: Motion, floor: float) -> Floats:
-    """Return how far vertices are above a floor [m], shape (F, V)."""
+def played(player: Player, motion: Motion) -> Floats:
+    """Return the network's positions over a motion [m], shape (F, V, 3)."""
     playback = player.play(motion)
-    return np.stack([playback.vertices(frame)[:, 1] for frame in range(motion.frame_count)]) - floor
+    return np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
 
 
-def main() -> None:
-    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("--model", type=Path, default=shipped_path("cape"), metavar="FILE")
-    found.add_argument("--stage", type=Path, default=demo_body_path(), help="USD file with the character")
-    found.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="of motion files CLIP.usdc")
-    found.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
-    found.add_argument("--split", default="test", help="of the clips (default test)")
-    found.add_argument("--frames", type=int, default=300, help="of each clip, at the model's rate (default 300)")
-    options = found.parse_args()
-    subject = open_subject(options.model, options.stage, "cpu")
+def sunk(options: argparse.Namespace, subject: Subject) -> None:
+    """Print how much of the garment lies below the floor in each clip of a split."""
     player, rows = Player(subject.file), []
     every: dict[str, list[Floats]] = {"sees it": [], "does not": []}
     for entry in json.loads(options.index.read_text()):
         if entry["split"] != options.split:
             continue
-        motion = read_motion(options.motions / f"{entry['clip']}.usdc", subject.scene.character.skeleton)
-        motion = resample(motion, subject.file.config.fps).clip(0, options.frames)
+        motion = clip_of(options, subject, entry["clip"])
         floor = floor_of(subject.scene, motion)
         for name, seen in ("sees it", seeing(subject, motion, floor_world(motion, floor))), ("does not", motion):
-            heights = heights_of(player, seen, floor)
+            heights = played(player, seen)[..., 1] - floor
             every[name].append(heights)
             rows.append([entry["clip"], name, *_cells(Sunk.of(heights))])
     rows += [["all", name, *_cells(Sunk.of(np.concatenate(heights)))] for name, heights in every.items()]
     print(table(["clip", "network", "mean [%]", "worst [%]", "frames [%]", "deepest [mm]"], rows))
+
+
+def look(options: argparse.Namespace, subject: Subject) -> None:
+    """Draw simulator, network and linear blend skinning in one clip over its floor."""
+    motion, report = clip_of(options, subject, options.clip), TextReporter()
+    world, skeleton = floor_world(motion, floor_of(subject.scene, motion)), subject.scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    rows = {
+        "simulator": simulated_worlds(options.simulation, subject, motion, [world], report)[0],
+        "SSILK": played(Player(subject.file), seeing(subject, motion, world)),
+        "plain skinning": skin_points(subject.scene.garment.mesh.points, subject.scene.lbs_skin, matrices),
+    }
+    draw_rows(rows, subject.dressed, motion, options, report)
+
+
+def clip_of(options: argparse.Namespace, subject: Subject, name: str) -> Motion:
+    """Return the first frames of a clip at the model's rate."""
+    motion = read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
+    return resample(motion, subject.file.config.fps).clip(0, options.frames)
+
+
+def main() -> None:
+    found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("what", choices=["sunk", "look"])
+    found.add_argument("--model", type=Path, default=shipped_path("cape"), metavar="FILE")
+    found.add_argument("--stage", type=Path, default=demo_body_path(), help="USD file with the character")
+    found.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="of motion files CLIP.usdc")
+    found.add_argument("--index", type=Path, help="JSON list of clips and their splits, for 'sunk'")
+    found.add_argument("--split", default="test", help="of the clips (default test)")
+    found.add_argument("--clip", default="dm_cartwheel", help="that 'look' draws (default dm_cartwheel)")
+    found.add_argument("--frames", type=int, default=300, help="of each clip, at the model's rate (default 300)")
+    found.add_argument("--simulation", type=Path, metavar="NPZ", help="positions, read or written")
+    found.add_argument("--device", default="cpu", help="where the simulator runs (default cpu)")
+    add_pictures(found)
+    options = found.parse_args()
+    needed = "index" if options.what == "sunk" else "simulation"
+    if getattr(options, needed) is None:
+        found.error(f"'{options.what}' needs --{needed}")
+    subject = open_subject(options.model, options.stage, options.device)
+    (sunk if options.what == "sunk" else look)(options, subject)
 
 
 def _cells(sunk: Sunk) -> list[str]:

@@ -15,54 +15,27 @@ a GPU can write it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from helpers.pictures import PlayedShot, posed_body
+from helpers.pictures import add_pictures, draw_rows, simulated_worlds
 from helpers.reports import table
 from helpers.subjects import Subject, open_subject
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.delivery.bake.world import parse_world
-from ssilk_core.delivery.view.shots import Look, film_of_shots, sheet_of_shots
 from ssilk_core.demo.shipped import shipped_path
-from ssilk_core.errors import fail
 from ssilk_core.events import Reporter, TextReporter
-from ssilk_core.files import replacing
 from ssilk_core.network.runtime import Player
-from ssilk_core.physics.simulate import SimulationOptions, simulate
 from ssilk_core.physics.world.felt import felt_gravity
-from ssilk_core.quality.evaluation.methods import CachedPoints, build_take_set
-from ssilk_core.quality.evaluation.takes import takes_of
 from ssilk_core.scene.assets import LOOSE, Air, Floats, Motion, ShotWorld
 from ssilk_core.scene.kinematics import resample
 
 SIDES = {"ahead": (0.0, 0.0, -1.0), "behind": (0.0, 0.0, 1.0), "side": (1.0, 0.0, 0.0)}
 HEM = 0.1  # of the loose vertices
-
-
-def simulated(
-    path: Path, subject: Subject, motion: Motion, worlds: Sequence[ShotWorld | None], report: Reporter
-) -> Floats:
-    """Return the simulator's positions in each world, (W, F, V, 3) [m], from a file or into it."""
-    if not path.is_file():
-        options, count = SimulationOptions(fps=motion.fps), len(worlds)
-        found = simulate(
-            subject.scene, subject.file.fabric, [motion] * count, options, worlds=worlds, device=subject.device,
-            report=report,
-        )  # fmt: skip
-        with replacing(path) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, points=np.stack(found).astype(np.float32))
-    points = np.load(path, allow_pickle=False)["points"].astype(np.float64)
-    wanted = len(worlds), motion.frame_count, subject.scene.garment.mesh.vertex_count, 3
-    if points.shape != wanted:
-        fail(str(path), f"positions of the shape {points.shape}", f"these winds have {wanted}", "name another file")
-    return points
 
 
 def played(subject: Subject, motion: Motion, world: ShotWorld | None) -> Floats:
@@ -79,7 +52,7 @@ def hem(options: argparse.Namespace, subject: Subject, motion: Motion, report: R
     winds = [(speed, side) for speed in options.speeds for side in SIDES]
     blown = [Air(speed * np.array([SIDES[side]]), np.zeros(1)) for speed, side in winds]
     worlds = [None, *(ShotWorld(motion.fps, air=air) for air in blown)]
-    still, *solved = simulated(options.simulation, subject, motion, worlds, report)
+    still, *solved = simulated_worlds(options.simulation, subject, motion, worlds, report)
     calm, rows = played(subject, motion, None), []
     for (speed, side), world, points in zip(winds, worlds[1:], solved):
         wanted, found = (points - still)[:, lowest], (played(subject, motion, world) - calm)[:, lowest]
@@ -95,30 +68,13 @@ def look(options: argparse.Namespace, subject: Subject, motion: Motion, report: 
     speed, size, seed = gusts or (0.0, 2.0, 0)
     air = Air(np.array([wind or (0.0, 0.0, 0.0)]), np.array([speed]), length=size, seed=seed)
     world = ShotWorld(motion.fps, air=air)
-    solved = simulated(options.simulation, subject, motion, [world], report)[0]
+    solved = simulated_worlds(options.simulation, subject, motion, [world], report)[0]
     rows = {
         "simulator": solved,
         "network": played(subject, motion, world),
         "network, no wind": played(subject, motion, None),
     }
-    takes = takes_of(Path(motion.path).stem, motion, subject.scene.character.skeleton, motion.fps)
-    plain, body, shots = (
-        build_take_set(takes, subject.dressed, subject.model.joints),
-        posed_body(subject.dressed, motion),
-        [],
-    )
-    for name, points in rows.items():
-        read = CachedPoints(partial(_frames_of, points), subject.dressed, plain)
-        shots.append(PlayedShot(name, subject.dressed, plain, read, body))
-    drawn = Look(options.size[0], options.size[1], options.azimuth, workers=2)
-    if options.output:
-        sheet_of_shots(options.output, shots, labels=list(rows), columns=6, frames=None, look=drawn, report=report)
-    if options.film:
-        film_of_shots(options.film, shots, labels=list(rows), look=drawn, report=report)
-
-
-def _frames_of(points: Floats, _: str, frames: range) -> Floats:
-    return points[frames.start : frames.stop]
+    draw_rows(rows, subject.dressed, motion, options, report)
 
 
 def main() -> None:
@@ -132,12 +88,7 @@ def main() -> None:
     found.add_argument("--wind", help="X,Y,Z [m/s] in the world, y up")
     found.add_argument("--gusts", help="RMS[,SIZE[,SEED]]")
     found.add_argument("--simulation", type=Path, required=True, metavar="NPZ", help="positions, read or written")
-    found.add_argument("-o", "--output", type=Path, metavar="PNG", help="sheet to write")
-    found.add_argument("--film", type=Path, metavar="MP4", help="film to write")
-    found.add_argument("--azimuth", type=float, default=150.0, help="of the camera [degrees] (default 150)")
-    found.add_argument(
-        "--size", type=int, nargs=2, default=(240, 300), metavar=("W", "H"), help="of a panel [pixels]"
-    )
+    add_pictures(found)
     found.add_argument("--device", default="cpu", help="where the simulator runs (default cpu)")
     options = found.parse_args()
     torch.set_num_threads(2)

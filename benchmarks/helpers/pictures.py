@@ -3,18 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from helpers.subjects import Subject
+from ssilk_core.delivery.view.shots import Look, film_of_shots, sheet_of_shots
 from ssilk_core.errors import fail
 from ssilk_core.events import Reporter
 from ssilk_core.files import replacing
 from ssilk_core.physics.simulate import SimulationOptions, simulate
 from ssilk_core.quality.evaluation.methods import EvaluationScene, Method, TakeSet
-from ssilk_core.scene.assets import Floats, Ints, Motion
+from ssilk_core.scene.assets import Floats, Ints, Motion, ShotWorld
 from ssilk_core.scene.kinematics import motion_transforms, skin_points, skinning_matrices
 
 TRY = "simulate this motion again, into another file"
@@ -28,6 +31,7 @@ class PlayedMesh:
     faces: Ints
     is_garment: bool
     colour: tuple[float, float, float] | None = None
+    is_rider: bool = False
 
 
 class PlayedShot:
@@ -41,14 +45,24 @@ class PlayedShot:
     """
 
     def __init__(self, name: str, dressed: EvaluationScene, take_set: TakeSet, method: Method, body: Floats) -> None:
-        motion, mesh = take_set.takes[0].motion, dressed.scene.garment.mesh
+        motion = take_set.takes[0].motion
         x = method.vertices(0, range(motion.frame_count)).double().permute(2, 0, 1).cpu().numpy()
-        if not np.isfinite(x).all():
+        self._show(name, dressed, x + take_set.origins[0], body, motion.fps)
+
+    @classmethod
+    def of(cls, name: str, dressed: EvaluationScene, points: Floats, body: Floats, fps: float) -> PlayedShot:
+        """Return a shot of a garment's vertices (F, V, 3) in the world [m]; errors as above."""
+        shot = cls.__new__(cls)
+        shot._show(name, dressed, points, body, fps)
+        return shot
+
+    def _show(self, name: str, dressed: EvaluationScene, points: Floats, body: Floats, fps: float) -> None:
+        if not np.isfinite(points).all():
             fail(name, "it is not finite", "a picture needs positions")
-        self.garment, self.body, self.fps = x + take_set.origins[0], body, motion.fps
-        self.frame_times = [float(frame) for frame in range(motion.frame_count)]
-        faces = dressed.scene.character.merged_body().mesh.faces
-        self.meshes = [PlayedMesh("body", faces, False), PlayedMesh(dressed.name, mesh.faces, True)]
+        self.garment, self.body, self.fps = points, body, fps
+        self.frame_times = [float(frame) for frame in range(len(points))]
+        faces, own = dressed.scene.character.merged_body().mesh.faces, dressed.scene.garment.mesh.faces
+        self.meshes = [PlayedMesh("body", faces, False), PlayedMesh(dressed.name, own, True)]
 
     def points(self, time: float) -> Sequence[Floats]:
         """Return the vertices of body and garment in a frame [m]."""
@@ -60,6 +74,54 @@ def posed_body(dressed: EvaluationScene, motion: Motion) -> Floats:
     skeleton, body = dressed.scene.character.skeleton, dressed.scene.character.merged_body()
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     return skin_points(body.mesh.points, body.skin, matrices)
+
+
+def draw_rows(
+    rows: Mapping[str, Floats], dressed: EvaluationScene, motion: Motion, options: Namespace, report: Reporter
+) -> None:
+    """Draw garments (F, V, 3) in the world [m], one row each, as options of `add_pictures` ask for it."""
+    body = posed_body(dressed, motion)
+    shots = [PlayedShot.of(name, dressed, points, body, motion.fps) for name, points in rows.items()]
+    look = Look(options.size[0], options.size[1], options.azimuth, workers=2)
+    if options.output:
+        shown = {"columns": 6, "frames": options.shown, "look": look, "report": report}
+        sheet_of_shots(options.output, shots, labels=list(rows), **shown)
+    if options.film:
+        film_of_shots(options.film, shots, labels=list(rows), look=look, report=report)
+
+
+def add_pictures(parser: ArgumentParser) -> None:
+    """Add the options that `draw_rows` takes."""
+    parser.add_argument("-o", "--output", type=Path, metavar="PNG", help="sheet to write")
+    parser.add_argument("--film", type=Path, metavar="MP4", help="film to write")
+    parser.add_argument("--shown", type=int, nargs="+", metavar="FRAME", help="of the sheet (default: six, evenly)")
+    parser.add_argument("--azimuth", type=float, default=150.0, help="of the camera [degrees] (default 150)")
+    parser.add_argument(
+        "--size", type=int, nargs=2, default=(240, 300), metavar=("W", "H"), help="of a panel [pixels]"
+    )
+
+
+def simulated_worlds(
+    path: Path, subject: Subject, motion: Motion, worlds: Sequence[ShotWorld | None], report: Reporter
+) -> Floats:
+    """Return the simulator's positions in each world, (W, F, V, 3) [m], from a file or into it.
+
+    Raises:
+        SsilkError: the file holds other positions.
+    """
+    if not path.is_file():
+        options, count = SimulationOptions(fps=motion.fps), len(worlds)
+        found = simulate(
+            subject.scene, subject.file.fabric, [motion] * count, options, worlds=worlds, device=subject.device,
+            report=report,
+        )  # fmt: skip
+        with replacing(path) as temporary, temporary.open("wb") as stream:
+            np.savez_compressed(stream, points=np.stack(found).astype(np.float32))
+    points = np.load(path, allow_pickle=False)["points"].astype(np.float64)
+    wanted = len(worlds), motion.frame_count, subject.scene.garment.mesh.vertex_count, 3
+    if points.shape != wanted:
+        fail(str(path), f"positions of the shape {points.shape}", f"these worlds have {wanted}", TRY)
+    return points
 
 
 def kept_simulation(

@@ -46,6 +46,7 @@ from ..scene.handover import STAGE, hand_over, loading_usd
 from ..scene.linked import is_override
 from ..scene.look import left_behind, lost_looks
 from ..scene.objects import Pair, scene_rate
+from ..scene.riders import gather_riders, moving_riders, riders_of, with_parts
 from ..scene.weights import has_trained_weights
 from ..settings.training import RELATIVE
 from . import tasks
@@ -64,6 +65,7 @@ QUALITY_ITEMS = [
     *((name, name.capitalize(), ABOUT.get(name, level.about)) for name, level in QUALITIES.items()),
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
+RIDDEN = "ridden.usdc"  # the character with what rides on the garment
 
 
 class TimelineOperator(tasks.OutsideOperator):
@@ -181,6 +183,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             self.report({"WARNING"}, f"{missed}.")
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
+        self.riders = gather_riders(garment, self.trained) if self.to_usd else {}
         if self.to_usd:
             self.tell_lost(garment, armature)
         self.python = interpreter(preferences(context))
@@ -195,12 +198,15 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
 
     def tell_lost(self, garment: bpy.types.Object, armature: bpy.types.Object) -> None:
         """Report what a shot in USD lacks of what Blender shows."""
-        written = [garment, *bodies_of(garment, armature)]
+        written = [garment, *bodies_of(garment, armature), *with_parts(riders_of(garment))]
         if looks := lost_looks(written):
             text = f"{'; '.join(looks)}. Bake to the timeline and use Blender's own export to keep these"
             self.report({"WARNING"}, f"In USD {text}.")
         if parts := left_behind(armature, written):
             self.report({"WARNING"}, f"The shot in USD holds the garment and its bodies alone, without {parts}.")
+        if moving := moving_riders(garment):
+            text = "what moves them besides the cloth is not in the shot in USD"
+            self.report({"WARNING"}, f"{moving}: {text}.")
         if over := overriding(garment, armature):
             text = "The shot in USD holds the network's own motion, without what stands over it in Blender"
             self.report({"WARNING"}, f"{text}: {'; '.join(over)}.")
@@ -212,6 +218,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         except SsilkError as error:
             raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
         scene, self.sees = file.scene, file.config.proximity_points > 0
+        self.trained = scene.garment.mesh
         self.prim = split_location(scene.garment.mesh.path)[1]
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
         joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
@@ -266,6 +273,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             given = hand_over(self.scene, self.pair, inputs)
             self.words |= {f"{inputs.name}/{made}": name for made, name in given.words.items()}
             stage = inputs / STAGE
+        if self.riders:
+            from ssilk_usd.writing.riders import write_riders
+
+            write_riders(inputs / RIDDEN, stage, self.prim, self.riders)
+            self.words[f"{inputs.name}/{RIDDEN}"] = f"what rides on '{self.pair.name}'"
+            stage = inputs / RIDDEN
         self.shot = self.shot or folder / SHOT
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames

@@ -74,6 +74,7 @@ class GarmentPanel(SidebarPanel, bpy.types.Panel):
             layout.prop(context.object.ssilk, "bodies")
             draw_course(layout, context.object)
             draw_garments(layout, context.object)
+            layout.operator("ssilk.attach_to_cloth", icon="SNAP_FACE")
         missing = "" if tasks.current else unready(context)  # what runs may be finding it
         if missing:  # why the search for a Python failed is said in its place, not beside it
             draw_text(layout, tasks.failed or missing, icon="ERROR")

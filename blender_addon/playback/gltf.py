@@ -23,6 +23,7 @@ from ..errors import SetupError
 from ..motions.simulated import sample_vertices
 from ..scene.meshes import rest_points
 from ..scene.objects import scene_rate, scene_units
+from ..scene.riders import riders_of, with_parts
 
 SETTINGS: dict[str, Any] = {
     "export_format": "GLB",
@@ -51,14 +52,15 @@ SAME = 1e-5  # of the garment's size: rest points that are one place
 
 
 def exported(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> tuple[float, int]:
-    """Write a glb of a garment with its armature, shown though they may be hidden; return its `largest_loss`.
+    """Write a glb of a garment with its armature, shown though they may be hidden; return its largest loss [m] and
+    the frame: of the garment or of what rides on it.
 
     Raises:
-        SsilkError: as `export_glb` and `largest_loss` do, or a collection hides one of both.
+        SsilkError: as `export_glb`, `largest_loss` and `largest_loss_of_riders` do, or a collection hides one.
     """
     with visible([garment, armature]):
         export_glb(garment, armature, path)
-        return largest_loss(garment, path)
+        return max(largest_loss(garment, path), largest_loss_of_riders(garment, path))
 
 
 def write_seen(garment: bpy.types.Object, armature: bpy.types.Object, path: Path) -> None:
@@ -104,7 +106,7 @@ def export_glb(garment: bpy.types.Object, armature: bpy.types.Object, path: Path
     if ADDON not in bpy.context.preferences.addons:
         raise SetupError("Blender's add-on for glTF 2.0 is switched off; switch it on in the preferences.")
     base = bpy.context.scene.render.fps_base
-    with _selected([armature, *_moved(armature), garment]):
+    with _selected([armature, *_moved(armature), garment, *with_parts(riders_of(garment))]):
         with _fps_base(1 / base):
             _export(path)
         if not _lasts_as_played(garment, path):
@@ -167,6 +169,30 @@ def largest_loss(garment: bpy.types.Object, path: Path) -> tuple[float, int]:
         there = played.vertices(played.start + number / scene_rate()) * units.meters_per_unit
         losses.append(np.minimum.reduceat(np.linalg.norm(there[stored] - points[own], axis=1), firsts).max())
     return float(max(losses)), frames[int(np.argmax(losses))]
+
+
+def largest_loss_of_riders(garment: bpy.types.Object, path: Path) -> tuple[float, int]:
+    """Return how far what rides on a garment is from where Blender shows it, at most [m], and in which frame.
+
+    Raises:
+        SsilkError: the file lacks one.
+    """
+    scene, units = bpy.context.scene, scene_units()
+    parts, turn = [part for part in with_parts(riders_of(garment)) if part.visible_get()], np.eye(4)
+    if not parts:
+        return 0.0, scene.frame_start
+    played, worst, before = SkinnedGlb(path, garment.name), (0.0, scene.frame_start), scene.frame_current
+    turn[:3, :3] = units.rotation
+    corners = [np.column_stack([np.array(part.bound_box), np.ones(8)]) @ turn.T for part in parts]
+    for frame in range(scene.frame_start, scene.frame_end + 1):
+        scene.frame_set(frame)
+        time = played.start + (frame - scene.frame_start) / scene_rate()
+        for part, box in zip(parts, corners):
+            there = played.place(part.name, time) - turn @ np.array(part.matrix_world) @ turn.T
+            off = float(np.linalg.norm(box @ there[:3].T, axis=1).max()) * units.meters_per_unit
+            worst = max(worst, (off, frame))
+    scene.frame_set(before)
+    return worst
 
 
 def _placed(garment: bpy.types.Object) -> np.ndarray:

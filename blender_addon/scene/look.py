@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 
 from .armature import leader_of
-from .garment import is_garment
+from .garment import FOLLOWING, is_garment
 from .meshes import rendered_map
 from .modifiers import HARMLESS, bones_place, reshapes
 
@@ -80,16 +80,22 @@ def _holds(mesh: bpy.types.Mesh, name: str) -> bool:
 
 
 def left_behind(armature: bpy.types.Object, written: Sequence[bpy.types.Object]) -> str:
-    """Return in words what is drawn and hangs on an armature, and is not written with it; garments are no loss."""
+    """Return in words what is drawn, and hangs on an armature or follows what is written, and is not itself written;
+    garments are no loss."""
     wearers = (armature, leader_of(armature))
     names = sorted(
         f"'{thing.name}'"
         for thing in bpy.context.view_layer.objects
         if thing.type in DRAWN and thing not in written and not thing.hide_render and not is_garment(thing)
-        and _hangs_on(thing, wearers)
+        and (_hangs_on(thing, wearers) or _follows(thing, written))
     )  # fmt: skip
     more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
     return f"{', '.join(names[:NAMED])}{more} of '{armature.name}'" if names else ""
+
+
+def _follows(thing: bpy.types.Object, written: Sequence[bpy.types.Object]) -> bool:
+    """Return whether a modifier lets an object follow the surface of another, as trims do a garment's."""
+    return any(getattr(each, FOLLOWING.get(each.type, ""), None) in written for each in thing.modifiers)
 
 
 def _hangs_on(thing: bpy.types.Object, wearers: Sequence[bpy.types.Object]) -> bool:

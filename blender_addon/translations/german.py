@@ -13,6 +13,10 @@ WORDS = {
     "Choose Garment": "Kleidungsstück wählen",
     "Work on this garment": "An diesem Kleidungsstück arbeiten",
     "Name of the object to work on": "Name des Objekts, an dem gearbeitet wird",
+    "Attach to Cloth": "Am Stoff befestigen",
+    "Let the other selected objects ride on the garment: each is parented to the three vertices beneath it": (
+        "Die anderen ausgewählten Objekte reiten auf dem Kleidungsstück: jedes hängt an den drei Eckpunkten unter ihm"
+    ),
     "Bodies": "Körper",
     "Meshes that the garment collides with; all others bound to the armature when empty": (
         "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an das Skelett gebunden sind"

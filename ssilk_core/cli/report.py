@@ -115,7 +115,8 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
         fail(str(path), "no mesh is marked as a garment", "at least one is needed", "see 'ssilk rig'")
     if not shot.frame_times:
         fail(str(path), "the shot has no frames", "at least one is needed")
-    bodies = {index: part.mesh for index, part in enumerate(parts) if not shot.meshes[index].is_garment}
+    others = {index for index, mesh in enumerate(shot.meshes) if mesh.is_garment or mesh.is_rider}
+    bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
     sections = shot_sections(shot, garments, bodies, report)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     return [*sections, Section("Provenance", facts({**read_provenance(path), **records}))]

@@ -224,8 +224,16 @@ class _Caches:
         from ssilk_usd.opening.stage import open_stage
         from ssilk_usd.units import StageUnits
 
+        from ..delivery.bake import riders_of
+
         self.stack, self.options, self.shots, self.scene, self.played = stack, options, shots, scene, played
-        self.units = StageUnits.of(open_stage(options.stage))
+        stage = open_stage(options.stage)
+        self.units = StageUnits.of(stage)
+        self.riders = riders_of(stage, scene.garment.mesh, options.root, report)
+        if self.riders and options.points:
+            report(
+                Message(f"{options.stage}: --points writes the garment alone, without what rides on it", "warning")
+            )
         self.folder = Path(stack.enter_context(TemporaryDirectory(prefix="ssilk_")))
         self.open: dict[int, tuple[ExitStack, PointCache]] = {}
         self.report = report
@@ -290,6 +298,7 @@ class _Caches:
                 units=self.units,
                 origin={},
                 about={"simulated": asked.provenance},
+                riders=self.riders,
                 include_body=not self.options.no_body,
                 device=self.options.device,
                 report=self.report,

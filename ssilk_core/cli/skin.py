@@ -55,7 +55,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.shots.trajectories import MeshTrajectories
     from ssilk_usd.units import StageUnits
 
-    from ..delivery.bake import cache_origin, motion_at, skin_trajectories
+    from ..delivery.bake import cache_origin, motion_at, riders_of, skin_trajectories
     from ..delivery.targets import fit, joint_names
     from ..scene.decomposition import FitTolerance
 
@@ -75,7 +75,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     motion = motion_at(read_motion(where, skeleton, root=options.root), skeleton, points, options.cache)
     shared.tell_shapes(options, [motion], report)
     report(Started("skin", motion.frame_count, {"output": str(options.output)}))
-    own = StageUnits.of(open_stage(options.stage))
+    stage = open_stage(options.stage)
+    own = StageUnits.of(stage)
     result = skin_trajectories(
         deformer,
         motion,
@@ -83,6 +84,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         options.output,
         units=StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis),
         origin=cache_origin(options.cache, points.mesh, options.output),
+        riders=riders_of(stage, mesh, options.root, report),
         hidden=read_hidden(where, motion, root=options.root),
         include_body=not options.no_body,
         verify=not options.no_verify,

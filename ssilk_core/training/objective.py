@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from ..network.model.network import GarmentModel
-from ..physics.collision import CollisionBody, Contacts
+from ..physics.collision import CollisionBody, Contacts, signed_distance_to_planes
 from ..physics.collision.contacts import no_planes
-from ..physics.collision.distance import signed_distance_to_planes
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
 from ..physics.intersections.contours import IntersectionContours

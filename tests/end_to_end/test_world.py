@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -15,8 +16,12 @@ from ssilk_usd.shots.play import Shot
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
 from ssilk_core.delivery.bake.load import load_rollout
+from ssilk_core.delivery.bake.world import world_of
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.parameters import seeing_colliders
+from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
 from ssilk_core.network.runtime import Player
+from ssilk_core.physics.world.felt import felt_proximity
 from ssilk_core.scene.kinematics import hub_places
 
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
@@ -145,6 +150,39 @@ def test_a_network_that_was_trained_in_wind_says_nothing_of_it(stage, capsys):
     save_model("model.safetensors", replace(file, provenance={**file.provenance, "train": train}))
     assert main([*BAKE, "plain.usda", "-o", "blown.usdc", "--wind", "0,0,4"]) == 0
     assert "network" not in capsys.readouterr().err
+
+
+def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
+    file = load_model("model.safetensors")
+    config = replace(file.config, proximity_points=5)
+    parameters = seeing_colliders(file.parameters, config, proximity_size(file.scene, config))
+    for name in ("initialiser.0.weight", "stepper.0.weight"):
+        empty = (parameters[name] == 0).all(axis=0)
+        assert empty.sum() == 15
+        parameters[name][:, empty] = np.random.default_rng(1).normal(size=(len(parameters[name]), 15))
+    save_model("seeing.safetensors", replace(file, config=config, parameters=parameters))
+    seeing = ["bake", "seeing.safetensors", *BAKE[2:]]
+    assert main([*seeing, "floored.usda", "-o", "seen.usdc"]) == 0
+    assert "does not see" not in capsys.readouterr().err
+    assert main(["verify", "seen.usdc"]) == 0
+    player, motion = Player.load("seeing.safetensors"), read_motion("floored.usda", file.scene.character.skeleton)
+    scene = player.file.scene
+    world = world_of("floored.usda", "rigged.usda", scene, motion, None)
+    rows, reach = proximity_vertices(scene, config), proximity_reach(scene)
+    near = felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
+    assert len(world.colliders) == 1 and np.abs(near).max() > 0.5
+    for name, felt in ("seen.usdc", near), ("blind.usdc", None):
+        playback = player.play(replace(motion, proximity=felt))
+        expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
+        if felt is None:  # nothing is near where there is no collider
+            assert main([*seeing, "plain.usda", "-o", name]) == 0
+        np.testing.assert_allclose(points_of(name), expected, atol=1e-5)
+    assert np.abs(points_of("seen.usdc") - points_of("blind.usdc")).max() > 1e-3
+    capsys.readouterr()
+    assert main([*seeing, "floored.usda", "-o", "latent.usdc", "--latent-iterations", "1"]) == 0
+    assert "the solver in latents does not see colliders" in capsys.readouterr().err
+    assert main([*seeing, "plain.usda", "-o", "latent_plain.usdc", "--latent-iterations", "1"]) == 0
+    np.testing.assert_array_equal(points_of("latent.usdc"), points_of("latent_plain.usdc"))
 
 
 @pytest.mark.parametrize("more", [["--refine", "30"], ["--refine", "30", "--feedback"]], ids=["refine", "feedback"])

@@ -17,6 +17,10 @@ LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeight
 WIND, GUSTS, GUST_LENGTH, GUST_SEED = "ssilk:wind", "ssilk:gusts", "ssilk:gustLength", "ssilk:gustSeed"
 # Of a garment in a shot: 1 where it moves freely, 0 where it is held to linear blend skinning; frames of each pose.
 FREE, HOLD = "ssilk:free", "ssilk:hold"
+# Of what rides on a garment: the garment's mesh, three vertices of it that carry the rider, whether it is soft.
+RIDES_ON, RIDE_VERTICES, RIDE_SOFT = "ssilk:ridesOn", "ssilk:rideVertices", "ssilk:rideSoft"
+# Of a baked garment: those of its proxy joints that carry riders.
+RIDER_JOINTS = "ssilk:riderJoints"
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 
 

@@ -14,6 +14,7 @@ from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
 from .result import BakeResult, FrameSpan, LatentSummary, RefinementSummary, Verification
+from .riders import riders_of
 from .rollout import BakeRollout
 from .sizing import shot_bytes, stored_bytes
 from .task import BakeTask, plan_layers
@@ -24,6 +25,6 @@ from .write import bake
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
     "LoadedGarment", "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment",
-    "load_rollout", "motion_at", "on_character", "plan_layers", "rig_deformer", "shot_bytes", "skin_trajectories",
-    "stored_bytes", "trained_deformer", "verify", "with_model",
+    "load_rollout", "motion_at", "on_character", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
+    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model",
 ]  # fmt: skip

@@ -127,7 +127,7 @@ def _opened(path: Path, points: bool) -> ShotPlayer:
 
 def _body_in(shot: ShotPlayer, scene: Scene) -> list[int] | None:
     """Return the meshes of a shot that are the bodies of a scene, in their order; None where some are missing."""
-    found = [number for number, mesh in enumerate(shot.meshes) if not mesh.is_garment]
+    found = [number for number, mesh in enumerate(shot.meshes) if not (mesh.is_garment or mesh.is_rider)]
     counts = [len(points) for points in shot.points(shot.frame_times[0])]
     wanted = [body.mesh.vertex_count for body in scene.character.bodies]
     return found if [counts[number] for number in found] == wanted else None

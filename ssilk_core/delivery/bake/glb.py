@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from ...events import Message, Reporter
 from ...files import split_location
 from ...scene.assets import Deformer, GarmentPose, Motion
+from ...scene.riders import RiderJoints
 from ..gltf.shot import SET, GlbLabels, write_glb
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ def write_glb_shot(
     start: float,
     samples_per_frame: int = 1,
     include_body: bool = True,
+    riders: RiderJoints | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -48,13 +50,15 @@ def write_glb_shot(
     looks = as_it_looks(scene.garment, split_location(scene.character.path)[0])
     scene = replace(scene, garment=looks)
     deformer = replace(deformer, scene=scene)
-    garment, *bodies = prim_names([scene.garment.mesh.path, *(body.mesh.path for body in scene.character.bodies)])
+    bodies, ridden = scene.character.bodies, riders.bodies if riders else ()
+    names = prim_names([mesh.path for mesh in (scene.garment.mesh, *(body.mesh for body in (*bodies, *ridden)))])
     labels = GlbLabels(
         character=prim_names([scene.character.path])[0],
         joints=unique_names(scene.joint_names),
         shapes=[shape_name(index) for index in range(deformer.shape_count)],
-        garment=garment,
-        bodies=bodies,
+        garment=names[0],
+        bodies=names[1 : 1 + len(bodies)],
+        riders=names[1 + len(bodies) :],
         start=start,
         samples_per_frame=samples_per_frame,
     )
@@ -65,6 +69,8 @@ def write_glb_shot(
         checked_poses(poses, deformer, motion),
         labels,
         include_body=include_body,
+        riders=ridden,
+        rider_shapes=riders.shapes if riders else (),
         hidden=hidden,
         hidden_polygons=None if hidden_polygons is None else hidden_polygons.masks,
         provenance=provenance,

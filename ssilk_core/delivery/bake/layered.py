@@ -107,7 +107,7 @@ class _Layer:
         self.shot, meshes = shot, [part.mesh for part in read_parts(shot)]
         self._place = next(place for place, mesh in enumerate(shot.meshes) if mesh.is_garment)
         self.rest = meshes[self._place]
-        self.bodies = [mesh for mesh, own in zip(meshes, shot.meshes) if not own.is_garment]
+        self.bodies = [mesh for mesh, own in zip(meshes, shot.meshes) if not (own.is_garment or own.is_rider)]
 
     def points(self, times: Sequence[float]) -> list[Floats]:
         """Return positions of the garment at some frame times [m], each (V, 3)."""

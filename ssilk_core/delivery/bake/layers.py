@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ...errors import SsilkError
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import FileHashes, remove_unfinished_in, replacing, sha256
+from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
 from .counted import state_rollout_counts
@@ -272,10 +273,12 @@ def _write_asset(
     from ssilk_usd.shots import layers_asset
 
     version, identifier = use.asset_version or garment.info.version, use.asset_identifier or ""
+    riders = RiderJoints(garment.deformer, garment.riders, task.request.receiver.influences)
     written = layers_asset.write_asset(
         layout,
-        garment.deformer,
+        riders.deformer,
         garment.units,
+        riders=riders,
         include_body=task.include_body,
         record=garment.record,
         info=replace(garment.info, version=version, identifier=identifier),
@@ -296,6 +299,10 @@ def _write_layer(
 
     rollout = refined(solved(rollout, report), report, add_shapes=True)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
+    riders = rollout.rider_joints()
+    if riders and rollout.request.writes_points:
+        text = "what rides on the garment follows the joints, also where the variant 'points' is selected"
+        report(Message(f"{layout.animation}: {text}", "warning"))
     common: dict[str, Any] = {
         "units": rollout.units,
         "start": rollout.start,
@@ -311,10 +318,11 @@ def _write_layer(
         summary = layers_animation.write_animation(
             layout,
             asset,
-            rollout.deformer,
+            riders.deformer,
             rollout.motion,
-            rollout.poses(),
+            riders.poses(rollout.motion, rollout.poses()),
             **common,
+            riders=riders,
             hidden=rollout.hidden,
             hidden_polygons=hidden,
             provenance=shot_metadata(rollout, layout.animation),

@@ -11,17 +11,20 @@ import numpy as np
 
 from ...devices import select_device
 from ...errors import fail
+from ...events import Event
 from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
 from ...scene.assets import Deformer, Floats, Motion, Scene
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
+from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .character import on_character
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
+from .riders import riders_of
 from .rollout import BakeRollout
 from .world import Sight, asked_world, world_of
 
@@ -64,6 +67,8 @@ class LoadedGarment:
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
         info: of the garment as an asset.
+        riders: what rides on it.
+        told: what was found about riders, to be reported.
     """
 
     request: BakeRequest
@@ -77,6 +82,8 @@ class LoadedGarment:
     provenance: dict[str, object]
     record: GarmentRecord
     info: AssetInfo
+    riders: tuple[Rider, ...] = ()
+    told: tuple[Event, ...] = ()
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -116,8 +123,10 @@ class LoadedGarment:
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
-            sight=Sight.of(self.file),
+            sight=Sight.of(self.file, solved=request.latent_iterations > 0),
             reduction=reduction,
+            riders=self.riders,
+            told=self.told,
             direction=None if request.lbs else self._directed(request, read),
         )
 
@@ -151,7 +160,7 @@ class LoadedGarment:
 
     def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
         """Return a motion with the gravity, the wind and the colliders of its shot that the network sees."""
-        sight, scene = Sight.of(self.file), self.deformer.scene
+        sight, scene = Sight.of(self.file, solved=request.latent_iterations > 0), self.deformer.scene
         if not (sight.pull or sight.colliders):
             return motion
         from ...network.proximity import proximity, proximity_reach, proximity_vertices
@@ -201,7 +210,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     device = select_device(request.device)
     file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
-    (scene, units), stage_held = read_unchanged(
+    (scene, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
     model = None if request.lbs else network(file, scene).to(device)
@@ -222,15 +231,23 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         },
         record=_record(file, model_held.digest),
         info=_info(request, model_held.digest),
+        riders=riders,
+        told=told,
     )
 
 
-def _on_stage(file: ModelFile, request: BakeRequest) -> tuple[Scene, StageUnits]:
-    """Return a model's scene with the character of a stage, and the units of what is written."""
+def _on_stage(
+    file: ModelFile, request: BakeRequest
+) -> tuple[Scene, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
+    """Return a model's scene with the character of a stage, the units of what is written, what rides on it, and what
+    there is to report of that."""
     from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
-    return on_character(file, stage, request.root), _units(stage, request.receiver)
+    scene = on_character(file, stage, request.root)
+    told: list[Event] = []
+    riders = riders_of(stage, scene.garment.mesh, request.root, lambda event: told.append(event))
+    return scene, _units(stage, request.receiver), riders, tuple(told)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...events import Countdown, Message, Reporter, silent
+from ...events import Countdown, Event, Message, Reporter, silent
 from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.fabrics import Fabric
@@ -23,6 +23,7 @@ from ...scene.kinematics import (
     slerp,
     split_at_cuts,
 )
+from ...scene.riders import Rider, RiderJoints
 from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
@@ -85,6 +86,7 @@ class BakeRollout:
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
+        riders: what rides on the garment; `told` is what was found about them, to be reported.
         direction: where the garment is held; None where it moves freely throughout.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
@@ -111,6 +113,8 @@ class BakeRollout:
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
     latents: SolvedLatents | None = None
+    riders: tuple[Rider, ...] = ()
+    told: tuple[Event, ...] = ()
     direction: Direction | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
@@ -131,6 +135,10 @@ class BakeRollout:
             yield from self.network_poses()
         else:
             yield from self.refinement.poses
+
+    def rider_joints(self) -> RiderJoints:
+        """Return the garment with the joints of what rides on it."""
+        return RiderJoints(self.deformer, self.riders, self.request.receiver.influences)
 
     def network_poses(self, roller: LatentRoller | None = None) -> Iterator[GarmentPose]:
         """Yield the network's poses, some frames at a time.
@@ -256,6 +264,8 @@ class BakeRollout:
         """Report joints that are renamed, and which frames of the motion are played, unless it is all of them."""
         if self.names.renamed:
             report(Message(f"--target {self.request.target}: {self.names}", "warning"))
+        for event in self.told:
+            report(event)
         if self.frames is None:
             return
         name = self.request.motion

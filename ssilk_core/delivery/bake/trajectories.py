@@ -16,6 +16,7 @@ from ...events import Message, Reporter, silent
 from ...files import relative_path, replacing, sha256, split_location
 from ...scene.assets import Deformer, Floats, Motion, Scene, Skeleton
 from ...scene.kinematics import held_at_cuts, sample_motion
+from ...scene.riders import Rider, RiderJoints
 from ..targets import GLB
 from .character import on_character
 from .counted import state_counts
@@ -23,6 +24,7 @@ from .glb import warn_of_sets, write_glb_shot
 from .nearness import need_near
 from .opened import open_shot
 from .result import SKINNED, BakeResult, ShotShapes, Verification
+from .riders import verify_riders
 from .verification import compare_trajectories, need_valid
 
 if TYPE_CHECKING:
@@ -85,6 +87,7 @@ def skin_trajectories(
     units: StageUnits,
     origin: Mapping[str, object],
     about: Mapping[str, object] | None = None,
+    riders: Sequence[Rider] = (),
     hidden: Sequence[tuple[int, bool]] = (),
     include_body: bool = True,
     verify: bool = True,
@@ -102,6 +105,7 @@ def skin_trajectories(
         units: units and up axis of the file.
         origin: where the points come from, as the file says it; without a cache it cannot be compared again.
         about: what else the file says of itself.
+        riders: what rides on the garment.
         hidden: from which frames on the garment is hidden (True) or seen (False).
         tolerance: how near joints and blendshapes come to the points; `FitTolerance()` by default.
         source: what the points come from, for messages.
@@ -125,27 +129,33 @@ def skin_trajectories(
         warn_of_sets(found.deformer, path, report)
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
     verification: Verification | None = None
+    ridden = RiderJoints(found.deformer, riders, found.deformer.skin.indices.shape[1])
+    poses = ridden.poses(motion, found.poses)
     with replacing(path) as unverified:
         with packaged(unverified, report, name=path) as layer:
             common: dict[str, Any] = {
-                "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said
+                "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said,
+                "riders": ridden,
             }  # fmt: skip
             if path.suffix == GLB:
-                summary = write_glb_shot(layer, found.deformer, motion, found.poses, **common)
+                summary = write_glb_shot(layer, ridden.deformer, motion, poses, **common)
             else:
-                summary = write_shot(layer, found.deformer, motion, found.poses, units=units, **common)
+                summary = write_shot(layer, ridden.deformer, motion, poses, units=units, **common)
             name = Path(split_location(motion.path)[0]).stem
             counts = state_counts(layer, found.deformer.scene, motion, name=name, device=device)
         if verify:
             need_valid(unverified, report)
-            verification = compare_trajectories(open_shot(unverified), points, tolerance=tolerance)
+            shot = open_shot(unverified)
+            verification = compare_trajectories(shot, points, tolerance=tolerance)
+            verify_riders(shot, shot.sample_times(), ridden, report)
         else:
             report(Message("not verified, as asked", "warning"))
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
     return BakeResult(
         path=path, frames=summary.frame_count, fps=summary.fps, joints=summary.joint_count,
-        proxies=summary.proxy_count, blendshapes=summary.shape_count, size_bytes=path.stat().st_size,
+        proxies=summary.proxy_count - len(ridden.names), blendshapes=summary.shape_count,
+        size_bytes=path.stat().st_size,
         verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
         intersections=counts.intersections,
     )  # fmt: skip

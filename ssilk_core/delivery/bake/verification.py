@@ -23,6 +23,7 @@ from .opened import open_shot, provenance_of
 from .origin import read_origin
 from .refinement import refined_points, verify_energies
 from .result import SKINNED, Verification
+from .riders import verify_riders
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     need_valid(path, report)
     shot, samples = open_shot(path), rollout.request.samples_per_frame
     times = shot.sample_times(samples)
+    verify_riders(shot, times, rollout.rider_joints(), report)
     if rollout.request.latent_iterations and rollout.latents is None:
         return _verify_extent(shot, times, path, rollout, report, "solved in latents")
     if rollout.request.refine and rollout.refinement is None:

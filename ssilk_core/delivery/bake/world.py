@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Vector = tuple[float, float, float]
 
 GUSTS = "RMS[,SIZE[,SEED]]"
-UNSEEN = "the network does not see {}: it plays without; --refine N or --quality hero solve for it"
+UNSEEN = "{} does not see {}: it plays without; --refine N or --quality hero solve for it"
 STILL = (
     "the network was trained in still air: it knows where wind and gravity pull, but not how cloth swings under more"
 )
@@ -91,23 +91,28 @@ def _found(
 
 @dataclass(frozen=True)
 class Sight:
-    """What a network knows of the world around its character.
+    """What is known of the world around a character where its garment plays.
 
     Attributes:
+        who: knows it, in words.
         pull: whether it sees gravity and wind; absolute descriptors name the axes of the world.
         strength: whether it was trained under others than the usual gravity.
         colliders: whether it sees them.
     """
 
+    who: str
     pull: bool
     strength: bool
     colliders: bool
 
     @classmethod
-    def of(cls, file: ModelFile) -> Sight:
-        """Return that of a trained network."""
+    def of(cls, file: ModelFile, *, solved: bool = False) -> Sight:
+        """Return that of a trained network, or of the solver in its latents, which meets no colliders."""
         blown = file.provenance.get("train", {}).get("wind_fraction", 0) > 0
-        return cls(file.config.descriptors == "relative", blown, file.config.proximity_points > 0)
+        who, sees = "the network", file.config.proximity_points > 0
+        if solved:
+            who, sees = "the solver in latents", False
+        return cls(who, file.config.descriptors == "relative", blown, sees)
 
 
 def unseen(
@@ -131,7 +136,7 @@ def unseen(
     found = _found(source, stage, scene, motion, asked, report)
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
     missed = [part for part in found.parts if not sees.get(part, False)]
-    told = [UNSEEN.format(" and ".join(missed))] if missed else []
+    told = [UNSEEN.format(sight.who, " and ".join(missed))] if missed else []
     if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
         told.append(STILL)
     return "; ".join(told)

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from ...errors import fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import need_not_input, need_writable, replacing, split_location
+from ...scene.kinematics import lbs_deformer, lbs_poses
+from ...scene.riders import RiderJoints
 from ..targets import GLB
 from .counted import ShotCounts, state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
@@ -19,6 +21,7 @@ from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body
 from .result import BakeResult, Verification
+from .riders import need_joints
 from .rollout import BakeRollout
 from .sizing import load_sized
 from .verification import verify_file
@@ -58,6 +61,8 @@ def bake(
     rollout = load_sized(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
+    if request.writes_points:
+        need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
     rollout = refined(solved(rollout, report), report)
@@ -87,7 +92,7 @@ def result_of(
         frames=summary.frame_count,
         fps=summary.fps,
         joints=summary.joint_count,
-        proxies=summary.proxy_count,
+        proxies=summary.proxy_count - sum(rider.attachment is not None for rider in rollout.riders),
         blendshapes=summary.shape_count,
         size_bytes=path.stat().st_size,
         verification=verification,
@@ -147,11 +152,17 @@ def _write(
         "hidden_polygons": hidden,
         "provenance": shot_metadata(rollout, output),
     }
+    riders = rollout.rider_joints()
+    poses = riders.poses(rollout.motion, rollout.poses())
     if output.suffix == GLB:
-        return write_glb_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
+        return write_glb_shot(layer, riders.deformer, rollout.motion, poses, riders=riders, **common)
     common |= {"units": rollout.units, "record": rollout.record, "info": rollout.info}
     if not rollout.request.writes_points:
-        return write_shot(layer, rollout.deformer, rollout.motion, rollout.poses(), **common)
+        return write_shot(layer, riders.deformer, rollout.motion, poses, riders=riders, **common)
+    if rollout.riders:
+        unposed = RiderJoints(lbs_deformer(rollout.deformer.scene), rollout.riders)
+        poses = unposed.poses(rollout.motion, lbs_poses(rollout.motion.frame_count), rollout.points())
+        common |= {"riders": unposed, "skinned": (unposed.deformer, poses)}
     with point_cache(layer, rollout.deformer.scene, rollout.motion, **common) as cache:
         for frame, points in enumerate(rollout.points()):
             cache.write(frame, points)

@@ -17,7 +17,7 @@ from .channel import NodeChannel
 from .container import GENERATOR
 from .file import GlbFile, listed, understood
 from .nodes import node_parents, node_transform
-from .shot import GARMENT
+from .shot import GARMENT, RIDER
 
 WRITTEN = "a .glb that 'ssilk bake' wrote is needed"
 TRIANGLES = 4  # the mode of primitives that are such
@@ -32,12 +32,14 @@ class GlbMesh:
         faces: triangles, shape (F, 3).
         is_garment: it is the garment; what is not counts as body.
         colour: none of its own, because `write_glb` gives all garments one plain material.
+        is_rider: it rides on the garment.
     """
 
     name: str
     faces: Ints
     is_garment: bool
     colour: None = None
+    is_rider: bool = False
 
 
 class GlbShot:
@@ -112,6 +114,10 @@ class GlbShot:
             fail(self.name, f"{len(found)} meshes are marked as garments", "one is needed")
         return self._posed(found, time)[0]
 
+    def rider_points(self, time: float) -> list[Floats]:
+        """Return the points of each mesh that rides on the garment [m], shape (V, 3), in the file's order."""
+        return self._posed([surface for surface in self._surfaces if surface.mesh.is_rider], time)
+
     def _posed(self, surfaces: Sequence[_SkinnedSurface], time: float) -> list[Floats]:
         with self._understood():
             seconds = (time - self._start) / self.fps
@@ -175,7 +181,8 @@ class _SkinnedSurface:
             raise IndexError("a vertex of a joint below zero")
         self.influences = np.concatenate([file.array(attributes[f"WEIGHTS_{each}"])[:count] for each in sets], axis=1)
         self.rest = rest
-        self.mesh = GlbMesh(item["name"], self._faces(file, primitive, attributes), item["extras"]["kind"] == GARMENT)
+        faces, kind = self._faces(file, primitive, attributes), item["extras"]["kind"]
+        self.mesh = GlbMesh(item["name"], faces, kind == GARMENT, is_rider=kind == RIDER)
 
     def _faces(self, file: GlbFile, primitive: Mapping[str, Any], attributes: Mapping[str, Any]) -> Ints:
         """Return the triangles, each vertex of a seam as the point that it doubles: the one in the same place."""

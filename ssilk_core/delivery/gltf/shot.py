@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...files import replacing
-from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
+from ...scene.assets import Body, Deformer, Floats, GarmentPose, Ints, Mesh, Motion, SkinWeights
 from ...scene.kinematics import (
     combined_transforms,
     continuous,
@@ -26,7 +26,7 @@ from .geometry import ShapeNormals, drawn_mesh
 
 SET = 4  # influences in one attribute
 ARMATURE = 0  # the node above the joints, which follow it in their order
-GARMENT, BODY = "garment", "body"  # kinds of meshes, as the file says them
+GARMENT, BODY, RIDER = "garment", "body", "rider"  # kinds of meshes, as the file says them
 AT_REST = 1e-7  # [m] by which a joint's place may differ and still count as the same
 # Plain colours, linear, where a garment has none: the bake knows no materials. Cloth is seen from both sides.
 MATERIALS = (
@@ -43,7 +43,7 @@ class GlbLabels:
         character: name of the node above the joints.
         joints: name of each joint, then of each proxy.
         shapes: name of each blendshape of the deformer.
-        garment, bodies: names of the meshes.
+        garment, bodies, riders: names of the meshes.
         start: time code of the first frame.
         samples_per_frame: how many of the motion's frames make one of the shot's.
     """
@@ -53,6 +53,7 @@ class GlbLabels:
     shapes: Sequence[str]
     garment: str
     bodies: Sequence[str]
+    riders: Sequence[str] = ()
     start: float = 0.0
     samples_per_frame: int = 1
 
@@ -65,6 +66,8 @@ def write_glb(
     labels: GlbLabels,
     *,
     include_body: bool = True,
+    riders: Sequence[Body] = (),
+    rider_shapes: Sequence[Floats | None] = (),
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: Sequence[NDArray[np.bool_]] | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -76,6 +79,8 @@ def write_glb(
     Args:
         motion: the character's motion at the shot's samples.
         poses: consecutive chunks of frames that together cover the motion.
+        riders: what rides on the garment, bound to joints of the deformer.
+        rider_shapes: of each, its offsets by the deformer's blendshapes [m], shape (K, M, 3); None where it is rigid.
         hidden: from which frames of the motion on the character is hidden (True) or seen (False). Hidden, its joints
             are scaled to nothing, because plain glTF has no visibility.
         hidden_polygons: of each body, those that are left out.
@@ -102,16 +107,22 @@ def write_glb(
     joints = list(range(1, 1 + len(scene.parents)))
     glb.add("skins", {"joints": joints, "skeleton": ARMATURE, "inverseBindMatrices": glb.array(binds, "MAT4")})
     offsets = {labels.shapes[index]: deformer.shapes[index] for index in shapes}
-    drawn = [_add_mesh(glb, labels.garment, scene.garment.mesh, deformer.skin, offsets=offsets, at=weights[0])]
+    worn = scene.garment.mesh
+    drawn = [_add_mesh(glb, labels.garment, worn, deformer.skin, offsets=offsets, at=weights[0], kind=GARMENT)]
     if include_body:
         bodies = scene.character.bodies
         masks: Sequence[NDArray[np.bool_] | None] = hidden_polygons or [None] * len(bodies)
         for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
             if mask is None or not mask.all():
                 drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
+    morphed = [drawn[0]]
+    for name, rider, own in zip(labels.riders, riders, rider_shapes, strict=True):
+        moved = None if own is None else {labels.shapes[index]: own[index] for index in shapes}
+        drawn.append(_add_mesh(glb, name, rider.mesh, rider.skin, offsets=moved, at=weights[0], kind=RIDER))
+        morphed += [drawn[-1]] if moved else []
     glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
     glb.document["scene"] = 0
-    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, drawn[0])
+    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, morphed)
     timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
               "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
     glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
@@ -152,11 +163,12 @@ def _add_mesh(
     offsets: Mapping[str, Floats] | None = None,
     at: Floats | None = None,
     hidden: NDArray[np.bool_] | None = None,
+    kind: str = BODY,
 ) -> int:
     """Add a skinned mesh and its node; return the node's index.
 
     Args:
-        offsets: of each morph target [m], by name; only a garment has them, or none.
+        offsets: of each morph target [m], by name; only a garment and soft riders have them, or none.
         at: weights of the targets where no animation plays.
     """
     drawn, normals = drawn_mesh(mesh, hidden), ShapeNormals(mesh.points, mesh.faces)
@@ -170,9 +182,8 @@ def _add_mesh(
         attributes["TEXCOORD_0"] = glb.array(drawn.uvs, "VEC2", use=VERTICES)
     wide = len(points) > 2**16 - 1  # the largest number of each type means something else to graphics cards
     faces = drawn.faces.reshape(-1).astype("<u4" if wide else "<u2")
-    is_garment = offsets is not None
     primitive = {"attributes": attributes, "indices": glb.array(faces, "SCALAR", use=INDICES),
-                 "material": 0 if is_garment else 1}  # fmt: skip
+                 "material": 0 if kind == GARMENT else 1}  # fmt: skip
     item: dict[str, object] = {"name": name, "primitives": [primitive]}
     if offsets and at is not None:
         primitive["targets"] = [
@@ -181,7 +192,6 @@ def _add_mesh(
             for offset in offsets.values()
         ]  # fmt: skip
         item["weights"] = at.tolist()
-    kind = GARMENT if is_garment else BODY
     item["extras"] = {"targetNames": list(offsets or ()), "kind": kind, "points": mesh.vertex_count}
     return glb.add("nodes", {"name": name, "mesh": glb.add("meshes", item), "skin": 0})
 
@@ -207,7 +217,7 @@ def _animate(
     fps: float,
     samples: tuple[Floats, Floats, Floats],
     hidden: Sequence[tuple[int, bool]],
-    garment: int,
+    morphed: Sequence[int],
 ) -> None:
     """Add one animation of what moves, and of the first joint's path, so that it always lasts as long."""
     rotations, translations, weights = samples
@@ -225,7 +235,8 @@ def _animate(
         if joint == 0 or _moves(translations[:, joint]):
             add(1 + joint, "translation", translations[:, joint], "VEC3")
     if weights.shape[1]:
-        add(garment, "weights", weights.reshape(-1), "SCALAR")
+        for node in morphed:
+            add(node, "weights", weights.reshape(-1), "SCALAR")
     if hidden:
         when = glb.array(np.array([frame / fps for frame, _ in hidden], dtype=np.float32), "SCALAR", bounds=True)
         scales = np.array([[0.0 if gone else 1.0] * 3 for _, gone in hidden], dtype=np.float32)

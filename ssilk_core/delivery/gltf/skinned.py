@@ -91,6 +91,20 @@ class SkinnedGlb:
                 posed += share[:, None] * (np.einsum("vab,vb->va", each[:, :3, :3], points) + each[:, :3, 3])
             return posed
 
+    def place(self, node: str, time: float) -> Floats:
+        """Return where a node with a mesh, and no skin, is in the world of the file at a time [s], shape (4, 4).
+
+        Raises:
+            SsilkError: there is no such node, or several.
+        """
+        with self._understood():
+            items = list(enumerate(self._nodes))
+            found = [at for at, item in items if item.get("name") == node and "mesh" in item and "skin" not in item]
+            if len(found) != 1:
+                fail(self.name, f"{len(found)} nodes '{node}' with a mesh and without a skin", "one is needed")
+            moved = {(channel.node, channel.path): channel.at(time) for channel in self._channels}
+            return node_transform(found[0], self._nodes, self._parents, moved, {})
+
     def _understood(self) -> AbstractContextManager[None]:
         """Raise `SsilkError` for a document that is not what the specification says."""
         return understood(self.name, "a damaged glb", "a skinned mesh is needed", "export again")

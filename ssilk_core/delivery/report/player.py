@@ -45,7 +45,7 @@ def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Re
     meshes, parts, words, floor = [], [], [], []
     for index, (word, mesh, colour) in enumerate(_described(players, labels)):
         points = np.stack([each[index] for each in shown])
-        if not mesh.is_garment:
+        if not (mesh.is_garment or mesh.is_rider):
             floor.append((points[..., 1].min(axis=1) + path[:, 1]).min())
         quantum, values = quantised(points)
         data = np.asarray(mesh.faces).astype("<u4").tobytes() + packed(values)

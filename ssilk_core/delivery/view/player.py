@@ -10,7 +10,7 @@ from ...scene.assets import Floats, Ints
 
 
 class PlayerMesh(Protocol):
-    """A mesh of a shot: its triangles (F, 3), whether it is cloth or skin, and its colour in sRGB or None."""
+    """A mesh of a shot: its triangles (F, 3), whether it is or rides on cloth, and its colour in sRGB or None."""
 
     @property
     def name(self) -> str: ...
@@ -20,6 +20,9 @@ class PlayerMesh(Protocol):
 
     @property
     def is_garment(self) -> bool: ...
+
+    @property
+    def is_rider(self) -> bool: ...
 
     @property
     def colour(self) -> tuple[float, float, float] | None: ...

@@ -13,7 +13,7 @@ from ...errors import fail
 from ...events import Countdown, Reporter, silent
 from ...scene.assets import Floats
 from .camera import Camera, follow_cameras
-from .colours import BODY, fabric_colour
+from .colours import BODY, METAL, fabric_colour
 from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import add_captions, compare, contact_sheet
@@ -188,10 +188,12 @@ def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:
 
 
 def mesh_colours(player: ShotPlayer) -> list[Floats]:
-    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, each garment in its own or a fabric's."""
+    """Return a colour in sRGB, shape (3,), for each mesh: skin in grey, all else its own or a plain one."""
     garments = np.cumsum([mesh.is_garment for mesh in player.meshes]) - 1
 
     def colour(mesh: PlayerMesh, number: int) -> Floats:
+        if mesh.is_rider:
+            return METAL if mesh.colour is None else np.array(mesh.colour)
         if not mesh.is_garment:
             return BODY
         return fabric_colour(number) if mesh.colour is None else np.array(mesh.colour)

@@ -93,8 +93,8 @@ def find_feet(mesh: Mesh) -> Stitches:
     offset = mesh.points[vertices] - corners[faces, 0]
     normal = normals[faces] / doubled[faces, None]
     height = np.einsum("mc,mc->m", offset, normal)
-    weights = _on_plane(offset, sides[faces], normals[faces])
-    foot = np.einsum("mk,mkc->mc", _closest(weights, offset, sides[faces]), corners[faces])
+    weights = shares_on_plane(offset, sides[faces], normals[faces])
+    foot = np.einsum("mk,mkc->mc", closest_shares(weights, offset, sides[faces]), corners[faces])
     distance = np.linalg.norm(mesh.points[vertices] - foot, axis=1)
     beneath = (np.abs(height) >= LEAST_COSINE * distance) | (distance < SAME_PLACE)
     kept = beneath & (distance <= ABOVE) & (np.abs(weights).max(axis=1, initial=0) <= FARTHEST_FOOT)
@@ -219,7 +219,7 @@ def _in_balls(mesh: Mesh, vertices: Ints, faces: Ints) -> tuple[Ints, Ints]:
     return inner, around
 
 
-def _on_plane(offset: Floats, sides: Floats, normal: Floats) -> Floats:
+def shares_on_plane(offset: Floats, sides: Floats, normal: Floats) -> Floats:
     """Return barycentric coordinates (M, 3) of offsets from the first corner (M, 3) on the plane of two sides."""
     square = np.einsum("mc,mc->m", normal, normal)
     second = np.einsum("mc,mc->m", np.cross(offset, sides[:, 1]), normal) / square
@@ -227,7 +227,7 @@ def _on_plane(offset: Floats, sides: Floats, normal: Floats) -> Floats:
     return np.column_stack([1 - second - third, second, third])
 
 
-def _closest(weights: Floats, offset: Floats, sides: Floats) -> Floats:
+def closest_shares(weights: Floats, offset: Floats, sides: Floats) -> Floats:
     """Return barycentric coordinates of the closest points of triangles (M, 3), from those on their planes."""
     if not len(weights):
         return weights

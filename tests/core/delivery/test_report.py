@@ -94,8 +94,8 @@ def test_frames_that_are_not_finite_are_counted_and_named_by_their_time_code(toy
     class Lost:
         fps, frame_times = 30.0, [1001.0, 1002.0, 1003.0, 1004.0, 1005.0, 1006.0]
         meshes = (
-            SimpleNamespace(name="Cover", faces=faces, is_garment=True, colour=None),
-            SimpleNamespace(name="Ball", faces=body.faces, is_garment=False, colour=None),
+            SimpleNamespace(name="Cover", faces=faces, is_garment=True, colour=None, is_rider=False),
+            SimpleNamespace(name="Ball", faces=body.faces, is_garment=False, colour=None, is_rider=False),
         )
 
         def points(self, time: float) -> list[np.ndarray]:

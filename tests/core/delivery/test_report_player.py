@@ -27,6 +27,7 @@ class Cloth:
     is_garment: bool
     faces = FACES
     colour = None
+    is_rider = False
 
 
 class Waving:

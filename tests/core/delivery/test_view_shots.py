@@ -28,6 +28,7 @@ class ToyMesh:
     faces: np.ndarray
     is_garment: bool
     colour: tuple[float, float, float] | None = None
+    is_rider: bool = False
 
 
 @dataclass(frozen=True)

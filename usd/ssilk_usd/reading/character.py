@@ -26,7 +26,7 @@ from ..opening.stage import (
 )
 from .bindings import need_skinned
 from .carried import carried_by
-from .mesh import is_drawn, is_garment, read_mesh, rendered
+from .mesh import is_body, is_drawn, read_mesh, rendered
 from .shapes import shape_offsets
 from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin, tell_method
@@ -93,7 +93,7 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
     garments = named(every, garment) if garment else []
     meshes = [prim for prim in every if is_skinned(prim, skel)]
     if not bodies:
-        drawn = [prim for prim in every if is_drawn(prim) and not is_garment(prim) and prim not in garments]
+        drawn = [prim for prim in every if is_drawn(prim) and is_body(prim) and prim not in garments]
         return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
     meshes = [prim for prim in every if prim in meshes or carried_by(prim, skel)]
     unknown = next((name for name in bodies if not named(meshes, name)), None)

@@ -9,7 +9,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, Ints, Mesh
 
-from ..names import CLASS, GARMENT, GEOM_BIND, PROXIES, SKEL
+from ..names import CLASS, GARMENT, GEOM_BIND, PROXIES, RIDES_ON, SKEL
 from ..opening.stage import (
     EARLIEST,
     apply,
@@ -29,6 +29,17 @@ from .uv_sets import texture_coordinates
 def is_garment(prim: Usd.Prim) -> bool:
     """Return whether a mesh has vertex classes, a proxy rig, or `ssilk:garment = true`."""
     return has_value(prim, CLASS) or has_value(prim, PROXIES) or value(prim, GARMENT) is True
+
+
+def is_rider(prim: Usd.Prim) -> bool:
+    """Return whether a prim, or one above it, says which garment it rides on."""
+    found = inherited(prim, RIDES_ON)
+    return isinstance(found, Usd.Relationship) and bool(found.GetTargets())
+
+
+def is_body(prim: Usd.Prim) -> bool:
+    """Return whether a mesh is neither a garment nor rides on one."""
+    return not is_garment(prim) and not is_rider(prim)
 
 
 def is_drawn(prim: Usd.Prim) -> bool:

@@ -21,7 +21,7 @@ from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
 from .character import geom_to_core, is_skinned
 from .clips import spread
-from .mesh import is_drawn, is_garment
+from .mesh import is_drawn, is_garment, is_rider
 from .motion import find_animation
 from .shapes import animated_shapes, shape_offsets, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
@@ -101,9 +101,9 @@ def shown_otherwise(
 
 
 def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
-    """Yield the meshes that are bound to a skeleton."""
+    """Yield the meshes that are bound to a skeleton; what rides on a garment is placed by its cloth."""
     for prim in Usd.PrimRange(skel.root, PRIMS):
-        if prim.IsA(UsdGeom.Mesh) and bound_skeleton(prim) == skel.prim:
+        if prim.IsA(UsdGeom.Mesh) and bound_skeleton(prim) == skel.prim and not is_rider(prim):
             yield prim
 
 

@@ -25,7 +25,7 @@ from ..opening.stage import (
 )
 from ..units import StageUnits
 from .carried import carried_by
-from .mesh import is_drawn, is_garment, placement, rendered
+from .mesh import is_body, is_drawn, placement, rendered
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
 
@@ -76,7 +76,7 @@ def of_bodies(
     """Return the pairs whose Skeleton moves a mesh that is no garment; all pairs where none does."""
     meshes = [prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
     garments = named(meshes, garment) if garment else []
-    bodies = [mesh for mesh in meshes if not is_garment(mesh) and mesh not in garments]
+    bodies = [mesh for mesh in meshes if is_body(mesh) and mesh not in garments]
     moved = {bound_skeleton(mesh) for mesh in bodies if inherited(mesh, SKEL[0]) is not None}
     return [pair for pair in pairs if pair[1] in moved] or pairs
 
@@ -120,7 +120,7 @@ def character_skeleton(source: SkelSource) -> Skeleton:
 def _moved(source: SkelSource) -> list[Floats]:
     """Return how much of each body each joint of a skeleton moves, shapes (N,); of garments where no body is."""
     meshes = [prim for prim in Usd.PrimRange(source.root, PRIMS) if prim.IsA(UsdGeom.Mesh) and is_drawn(prim)]
-    bodies = rendered([prim for prim in meshes if not is_garment(prim)])
+    bodies = rendered([prim for prim in meshes if is_body(prim)])
     skinned = [_skinned(prim, source) for prim in bodies]
     if not any(each is not None for each in skinned):
         skinned = [_carried(prim, source) for prim in bodies]

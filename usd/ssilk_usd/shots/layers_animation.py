@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -18,7 +19,7 @@ from ..names import shape_name
 from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
 from ..units import StageUnits
-from ..writing.author import Asset, define_blendshapes, extent_array
+from ..writing.author import Asset, define_blendshapes, define_rider_shapes, extent_array
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import save
 from .layers import DEFORMATION, QUALITY, Layout, define_path, variant
@@ -26,6 +27,9 @@ from .play import Shot
 from .samples import Samples, root_path
 from .shot import ShotSummary, TimeSpan, set_metadata, set_visibility, summary, write_samples
 from .velocities import cut_frames, with_velocities
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 FRAMES_PER_SAVE = 64  # of points and velocities: 5 MB in memory for a garment of 3,000 vertices
 
@@ -41,6 +45,7 @@ def write_animation(
     start: float = 0.0,
     samples_per_frame: int = 1,
     lean: bool = True,
+    riders: RiderJoints | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     points: bool = False,
@@ -54,6 +59,7 @@ def write_animation(
     Args:
         motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
         lean: see `samples.Samples`.
+        riders: what rides on the garment, as its asset has it.
         hidden_polygons: polygons of the bodies that this shot hides, in a variant.
         points: offer the point cache that `write_points` writes as a variant.
         path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
@@ -66,6 +72,7 @@ def write_animation(
         layer = Sdf.Layer.CreateNew(str(temporary))
         stage = Usd.Stage.Open(layer, None)
         _define_animation(stage, asset, layout, deformer)
+        asset = replace(asset, rider_shapes=riders.shapes if riders else asset.rider_shapes)
         asset = _define_own_shapes(stage, asset, deformer, units)
         set_metadata(stage, span, units)
         if lean:
@@ -109,6 +116,9 @@ def _define_own_shapes(stage: Usd.Stage, asset: Asset, deformer: Deformer, units
     with variant(stage.GetPrimAtPath(asset.root), QUALITY, "full"):
         mesh = UsdGeom.Mesh(stage.OverridePrim(asset.garment))
         define_blendshapes(mesh, names, deformer.shapes[own], units, before=before)
+        for path, offsets in zip(asset.rider_paths, asset.rider_shapes):
+            rider = UsdGeom.Mesh(stage.OverridePrim(path))
+            define_rider_shapes(rider, offsets, own, units, before=asset.shapes)
     animation = UsdSkel.Animation(stage.GetPrimAtPath(asset.animation))
     animation.CreateBlendShapesAttr(Vt.TokenArray([*before, *names]))
     animation.CreateBlendShapeWeightsAttr()

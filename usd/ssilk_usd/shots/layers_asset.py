@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -21,6 +22,9 @@ from ..writing.author import Asset, define_asset, extent_array
 from ..writing.export import new_stage, save
 from .layers import DEFORMATION, QUALITY, Layout, define_path, variant
 from .layers_facts import AssetFacts, asset_facts
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,7 @@ def write_asset(
     units: StageUnits,
     *,
     include_body: bool = True,
+    riders: RiderJoints | None = None,
     record: GarmentRecord | None = None,
     info: AssetInfo | None = None,
     lean: bool = True,
@@ -52,6 +57,7 @@ def write_asset(
 
     Args:
         include_body: with the body meshes.
+        riders: what rides on the garment; the deformer has its joints.
         record: how the garment was made, kept on its mesh.
         info: of the asset, in a layer of its own, so that another version makes no shot stale; its identifier is the
             asset's own layer where none is given.
@@ -67,7 +73,7 @@ def write_asset(
     with replacing(layout.geometry, keep_same=True) as temporary:
         stage = new_stage(temporary, units)
         asset = define_asset(
-            stage, deformer, bodies, units, name=layout.garment, record=record, output=layout.geometry
+            stage, deformer, bodies, units, riders=riders, name=layout.garment, record=record, output=layout.geometry
         )
         save(stage.GetRootLayer(), layout.geometry)
         box = _extent(stage, asset)
@@ -125,8 +131,10 @@ def _define_component(stage: Usd.Stage, asset: Asset, layout: Layout, box: Vt.Ve
     with variant(root, DEFORMATION, "rest"):
         UsdSkel.BindingAPI(root).CreateAnimationSourceRel().SetTargets([])
     with variant(root, QUALITY, "skin"):
-        binding = UsdSkel.BindingAPI(stage.OverridePrim(asset.garment))
-        binding.CreateBlendShapesAttr().Block()
-        binding.CreateBlendShapeTargetsRel().SetTargets([])
+        soft = [path for path, shapes in zip(asset.rider_paths, asset.rider_shapes) if shapes is not None]
+        for path in (asset.garment, *soft):
+            binding = UsdSkel.BindingAPI(stage.OverridePrim(path))
+            binding.CreateBlendShapesAttr().Block()
+            binding.CreateBlendShapeTargetsRel().SetTargets([])
     variant(root, DEFORMATION, "skel")
     variant(root, QUALITY, "full")

@@ -14,7 +14,7 @@ from ssilk_core.files import replacing
 
 from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
-from ..reading.mesh import is_garment
+from ..reading.mesh import is_body
 from ..units import StageUnits
 from ..writing.export import new_stage, save
 from .layers import LEVEL, Layout, variant
@@ -170,4 +170,4 @@ def _span(layer: Sdf.Layer, rate: float) -> tuple[float, float]:
 def _body_names(stage: Usd.Stage) -> list[str]:
     """Return the names of the body meshes that come with a garment."""
     prims = stage.GetDefaultPrim().GetChildren()
-    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and not is_garment(prim)]
+    return [prim.GetName() for prim in prims if prim.IsA(UsdGeom.Mesh) and is_body(prim)]

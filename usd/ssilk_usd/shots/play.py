@@ -13,7 +13,7 @@ from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, open_stage, stage_name
 from ..opening.times import change_times
-from ..reading.mesh import display_colour, is_drawn, is_garment, read_mesh, rendered
+from ..reading.mesh import display_colour, is_drawn, is_garment, is_rider, read_mesh, rendered
 from ..reading.posed import PlainMesh, SkinnedMesh, posed_mesh, skinning_of
 from ..units import StageUnits
 
@@ -28,6 +28,7 @@ class ShotMesh:
         faces: triangles, shape (F, 3).
         is_garment: it is marked as a garment (see `read_mesh.is_garment`); what is not counts as body.
         colour: the mean of its displayColor in sRGB, each from 0 to 1; None where it has none.
+        is_rider: it rides on a garment, and is no body either.
     """
 
     name: str
@@ -35,6 +36,7 @@ class ShotMesh:
     faces: Ints
     is_garment: bool
     colour: tuple[float, float, float] | None = None
+    is_rider: bool = False
 
 
 class Shot:
@@ -102,6 +104,10 @@ class Shot:
         code = Usd.TimeCode(float(time))
         return apply(self.units.matrix, self._garment().points(code, UsdGeom.XformCache(code)))
 
+    def rider_points(self, time: float) -> list[Floats]:
+        """Return the points of each mesh that rides on a garment [m], shape (V, 3), in the stage's order."""
+        return [self.mesh_points(index, time) for index, mesh in enumerate(self.meshes) if mesh.is_rider]
+
     def _garment(self) -> SkinnedMesh | PlainMesh:
         garments = [player for player, mesh in zip(self._players, self.meshes) if mesh.is_garment]
         if len(garments) != 1:
@@ -111,7 +117,7 @@ class Shot:
 
 def _describe(prim: Usd.Prim) -> ShotMesh:
     faces = read_mesh(prim, np.eye(4)).faces
-    return ShotMesh(prim.GetName(), str(prim.GetPath()), faces, is_garment(prim), _colour(prim))
+    return ShotMesh(prim.GetName(), str(prim.GetPath()), faces, is_garment(prim), _colour(prim), is_rider(prim))
 
 
 def _colour(prim: Usd.Prim) -> tuple[float, float, float] | None:

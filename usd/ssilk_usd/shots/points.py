@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
 from ssilk_core.files import replacing
-from ssilk_core.scene.assets import Floats, Motion, Scene
+from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion, Scene
 from ssilk_core.scene.kinematics import lbs_deformer, lbs_poses
 
 from ..opening.garment_api import GarmentRecord
@@ -25,6 +26,9 @@ from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
 from .shot import ShotSummary, write_shot
 from .velocities import cut_frames, with_velocities
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 FRAMES_PER_SAVE = 128  # 5 MB of points in memory for a garment of 3,000 vertices
 
@@ -106,6 +110,8 @@ def point_cache(
     start: float | None = None,
     samples_per_frame: int = 1,
     include_body: bool = True,
+    riders: RiderJoints | None = None,
+    skinned: tuple[Deformer, Iterable[GarmentPose]] | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -122,23 +128,26 @@ def point_cache(
         path: the file to write: .usdc, .usd, or .usda for people.
         motion: the character's motion at the samples of the shot, whose rate becomes the shot's.
         start: time code of the first frame, by default the motion's own.
-        units, samples_per_frame, include_body, hidden, hidden_polygons, provenance, record, info: as `write_shot`
-            takes them.
+        skinned: the garment and its poses with the joints of `riders`, which stay; linear blend skinning by default.
+        units, samples_per_frame, include_body, riders, hidden, hidden_polygons, provenance, record, info: as
+            `write_shot` takes them.
 
     Raises:
         SsilkError: frames are missing at the end, or the file cannot be written.
     """
     need_layer_suffix(path)
+    deformer, poses = skinned or (lbs_deformer(scene), lbs_poses(motion.frame_count))
     with replacing(path) as temporary:
         shot = write_shot(
             temporary,
-            lbs_deformer(scene),
+            deformer,
             motion,
-            lbs_poses(motion.frame_count),
+            poses,
             units=units,
             start=motion.start if start is None else start,
             samples_per_frame=samples_per_frame,
             include_body=include_body,
+            riders=riders,
             hidden=hidden,
             hidden_polygons=hidden_polygons,
             provenance=provenance,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +13,9 @@ from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Floats, GarmentPose, Mesh, ProxyRig, Skeleton
 from ssilk_core.scene.kinematics import local_transforms
 
+from ..names import RIDER_JOINTS
 from ..opening.garment_api import GarmentRecord, read_garment_record
-from ..opening.stage import StageLike, apply, location, needs_whole_files, open_stage
+from ..opening.stage import StageLike, apply, location, needs_whole_files, open_stage, value
 from ..reading.garment import find_garment, fitted_skeleton, garment_place, read_garment
 from ..reading.mesh import read_mesh
 from ..reading.motion import find_animation, read_samples
@@ -61,6 +63,7 @@ def read_baked(source: StageLike) -> BakedGarment:
         fail(location(prim), "its stage has no skeleton", "a baked garment needs joints", "choose a shot with joints")
     skeleton = character_skeleton(skel)
     garment, rig = read_garment(stage, skeleton, shaped=False), read_proxy_rig(stage, skeleton)
+    rig = rig and _without_riders(rig, value(prim, RIDER_JOINTS) or ())
     joints, binds, skin = skeleton.joint_names, skeleton.bind_transforms, garment.skin
     if rig is not None:
         joints, binds, skin = (*joints, *rig.joint_names), np.concatenate([binds, rig.bind_transforms]), rig.skin
@@ -73,6 +76,13 @@ def read_baked(source: StageLike) -> BakedGarment:
     pose = _read_pose(find_animation(stage, None, None)[0], proxies, names, times, skel.joint_scale)
     pose = replace(pose, translations=None) if rig is None else _without_rest(pose, skeleton, rig)
     return BakedGarment(SkinnedGarment(joints, binds, garment.mesh.points, skin, names, shapes), pose, times[0])
+
+
+def _without_riders(rig: ProxyRig, riders: Sequence[str]) -> ProxyRig:
+    """Return a rig without the joints that carry riders, which move nothing of the garment and stand last."""
+    kept = [index for index, name in enumerate(rig.joint_names) if name not in riders]
+    names = tuple(rig.joint_names[index] for index in kept)
+    return replace(rig, joint_names=names, parents=rig.parents[kept], bind_transforms=rig.bind_transforms[kept])
 
 
 def _read_blendshapes(prim: Usd.Prim, to_core: Floats, point_count: int) -> tuple[tuple[str, ...], Floats]:

@@ -58,7 +58,9 @@ class Samples:
     ) -> None:
         self.layer, self.asset, self.deformer, self.motion = layer, asset, deformer, motion
         self.units, self.start, self.step, self.lean, self.unsaved_count = units, start, step, lean, 0
-        self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in asset.bodies)]
+        self.others = (*asset.bodies, *asset.riders)
+        self.soft = [(len(asset.bodies) + at, each) for at, each in enumerate(asset.rider_shapes) if each is not None]
+        self.surfaces = [_Surface(deformer.skin), *(_Surface(body.skin) for body in self.others)]
         _need_same_skeleton(deformer, motion)
         self.path = root_path(deformer, motion)
         self.moves = bool((np.ptp(_stored_translations(deformer, motion, lean), axis=0) > AT_REST).any())
@@ -102,10 +104,12 @@ class Samples:
         """Yield the bounds of everything skinned at each frame."""
         scene = self.deformer.scene
         matrices = skinning_matrices(world, scene.bind_transforms)
-        bodies = [body.mesh.points for body in self.asset.bodies]
+        bodies = [body.mesh.points for body in self.others]
         for weights, joints in zip(pose.weights, matrices):
             garment = scene.garment.mesh.points + np.tensordot(weights, self.deformer.shapes, 1)
             rest = [garment, *bodies]
+            for at, shapes in self.soft:
+                rest[1 + at] = bodies[at] + np.tensordot(weights, shapes, 1)
             posed = np.concatenate([surface.skin(points, joints) for surface, points in zip(self.surfaces, rest)])
             posed = self.units.points_from_core(posed)
             yield extent_array(posed.min(axis=0), posed.max(axis=0))

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
@@ -21,6 +22,9 @@ from ..writing.author import define_asset
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
 from .samples import Samples
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 # A save lets go of the samples (less than 1 kB a frame remains, for the tables of their times), but leaves each
 # attribute's older table behind in the file. At this many frames both stay small: about 10 MB in memory, and a
@@ -53,6 +57,7 @@ def write_shot(
     start: float = 0.0,
     samples_per_frame: int = 1,
     include_body: bool = True,
+    riders: RiderJoints | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     provenance: Mapping[str, object] | None = None,
@@ -69,6 +74,7 @@ def write_shot(
         start: time code of the first frame; each next frame is one time code later.
         samples_per_frame: how many of the motion's frames make one of the shot's, for motion blur.
         include_body: write the character's body meshes as well.
+        riders: what rides on the garment; deformer and poses have its joints.
         hidden: from which frames of the motion on the garment is hidden (True) or seen (False).
         hidden_polygons: polygons of the bodies to hide.
         provenance: where the shot came from, kept as the layer's `customLayerData["ssilk"]`; looked at once the
@@ -88,8 +94,9 @@ def write_shot(
         set_metadata(stage, span, units)  # first, for what is copied has the times of the rate
         hiding = hidden_polygons if include_body else None
         asset = define_asset(
-            stage, deformer, bodies, units, record=record, info=info, hidden_polygons=hiding, output=path
-        )
+            stage, deformer, bodies, units, riders=riders, record=record, info=info, hidden_polygons=hiding,
+            output=path,
+        )  # fmt: skip
         set_visibility(stage, asset.root, span, hidden)
         del stage  # nobody has to hear of each sample
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step)

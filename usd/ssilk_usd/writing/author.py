@@ -8,6 +8,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
@@ -17,7 +18,7 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
-from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, shape_name
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, RIDER_JOINTS, RIDES_ON, shape_name
 from ..opening.garment_api import GarmentRecord, apply_garment_api
 from ..reading.mesh import display_colour
 from ..reading.skin import leaf
@@ -26,6 +27,9 @@ from .asset_info import AssetInfo, author_asset_info
 from .body_faces import HiddenPolygons, author_faces, hide_polygons
 from .left_behind import left_behind
 from .look import copy_looks
+
+if TYPE_CHECKING:
+    from ssilk_core.scene.riders import RiderJoints
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,8 @@ class Asset:
         garment: the garment's mesh.
         animation: the SkelAnimation; what moves (rotations, translations, blendShapeWeights) has no value yet.
         bodies, body_paths: the bodies whose meshes were written, and the prims of these.
+        riders, rider_paths: likewise what rides on the garment.
+        rider_shapes: of each rider, offsets by the deformer's blendshapes [m], shape (K, M, 3), or None.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
         left_out: what the meshes lose of their looks, and the character of its parts, for messages; empty where
             nothing.
@@ -49,6 +55,9 @@ class Asset:
     body_paths: tuple[Sdf.Path, ...]
     shapes: Ints
     left_out: str = ""
+    riders: tuple[Body, ...] = ()
+    rider_paths: tuple[Sdf.Path, ...] = ()
+    rider_shapes: tuple[Floats | None, ...] = ()
 
 
 def define_asset(
@@ -57,6 +66,7 @@ def define_asset(
     bodies: tuple[Body, ...],
     units: StageUnits,
     *,
+    riders: RiderJoints | None = None,
     name: str | None = None,
     record: GarmentRecord | None = None,
     info: AssetInfo | None = None,
@@ -66,6 +76,7 @@ def define_asset(
     """Define SkelRoot, Skeleton, SkelAnimation, the garment's mesh with its blendshapes, and body meshes.
 
     Args:
+        riders: what rides on the garment; the deformer has its joints.
         name: of the SkelRoot (default: the character's).
         record: how the garment was made, kept on its mesh.
         info: of the SkelRoot as an asset, under its own name; None for none.
@@ -75,8 +86,8 @@ def define_asset(
     Raises:
         SsilkError: the joint paths spell another hierarchy than the parents.
     """
-    scene = deformer.scene
-    meshes = [scene.garment.mesh.path, *(body.mesh.path for body in bodies)]
+    scene, ridden = deformer.scene, riders.bodies if riders else ()
+    meshes = [scene.garment.mesh.path, *(body.mesh.path for body in (*bodies, *ridden))]
     names = prim_names(["Skeleton", "Animation", *meshes])
     root = UsdSkel.Root.Define(stage, "/" + (name or prim_names([scene.character.path])[0]))
     paths = [root.GetPath().AppendChild(name) for name in names]
@@ -92,19 +103,29 @@ def define_asset(
     apply_garment_api(garment.GetPrim(), record)
     bind_skin(garment, deformer.skin, skeleton)
     define_blendshapes(garment, shape_names, deformer.shapes[shapes], units)
-    for path, body in zip(paths[3:], bodies):
+    body_paths, rider_paths = paths[3 : 3 + len(bodies)], paths[3 + len(bodies) :]
+    for path, body in zip(paths[3:], (*bodies, *ridden)):
         mesh = define_mesh(stage, path, body.mesh, units)
         bind_skin(mesh, body.skin, skeleton)
         if body.purpose != UsdGeom.Tokens.default_:
             mesh.CreatePurposeAttr(body.purpose)
-    written = [scene.garment.mesh, *(body.mesh for body in bodies)]
+    for path, offsets in zip(rider_paths, riders.shapes if riders else ()):
+        prim = stage.GetPrimAtPath(path)
+        prim.CreateRelationship(RIDES_ON, False).SetTargets([paths[2]])
+        define_rider_shapes(UsdGeom.Mesh(prim), offsets, shapes, units)
+    if riders and riders.names:
+        _author_names(garment.GetPrim(), RIDER_JOINTS, riders.names)
+    written = [scene.garment.mesh, *(body.mesh for body in (*bodies, *ridden))]
     source = split_location(scene.character.path)[0]
     left = copy_looks(stage, root.GetPath(), source, list(zip(written, paths[2:])), output)
     if bodies:  # without any, the garment alone is asked for
         left.add(root.GetPrim().GetName(), *left_behind(scene.character, written))
     if hidden_polygons is not None:
-        hide_polygons(stage, root.GetPath(), paths[3:], [body.mesh for body in bodies], hidden_polygons)
-    return Asset(root.GetPath(), paths[2], paths[1], bodies, tuple(paths[3:]), shapes, str(left))
+        hide_polygons(stage, root.GetPath(), body_paths, [body.mesh for body in bodies], hidden_polygons)
+    return Asset(
+        root.GetPath(), paths[2], paths[1], bodies, tuple(body_paths), shapes, str(left), ridden,
+        tuple(rider_paths), riders.shapes if riders else (),
+    )  # fmt: skip
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
@@ -292,3 +313,19 @@ def define_blendshapes(
     names = [*before, *names]
     binding.CreateBlendShapesAttr(Vt.TokenArray(names))
     binding.CreateBlendShapeTargetsRel().SetTargets([path.AppendChild(name) for name in names])
+
+
+def define_rider_shapes(
+    mesh: UsdGeom.Mesh, offsets: Floats | None, shapes: Ints, units: StageUnits, *, before: Sequence[int] | Ints = ()
+) -> None:
+    """Define those blendshapes of a rider that move it, of some of its garment's.
+
+    Args:
+        offsets: by all of the garment's blendshapes [m], shape (K, M, 3); None where it is rigid.
+        before: those of the garment that were defined already.
+    """
+    if offsets is None:
+        return
+    own, there = ([index for index in each if offsets[index].any()] for each in (shapes, before))
+    names = [shape_name(index) for index in own]
+    define_blendshapes(mesh, names, offsets[own], units, before=[shape_name(index) for index in there])

@@ -12,7 +12,7 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Character, Mesh
 
 from ..opening.stage import PRIMS, open_stage
-from ..reading.mesh import is_drawn, is_garment, is_stand_in
+from ..reading.mesh import is_body, is_drawn, is_stand_in
 
 NAMED = 3  # of them are named at most
 
@@ -37,7 +37,7 @@ def left_behind(character: Character, written: Sequence[Mesh]) -> list[str]:
         if str(prim.GetPath()) in known or not (prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.PointInstancer)):
             continue
         prims.PruneChildren()  # prototypes of instances
-        worn = prim.IsA(UsdGeom.Mesh) and is_garment(prim)
+        worn = prim.IsA(UsdGeom.Mesh) and not is_body(prim)
         if is_drawn(prim) and not is_stand_in(prim) and not worn:
             names.append(f"the {prim.GetTypeName()} {prim.GetName()}")
     more = [f"{len(names) - NAMED} more"] if len(names) > NAMED else []
