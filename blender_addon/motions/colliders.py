@@ -2,7 +2,8 @@
 """The meshes that cloth meets besides its character, over the frames of a timeline.
 
 They are those with Blender's own *Collision* physics, and those of the collection that the garment's settings name,
-as they are evaluated in each frame. The garment, other garments and the bodies of its character are none.
+as they are evaluated in each frame. The garment, other garments, what hangs on these and the bodies of its character
+are none.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def colliders_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[
     found = [thing for thing in _layer().objects if _may_collide(thing) and not is_own_body(thing, garment, armature)]
     named = chosen.all_objects if chosen else ()
     found += [thing for thing in named if not is_own_body(thing, garment, armature, bound=False)]
-    meshes = {thing for thing in found if thing.type == "MESH" and thing != garment and not is_garment(thing)}
+    meshes = {thing for thing in found if thing.type == "MESH" and not _is_on_cloth(thing, garment)}
     return sorted((thing for thing in meshes if _may_be_enabled(thing)), key=lambda thing: thing.name)
 
 
@@ -76,6 +77,14 @@ def _may_collide(thing: bpy.types.Object) -> bool:
     moved = changing_paths(thing.animation_data)
     shown = modifier.show_viewport or _shown_path(modifier) in moved
     return shown and (thing.collision.use or USE in moved)
+
+
+def _is_on_cloth(thing: bpy.types.Object, garment: bpy.types.Object) -> bool:
+    """Return whether an object is a garment, or hangs on one as riders do."""
+    above: bpy.types.Object | None = thing
+    while above is not None and above != garment and not is_garment(above):
+        above = above.parent
+    return above is not None
 
 
 def _may_be_enabled(thing: bpy.types.Object) -> bool:

@@ -336,6 +336,11 @@ def test_bodies_garments_and_what_is_off_are_no_colliders(ready, seeing):
     other = add_mesh(ready, "Other Skirt", np.eye(3), np.array([[0, 1, 2]]))
     other.ssilk.armature = ready.data.objects["Rig"]
     chosen.objects.link(other)
+    brooch = add_mesh(ready, "Brooch", np.eye(3), np.array([[0, 1, 2]]))
+    collide(ready, seeing, brooch)
+    assert colliders(seeing) == ["Brooch", floor.name]
+    brooch.parent = seeing
+    assert colliders(seeing) == [floor.name]
     floor.hide_viewport = True
     assert colliders(seeing) == []
 
