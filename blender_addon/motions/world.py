@@ -13,7 +13,7 @@ import numpy as np
 from ssilk_usd.units import StageUnits
 
 from ssilk_core.physics.constants import GRAVITY
-from ssilk_core.scene.assets import UP, Air, ShotWorld
+from ssilk_core.scene.assets import UP, Air, Collider, ShotWorld
 from ssilk_core.scene.assets.world import FASTEST
 
 from ..errors import SetupError
@@ -34,14 +34,20 @@ def fields_in(scene: bpy.types.Scene) -> list[bpy.types.Object]:
     return sorted((thing for thing in found if not is_disabled(thing)), key=lambda thing: thing.name)
 
 
-def world_over(scene: bpy.types.Scene, frames: range, fps: float) -> ShotWorld | None:
-    """Return gravity and wind over frames of a timeline; None where gravity is the usual one and nothing blows.
+def world_over(
+    scene: bpy.types.Scene, frames: range, fps: float, colliders: tuple[Collider, ...] = ()
+) -> ShotWorld | None:
+    """Return what surrounds a character over frames of a timeline; None where nothing but the usual gravity does.
+
+    Args:
+        colliders: that were sampled over these frames.
 
     Raises:
         SetupError: gravity cannot be read, or fields blow too fast.
     """
     gravity, air = _gravity(scene, frames), _air(fields_in(scene), frames, fps)
-    return None if gravity is None and air is None else ShotWorld(fps, gravity=gravity, air=air)
+    usual = gravity is None and air is None and not colliders
+    return None if usual else ShotWorld(fps, colliders, gravity, air)
 
 
 def signature(scene: bpy.types.Scene) -> tuple[object, ...]:

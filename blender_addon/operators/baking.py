@@ -18,10 +18,12 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
+from ssilk_core.scene.assets import Collider
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints
 from ..errors import SetupError
+from ..motions.colliders import MetColliders, unseen
 from ..motions.freedom import freedom, is_held
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
@@ -55,7 +57,7 @@ ABOUT = {
     "crowd": "For many characters, far away: few shapes and proxies, four influences",
     "game": "For real time: some shapes and proxies, four influences",
     "film": "What cannot be told from the whole model",
-    "latent": "The model's own bones and shapes, with motion from a solver; takes a while",
+    "latent": "The model's own bones and shapes, with motion from a solver; takes a while, and meets no colliders",
     "hero": "Carried on by a solver, on bones and shape keys of this shot's own; takes long",
 }
 QUALITY_ITEMS = [
@@ -177,6 +179,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
         tell_changing_shapes(self, garment)
+        if not self.meets_colliders and (missed := unseen(garment, armature, "The bake")):
+            self.report({"WARNING"}, f"{missed}.")
         self.pair = Pair.of(garment, armature)
         self.shot = usd_path(garment, self.filepath) if self.to_usd else None
         self.riders = gather_riders(garment, self.trained) if self.to_usd else {}
@@ -210,9 +214,10 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def known_joints(self, garment: bpy.types.Object, armature: bpy.types.Object) -> Joints:
         """Return the joints under the names that the model knows; raise `SsilkError` where it cannot be read."""
         try:
-            scene = load_model(self.model).scene
+            file = load_model(self.model)
         except SsilkError as error:
             raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
+        scene, self.sees = file.scene, file.config.proximity_points > 0
         self.trained = scene.garment.mesh
         self.prim = split_location(scene.garment.mesh.path)[1]
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
@@ -234,7 +239,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         from ssilk_usd.writing.files import write_direction, write_motion
 
         motion = self.take.motion(self.character)
-        world = world_over(bpy.context.scene, self.take.frames, motion.fps)
+        met: tuple[Collider, ...] = ()
+        if self.meets_colliders:
+            read = MetColliders(*self.pair.objects(), self.take.frames)
+            yield from read.sample()
+            met = read.found
+        world = world_over(bpy.context.scene, self.take.frames, motion.fps, met)
         write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
         garment, _ = self.pair.objects()
         free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
@@ -245,6 +255,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         self.reshaped = reshaped(garment, self.character, stage) if stage.exists() else ""
         if self.to_usd and stage.exists():
             self.reshaped += corrected(garment, self.character, stage)
+
+    @property
+    def meets_colliders(self) -> bool:
+        """Whether colliders count at this quality: the network sees them, or the simulator's solver meets them."""
+        level = None if self.quality == WHOLE else QUALITIES[self.quality]
+        return bool(level and level.refine) or (self.sees and not (level and level.latent_iterations))
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write the inputs of the bake; return the command."""

@@ -5,11 +5,15 @@ from __future__ import annotations
 
 import bpy
 
+from ssilk_core.errors import SsilkError
+
+from ..motions.colliders import unmet, unseen
 from ..motions.keys import has_keys
 from ..playback import playing
 from ..playback.live import Live
-from ..playback.models import no_model
+from ..playback.models import no_model, sees_colliders
 from ..playback.overrides import overriding
+from ..playback.solving import SOLVED
 from ..scene.garment import armature_of
 from .base import PlayableGarmentPanel, draw_text, saying_errors
 
@@ -41,13 +45,31 @@ def live_line(garment: bpy.types.Object) -> str:
     if played.done is not None:
         return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
     if played.behind:
-        return "The frame range, the rate, Free or Hold Frames changed since the motion was read"
+        return "The frames, Free, Hold Frames or what surrounds it changed since the motion was read"
     if played.unkeyed:
         return f"Renders lack it: {played.unkeyed}"
     solved = solved_line(played)
     if played.stale:
         return f"The motion changed since it was read{solved and '. '}{solved}"
     return playing.warning(garment) or solved or "Follows the armature"
+
+
+def unseen_line(garment: bpy.types.Object) -> str:
+    """Return that a garment's network sees none of the colliders that are there; empty where it does, or none are."""
+    if no_model(garment):
+        return ""
+    line = unseen(garment, armature_of(garment), "The network")
+    try:
+        return "" if not line or sees_colliders(garment) else line
+    except SsilkError:  # a damaged model, of which playing and baking tell
+        return ""
+
+
+def unsolved_line(garment: bpy.types.Object) -> str:
+    """Return that the chosen solver meets none of the colliders that are there; empty where none is chosen."""
+    if garment.ssilk.live_quality not in SOLVED or no_model(garment):
+        return ""
+    return unseen(garment, armature_of(garment), "The solver in latents")
 
 
 class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
@@ -65,6 +87,8 @@ class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
         else:
             layout.operator("ssilk.play_live", icon="PLAY")
         layout.prop(context.object.ssilk, "live_quality")
+        if unsolved := unsolved_line(context.object):
+            draw_text(layout, unsolved, icon="INFO")
         if line:
             draw_text(layout, line)
 
@@ -102,6 +126,9 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         draw_text(layout, model_line(context.object))
         layout.prop(context.object.ssilk, "free")
         layout.prop(context.object.ssilk, "hold")
+        layout.prop(context.object.ssilk, "colliders")
+        for line in filter(None, (unseen_line(context.object), *unmet(context.object))):
+            draw_text(layout, line, icon="INFO")
         layout.operator("ssilk.bake", icon="REC")
         draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")

@@ -16,7 +16,7 @@ and the keys are put once more when all have come.
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,14 +28,17 @@ from ssilk_usd.shots.skinned import SkinnedGarment
 from ssilk_core.delivery.bake.direction import DirectedPoses, Direction
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.runtime import Playback, Player
-from ssilk_core.physics.world.felt import felt_gravity
+from ssilk_core.physics.world.felt import ColliderSight, felt_gravity
 from ssilk_core.scene.assets import GarmentPose, Motion
 from ssilk_core.scene.held import HeldGarment
 
 from ..arrays.joints import Joints
 from ..errors import SetupError
+from ..motions.colliders import MetColliders
+from ..motions.colliders import signature as met
 from ..motions.freedom import freedom, is_held, is_keyed
 from ..motions.keys import has_live_keys, need_tracks, remove_keys
+from ..motions.nearest import tree_nearest
 from ..motions.sampling import SampledTake, motion_of, need_company, prepare_takes, sample, worlds
 from ..motions.sources import TIMELINE, Source
 from ..motions.world import signature, world_over
@@ -56,6 +59,7 @@ from .solving import SOLVED, Solving, need_solver
 
 BLOCK = 16  # frames rolled at once: few, so that an edit costs little at each frame that follows
 PRE_ROLL = 1.0  # seconds in which the garment settles before the first frame, as a bake has it
+LOOKING = 16  # frames in which colliders are looked for at once
 READING = 0.8  # the part of the preparation that is reading, mostly; the rest is rolling
 QUIET = 0.3  # seconds after a pose was found to differ before the motion is solved again
 MOVED = 1e-5  # by how much a joint's transform differs that was moved since it was read, of its size
@@ -70,7 +74,8 @@ class Live:
         unkeyed: why what is played stands not as keys, so that renders lack it; empty where it does.
         free: how freely the garment moves in each frame; None where it does throughout, and holds no pose.
         hold: frames that each pose is held.
-        world: gravity and wind that were read; None for the usual gravity and no wind.
+        world: gravity, wind and colliders that were read; None for the usual gravity and nothing else.
+        colliders: that were read; None where the model sees none.
         model_only: whether a newer model is read, for the motion that was read before.
         level: of quality, as `GarmentSettings.live_quality` names it.
         solving: what solves for frames; None where the network alone is played.
@@ -89,6 +94,10 @@ class Live:
         self.model, self.trained, self._written = model, None, 0.0
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.free, self.hold, self.world = None, 1, None
+        self.colliders: MetColliders | None = None
+        self._sight: ColliderSight | None = None
+        self._near: np.ndarray | None = None  # how near colliders are, (F, M, 3); None where there are none
+        self._frames = range(0)
         self.done: float | None = None
         self.stale = self.model_only = False
         self.unkeyed = self.unsolved = ""
@@ -121,7 +130,7 @@ class Live:
     def behind(self) -> bool:
         """Whether the scene's frames, its rate, or how the garment is held are others by now than was read."""
         try:
-            return self.times != self._asked()
+            return self.times != self._asked() or self._meets_others()
         except SetupError:  # it was deleted, which is told where it is shown
             return False
 
@@ -130,6 +139,23 @@ class Live:
         garment, _ = self.objects()
         own = garment.ssilk.hold, None if is_keyed(garment) else garment.ssilk.free
         return *_times(), *own, *signature(bpy.context.scene)
+
+    def _meets_others(self) -> bool:
+        """Return whether the scene has other colliders than were read."""
+        return self.colliders is not None and self.colliders.signature != met(*self.objects())
+
+    def meets_otherwise(
+        self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, things: Sequence[bpy.types.Object] | None = None
+    ) -> bool:
+        """Return whether a collider is evaluated otherwise in this frame than it was read.
+
+        Args:
+            things: that may be; all colliders where None.
+        """
+        if self.colliders is None or self.done is not None or scene != bpy.context.scene:
+            return False
+        asked = self.colliders.things() if things is None else things
+        return self.colliders.differ(asked, depsgraph, scene.frame_current)
 
     def choose(self, level: str) -> None:
         """Play at another level of quality; where it cannot be solved for, the network is played."""
@@ -335,20 +361,51 @@ class Live:
         need_company(garment, armature, take)
         placed, self.hold, free = np.array(take.worlds), garment.ssilk.hold, freedom(garment, take.frames)
         self.free = free if self.hold > 1 or (free < 1).any() else None
-        self.world = world_over(bpy.context.scene, take.frames, scene_rate())
+        self.colliders = yield from self._meeting(self.trained, take.frames)
+        self._frames, sight = take.frames, self._surround(self.trained, take.frames)
         if is_held(garment):
             need_movable(armature, self.joints.proxies)
-        playback, poses = yield from self._rolling(self.trained, placed, READING)
+        near = yield from self._looking(self.trained, placed, sight)
+        playback, poses = yield from self._rolling(self.trained, placed, near, READING)
         self.first, self.placed, self.playback = take.frames.start, placed, playback
+        self._near, self._sight = near, sight
         self._prepare_solver()
         self._follow()
         self._key(poses, self.first)
 
+    def _meeting(self, trained: TrainedGarment, frames: range) -> Generator[float, None, MetColliders | None]:
+        """Return the colliders over frames of the timeline; None for a model that sees none."""
+        if not trained.sees_colliders:
+            return None
+        read = MetColliders(*self.objects(), frames)
+        if self.colliders:
+            read.remember(self.colliders)
+        yield from (READING for _ in read.sample())
+        return read
+
+    def _surround(self, trained: TrainedGarment, frames: range) -> ColliderSight | None:
+        """Take what was read as what surrounds the character from now on; return what a model sees of it."""
+        found = self.colliders.found if self.colliders else ()
+        self.world = world_over(bpy.context.scene, frames, scene_rate(), found)
+        return trained.sight(self.world, tree_nearest) if self.world and found else None
+
+    def _looking(
+        self, trained: TrainedGarment, placed: np.ndarray, sight: ColliderSight | None
+    ) -> Generator[float, None, np.ndarray | None]:
+        """Return how near colliders are to the garment in each frame, (F, M, 3); None where there are none."""
+        if sight is None:
+            return None
+        motion, found = self._motion(trained, placed), []
+        for first in range(0, len(placed), LOOKING):
+            found.append(sight.near(motion, np.arange(first, min(first + LOOKING, len(placed)))))
+            yield READING
+        return np.concatenate(found)
+
     def _rolling(
-        self, trained: TrainedGarment, placed: np.ndarray, done: float
+        self, trained: TrainedGarment, placed: np.ndarray, near: np.ndarray | None, done: float
     ) -> Generator[float, None, tuple[Playback, list[GarmentPose]]]:
         """Return what plays joints to the world, (F, J, 4, 4), with all poses; yield the part that is done."""
-        motion, player, poses = self._motion(trained, placed), trained.player, []
+        motion, player, poses = self._motion(trained, placed, near), trained.player, []
         playback, some = player.play(motion, pre_roll=PRE_ROLL, block=BLOCK), None
         if self.free is not None:
             deformer = player.deformer()
@@ -359,10 +416,16 @@ class Live:
             yield done + (1 - done) * pose.start / len(placed)
         return playback, poses
 
-    def _motion(self, trained: TrainedGarment, placed: np.ndarray) -> Motion:
-        """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton."""
+    def _motion(self, trained: TrainedGarment, placed: np.ndarray, near: np.ndarray | None = None) -> Motion:
+        """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton.
+
+        Args:
+            near: how near colliders are, shape (F, M, 3).
+        """
         player = trained.player
         motion = motion_of(placed[:, trained.own], player.skeleton.parents, "the timeline")
+        if near is not None:
+            motion = replace(motion, proximity=near)
         if player.file.config.descriptors != "relative":  # it names the axes of the world, as `ssilk bake` has it
             return motion
         return replace(motion, gravity=felt_gravity(self.world, motion, player.file.scene, player.file.fabric))
@@ -380,16 +443,22 @@ class Live:
         written, trained, placed = _written(self.model), self._trained(), self.placed.copy()
         yield 0.0
         skinned = SkinnedGarment.of(trained.player.deformer())
-        playback, poses = yield from self._rolling(trained, placed, 0.0)
+        if trained.sees_colliders != (self.colliders is not None):
+            self.colliders = yield from self._meeting(trained, self._frames)
+        sight = self._surround(trained, self._frames)
+        near = yield from self._looking(trained, placed, sight)
+        playback, poses = yield from self._rolling(trained, placed, near, 0.0)
         garment, armature = self.objects()
         if not self.ready():  # the artist edits it; the model is still a new one afterwards
             return
         self.joints = self._joints_now()
         moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
         if len(moved):
-            playback = playback.with_motion(self._motion(trained, self.placed), int(moved[0]))
+            near = self._near_again(trained, near, moved, sight)
+            playback = playback.with_motion(self._motion(trained, self.placed, near), int(moved[0]))
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
         self.trained, self.playback, self._written = trained, playback, written
+        self._near, self._sight = near, sight
         self._prepare_solver()
         self._follow()
         self._key(poses, self.first)
@@ -426,10 +495,22 @@ class Live:
         if self._is_as_read(placed, index):
             return
         self.placed[index] = placed
-        self.playback, self.stale = self.playback.with_motion(self._motion(self.trained, self.placed), index), True
+        self._near = self._near_again(self.trained, self._near, np.array([index]), self._sight)
+        motion = self._motion(self.trained, self.placed, self._near)
+        self.playback, self.stale = self.playback.with_motion(motion, index), True
         if self.solving:
             self.solving.forget_from(index)
             self._keyed, self._noticed = min(self._keyed, self.solved), time.monotonic()
+
+    def _near_again(
+        self, trained: TrainedGarment, near: np.ndarray | None, frames: np.ndarray, sight: ColliderSight | None
+    ) -> np.ndarray | None:
+        """Return how near colliders are, (F, M, 3), where the armature differs in some frames by now."""
+        if near is None or sight is None:
+            return None
+        near = near.copy()
+        near[frames] = sight.near(self._motion(trained, self.placed), frames)
+        return near
 
     def _placed(self, armature: bpy.types.Object) -> np.ndarray:
         bones = [armature.pose.bones.find(name) for name in self.joints.character.names]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,12 @@ import bpy
 import numpy as np
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
 from ssilk_core.network.runtime import Player
+from ssilk_core.physics.world.felt import ColliderSight
+from ssilk_core.physics.world.surface import Search
+from ssilk_core.scene.assets import ShotWorld
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, growth, known_as, renames
@@ -159,6 +165,7 @@ class TrainingProgress:
         return bool(self.state and self.state.alive)
 
 
+_sees: dict[Path, tuple[float, bool]] = {}  # when a model was written that was read, and whether it sees colliders
 _known: dict[int, tuple[Question, TrainingProgress | None]] = {}
 
 
@@ -247,6 +254,19 @@ def told_renames(joints: Joints) -> str:
     return f" ({count} called otherwise than in the training and matched, as '{name}', which was '{found[name]}')"
 
 
+def sees_colliders(garment: bpy.types.Object) -> bool:
+    """Return whether a garment's model was trained to see colliders; the file is read where it is another by now.
+
+    Raises:
+        SsilkError: there is no model, or it cannot be read.
+    """
+    path = model_of(garment)
+    written = path.stat().st_mtime
+    if _sees.get(path, (0.0, False))[0] != written:
+        _sees[path] = written, load_model(path).config.proximity_points > 0
+    return _sees[path][1]
+
+
 class TrainedGarment:
     """A model on an armature.
 
@@ -270,6 +290,17 @@ class TrainedGarment:
         self.joints = joints = joints_known_to(garment, armature, joints, trained)
         self.order = joint_order(joints, scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
+
+    @property
+    def sees_colliders(self) -> bool:
+        """Whether the network was trained to."""
+        return self.player.file.config.proximity_points > 0
+
+    def sight(self, world: ShotWorld, search: Search) -> ColliderSight:
+        """Return what the network sees of the colliders around it; `search` finds nearest points on triangles."""
+        scene, reach = self.player.file.scene, proximity_reach(self.player.file.scene)
+        rows = proximity_vertices(scene, self.player.file.config)
+        return ColliderSight(world, scene, rows, reach, partial(proximity, reach=reach), search)
 
     @property
     def proxies(self) -> np.ndarray:

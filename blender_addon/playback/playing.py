@@ -177,7 +177,10 @@ def _read() -> float | None:
         if played.done is not None:
             more = _attempt(uid, played.read)
             if not more:
-                _show_all(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
+                depsgraph = bpy.context.evaluated_depsgraph_get()
+                _show_all(bpy.context.scene, depsgraph)
+                if _attempt(uid, played.meets_otherwise, bpy.context.scene, depsgraph):  # edited while it was read
+                    _outdate(uid, played)
             return BETWEEN
     waits = [_solve(uid, played) for uid, played in list(_played.items())]
     return SOLVING if any(waits) else None
@@ -253,6 +256,14 @@ def _edited(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     _look_at_times(scene)
     if any(isinstance(update.id, bpy.types.Action) and not is_baked(update.id) for update in depsgraph.updates):
         _read_again(scene)
+    moved = [
+        update.id.original
+        for update in depsgraph.updates
+        if isinstance(update.id, bpy.types.Object) and (update.is_updated_transform or update.is_updated_geometry)
+    ]
+    for uid, played in list(_played.items()) if moved else ():
+        if _attempt(uid, played.meets_otherwise, scene, depsgraph, moved):
+            _outdate(uid, played)
 
 
 def _look_at_times(scene: bpy.types.Scene) -> None:
@@ -264,8 +275,13 @@ def _look_at_times(scene: bpy.types.Scene) -> None:
 def _read_again(scene: bpy.types.Scene) -> None:
     for uid, played in list(_played.items()):
         if _attempt(uid, played.is_in, scene):
-            played.stale = True
-            _outdated.add(uid)
+            _outdate(uid, played)
+
+
+def _outdate(uid: int, played: Live) -> None:
+    """Read a garment's motion again, soon."""
+    played.stale = True
+    _outdated.add(uid)
     if not bpy.app.background:
         _read_soon(PATIENCE)
 

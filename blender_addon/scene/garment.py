@@ -136,17 +136,43 @@ def _around(garment: bpy.types.Object) -> Iterable[bpy.types.Object]:
     return garment.ssilk.bodies.all_objects if garment.ssilk.bodies else bpy.context.view_layer.objects
 
 
+def is_own_body(
+    thing: bpy.types.Object, garment: bpy.types.Object, armature: bpy.types.Object, *, bound: bool = True
+) -> bool:
+    """Return whether an object is a body of a garment's character, as `bodies_of` has them.
+
+    Args:
+        bound: whether what is bound to the armature counts where bodies were chosen.
+    """
+    chosen, wearers = garment.ssilk.bodies, (armature, leader_of(armature))
+    if chosen and any(thing == each for each in chosen.all_objects):
+        return True
+    if chosen or _modifier_armature(thing) in wearers:
+        return (bound or not chosen) and _modifier_armature(thing) in wearers
+    if not is_carried(thing, wearers):
+        return False
+    meshes = (each for each in bpy.context.view_layer.objects if each.type == "MESH" and each != garment)
+    return not any(_modifier_armature(each) in wearers and not is_garment(each) for each in meshes)
+
+
 def no_meshes(garment: bpy.types.Object, armature: bpy.types.Object) -> list[str]:
     """Return in words what looks like a body, and is none since it is no mesh: it was chosen, or bones move it."""
     said, wearers = [], (armature, leader_of(armature))
     for thing in _around(garment):
         is_meant = bool(garment.ssilk.bodies) or _modifier_armature(thing) in wearers
-        if is_meant and thing.type in SURFACES:
-            said.append(f"'{thing.name}' is no mesh, and cloth does not meet it; convert it (Object > Convert)")
-        elif is_meant and thing.instance_type == "COLLECTION" and thing.instance_collection:
-            text = f"'{thing.name}' is an instance of a collection, and cloth does not meet it; make it real"
-            said.append(f"{text} (Object > Apply > Make Instances Real) and bind it")
+        if is_meant and (words := no_mesh(thing)):
+            said.append(f"{words} and bind it" if thing.type not in SURFACES else words)
     return said
+
+
+def no_mesh(thing: bpy.types.Object) -> str:
+    """Return in words that an object with a surface is no mesh; empty where it is one, or has none."""
+    if thing.type in SURFACES:
+        return f"'{thing.name}' is no mesh, and cloth does not meet it; convert it (Object > Convert)"
+    if thing.instance_type == "COLLECTION" and thing.instance_collection:
+        text = f"'{thing.name}' is an instance of a collection, and cloth does not meet it; make it real"
+        return f"{text} (Object > Apply > Make Instances Real)"
+    return ""
 
 
 def follow_bodies(garment: bpy.types.Object, bodies: Sequence[bpy.types.Object]) -> list[str]:

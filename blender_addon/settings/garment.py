@@ -23,7 +23,11 @@ from .training import RELATIVE, SHOTS, TrainingSettings
 
 LIVE_QUALITIES = [
     ("NETWORK", "Network", "The network's own motion, at once"),
-    ("latent", "Latent", "As Bake solves it: in the Python with ssilk, frame by frame in the background"),
+    (
+        "latent",
+        "Latent",
+        "As Bake solves it: in the Python with ssilk, frame by frame in the background; meets no colliders",
+    ),
     ("latent_few", "Latent, Few Elements", "Likewise in a quarter of the time, on a sample of the cloth: less exact"),
 ]
 
@@ -67,6 +71,12 @@ class GarmentSettings(bpy.types.PropertyGroup):
         type=bpy.types.Collection,
         name="Bodies",
         description="Meshes that the garment collides with; all others bound to the armature when empty",
+        override=SHOTS,
+    )
+    colliders: PointerProperty(
+        type=bpy.types.Collection,
+        name="Colliders",
+        description="Meshes that the garment meets besides its bodies, with Collision physics or without",
         override=SHOTS,
     )
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")

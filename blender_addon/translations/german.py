@@ -311,6 +311,10 @@ WORDS = {
         "Wie sehr das Netzwerk das Kleidungsstück bewegt: bei 0 tragen es seine Knochen. Mit Keyframes wird es "
         "gehalten und losgelassen"
     ),
+    "Colliders": "Kollisionsobjekte",
+    "Meshes that the garment meets besides its bodies, with Collision physics or without": (
+        "Netze, auf die das Kleidungsstück außer seinen Körpern trifft, mit der Physik Kollision oder ohne"
+    ),
     "Hold Frames": "Bilder halten",
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
@@ -369,8 +373,8 @@ WORDS = {
         "Für viele Figuren in der Ferne: wenige Formen und Stellvertreter, vier Einflüsse"
     ),
     "Latent": "Latent",
-    "The model's own bones and shapes, with motion from a solver; takes a while": (
-        "Knochen und Formen des Modells selbst, Bewegung von einem Löser; dauert eine Weile"
+    "The model's own bones and shapes, with motion from a solver; takes a while, and meets no colliders": (
+        "Knochen und Formen des Modells selbst, Bewegung von einem Löser; dauert eine Weile, ohne Kollisionsobjekte"
     ),
     "Hero": "Hauptfigur",
     "Carried on by a solver, on bones and shape keys of this shot's own; takes long": (
@@ -406,8 +410,8 @@ WORDS = {
     "What is played live": "Was live gespielt wird",
     "Network": "Netzwerk",
     "The network's own motion, at once": "Die Bewegung des Netzwerks selbst, sofort",
-    "As Bake solves it: in the Python with ssilk, frame by frame in the background": (
-        "Wie beim Backen gelöst: im Python mit ssilk, Bild für Bild im Hintergrund"
+    "As Bake solves it: in the Python with ssilk, frame by frame in the background; meets no colliders": (
+        "Wie beim Backen gelöst: im Python mit ssilk, Bild für Bild im Hintergrund; ohne Kollisionsobjekte"
     ),
     "Latent, Few Elements": "Latent, wenige Elemente",
     "Likewise in a quarter of the time, on a sample of the cloth: less exact": (

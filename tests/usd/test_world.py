@@ -13,7 +13,7 @@ from ssilk_usd.reading.world import AskedWorld, find_world
 from ssilk_usd.writing.files import write_motion
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.scene.assets import Air, Body, Character, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
+from ssilk_core.scene.assets import Air, Body, Character, Collider, Mesh, Motion, ShotWorld, Skeleton, SkinWeights
 
 FPS, FRAMES, FIRST = 25.0, 5, 10
 TO_CORE = {"Y": np.eye(3), "Z": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
@@ -292,6 +292,39 @@ def test_a_motion_is_written_with_its_gravity_and_wind(tmp_path, keyed):
     np.testing.assert_allclose(found.air.velocity, blown, atol=1e-5)
     np.testing.assert_allclose(found.air.gusts, np.abs(blown[:, 0]), atol=1e-5)
     assert (found.air.length, found.air.seed) == (1.25, 3)
+
+
+def test_colliders_are_read_as_they_were_written(tmp_path):
+    """One that moves and is absent for a while, one that changes its shape, and one that stands still."""
+    rng, faces = np.random.default_rng(2), np.array([[0, 1, 2], [2, 1, 3]])
+    turns = np.tile(np.eye(4), (FRAMES, 1, 1))
+    for place in turns:
+        place[:3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        place[:3, :3] *= np.linalg.det(place[:3, :3])
+        place[:3, 3] = rng.normal(size=3)
+    always, points = np.ones(1, bool), rng.normal(size=(FRAMES, 4, 3))
+    written = (
+        Collider("Böx.001", faces, points[:1], turns, np.arange(FRAMES) != 2),
+        Collider("Böx.002", faces, points, np.eye(4)[None], always),
+        Collider("2", faces, points[:1], np.eye(4)[None], always),
+    )
+    path, skeleton = tmp_path / "clip.usdc", character().skeleton
+    write_motion(path, motion(), skeleton, ShotWorld(FPS, written))
+    again = read_motion(str(path), skeleton)
+    world = find_world(str(path), str(path), character(), again).read()
+    assert (world.gravity, world.air, len(world.colliders)) == (None, None, 3)
+    for before, after in zip(written, world.colliders):
+        np.testing.assert_array_equal(after.faces, faces)
+        np.testing.assert_array_equal(after.present, before.present)
+        for frame in range(FRAMES):
+            np.testing.assert_allclose(placed_of(after, frame), placed_of(before, frame), atol=1e-6)
+    assert [len(each.points) for each in world.colliders] == [1, FRAMES, 1]
+
+
+def placed_of(collider: Collider, frame: int) -> np.ndarray:
+    """Return the points of a collider in the world, shape (P, 3)."""
+    points, place = (part[frame % len(part)] for part in (collider.points, collider.placements))
+    return points @ place[:3, :3].T + place[:3, 3]
 
 
 def test_the_stage_of_the_character_gives_what_the_shot_lacks(stage, tmp_path):

@@ -22,6 +22,8 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
+from .colliders import VOTERS, ColliderPoser, Nearby
+from .surface import Search, boxes
 
 PLACES = 32  # vertices at which the air is averaged
 Proximity = Callable[[Floats, Floats], Floats]
@@ -53,29 +55,48 @@ def felt_proximity(
 
     Args:
         world: as for `felt_gravity`.
-        within: distance up to which colliders count [m].
-        see: takes distances (M,) and directions away from what is nearest (M, 3), and returns vectors (M, 3).
+        within, see: as for `ColliderSight`.
 
     Returns:
         None where there are no colliders.
     """
     if world is None or not world.colliders or not len(rows):
         return None
-    # PyTorch, which live playback of wind and gravity does without.
-    from .surroundings import VOTERS, Nearby, Surroundings
+    return ColliderSight(world, scene, rows, within, see).near(motion, np.arange(motion.frame_count))
 
-    around, every = Surroundings([world], -GRAVITY * UP), np.arange(scene.garment.mesh.vertex_count)
-    points, voters = (_carried(motion, scene, some) for some in (rows, _spread(every, VOTERS)))
-    found = np.zeros((motion.frame_count, len(rows), 3))
-    for frame, (here, votes) in enumerate(zip(points, voters)):
-        distance, normal = np.full(len(rows), np.inf), np.zeros((len(rows), 3))
-        close = Nearby.of(here, within)
-        for collider in around.colliders(0, frame / motion.fps, np.zeros(3), votes, close):
-            near, met = collider.near(here, within)
-            closer = met.distance < distance[near]
-            distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
-        found[frame] = see(distance, normal)
-    return found
+
+class ColliderSight:
+    """What a garment sees of the colliders of its shot.
+
+    Args:
+        world: its time runs from the first frame of motions.
+        rows: vertices from which colliders are seen (M,).
+        within: distance up to which they count [m].
+        see: takes distances (M,) and directions away from what is nearest (M, 3), and returns vectors (M, 3).
+        search: finds nearest points on triangles.
+    """
+
+    def __init__(
+        self, world: ShotWorld, scene: Scene, rows: Ints, within: float, see: Proximity, search: Search = boxes
+    ) -> None:
+        self._world, self._scene, self._rows, self._within, self._see = world, scene, rows, within, see
+        self._voters = _spread(np.arange(scene.garment.mesh.vertex_count), VOTERS)
+        self._poser = ColliderPoser(search)
+
+    def near(self, motion: Motion, frames: Ints) -> Floats:
+        """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 3)."""
+        own = motion if len(frames) == motion.frame_count else motion.picked(frames)
+        points, voters = (_carried(own, self._scene, some) for some in (self._rows, self._voters))
+        found = np.zeros((len(frames), len(self._rows), 3))
+        for row, (frame, here, votes) in enumerate(zip(frames.tolist(), points, voters)):
+            distance, normal = np.full(len(self._rows), np.inf), np.zeros((len(self._rows), 3))
+            close = Nearby.of(here, self._within)
+            for collider in self._poser.at(self._world, frame / motion.fps, np.zeros(3), votes, close):
+                near, met = collider.near(here, self._within)
+                closer = met.distance < distance[near]
+                distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
+            found[row] = self._see(distance, normal)
+        return found
 
 
 def _loose(scene: Scene) -> Ints:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The signed distance to a mesh that cloth meets besides the body.
 
-The nearest point is found with libigl's tree of boxes. The side is that of the angle-weighted pseudonormal there
+The nearest point is found with libigl's tree of boxes, or with what is handed in where that is not installed, as in
+Blender's Python. The side is that of the angle-weighted pseudonormal there
 (Baerentzen and Aanaes, IEEE TVCG 11, 2005), which is exact for closed meshes. Corners that lie on one another are
 one: exporters split them along seams of normals and textures, and a box of six quads is still closed.
 
@@ -12,6 +13,7 @@ below. A closed part is solid, but for one that the whole garment is inside of, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +26,25 @@ from ...scene.mesh import topology
 
 ON_EDGE = 1e-7  # barycentric coordinate up to which a point is on the edge opposite
 TOUCHING = 1e-9  # [m] from the surface, up to which its normal is the direction away from it
+Nearest = Callable[[Floats], tuple[Floats, Ints, Floats]]
+Search = Callable[[Floats, Ints], Nearest]
+
+
+def boxes(points: Floats, faces: Ints) -> Nearest:
+    """Return what finds the nearest points of triangles (T, 3) with vertices (P, 3), by libigl.
+
+    It takes queries (M, 3) and returns squared distances [m2] (M,), triangles (M,) and the points on them (M, 3).
+    """
+    import igl
+
+    tree = igl.AABB()
+    tree.init(points, faces)
+
+    def nearest(queries: Floats) -> tuple[Floats, Ints, Floats]:
+        squares, face, found = tree.squared_distance(points, faces, np.ascontiguousarray(queries))
+        return np.asarray(squares).reshape(-1), np.asarray(face).reshape(-1), np.asarray(found).reshape(-1, 3)
+
+    return nearest
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,16 +92,12 @@ class CollisionSurface:
     """
 
     def __init__(self, path: str, points: Floats, faces: Ints) -> None:
-        import igl
-
         place = topology.merged_places(points)
         welded = place[faces]
         kept = (welded != np.roll(welded, 1, axis=1)).all(axis=1)
         if not (kept.any() and topology.face_areas(points, faces)[kept].max() > 0):
             fail(path, "no triangle of it has an area", "cloth meets surfaces", "leave it out of the colliders")
-        turned, part = igl.bfs_orient(np.ascontiguousarray(welded[kept]))
-        self.part = np.unique(np.asarray(part).reshape(-1), return_inverse=True)[1]
-        swapped = _is_odd(welded[kept], turned)
+        swapped, self.part = _wound_alike(welded[kept])
         own = np.where(swapped[:, None], faces[kept][:, ::-1], faces[kept])
         sides = np.sort(np.stack([place[own], np.roll(place[own], -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
         _, edge, used = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
@@ -102,20 +119,17 @@ class CollisionSurface:
         self._border_vertex[sides[border[edge.reshape(-1)]]] = True
         self._edge_count = len(used)
 
-    def at(self, points: Floats) -> PosedSurface:
+    def at(self, points: Floats, search: Search = boxes) -> PosedSurface:
         """Return the surface with its mesh's points (P, 3) [m]."""
-        return PosedSurface(self, points)
+        return PosedSurface(self, points, search)
 
 
 class PosedSurface:
     """A surface at given points; built in time in proportion to its triangles, and queried often."""
 
-    def __init__(self, surface: CollisionSurface, points: Floats) -> None:
-        import igl
-
+    def __init__(self, surface: CollisionSurface, points: Floats, search: Search) -> None:
         self.surface, self.points = surface, np.ascontiguousarray(points)
-        self._tree = igl.AABB()
-        self._tree.init(self.points, np.ascontiguousarray(surface.faces))
+        self._nearest = search(self.points, np.ascontiguousarray(surface.faces))
 
     @cached_property
     def _normals(self) -> tuple[Floats, Floats, Floats]:
@@ -135,13 +149,10 @@ class PosedSurface:
     def distance(self, queries: Floats, sides: Floats | None = None) -> SurfaceDistance:
         """Return the distances of queries (M, 3), where each part's outside is turned by `sides` (C,), 1 or -1."""
         surface = self.surface
-        squares, face, nearest = self._tree.squared_distance(
-            self.points, np.ascontiguousarray(surface.faces), np.ascontiguousarray(queries)
-        )
-        face, nearest = np.asarray(face).reshape(-1), np.asarray(nearest).reshape(-1, 3)
+        squares, face, nearest = self._nearest(queries)
         weights = _barycentric(self.points[surface.faces[face]], nearest)
         away = queries - nearest
-        length = np.sqrt(np.maximum(np.asarray(squares).reshape(-1), 0.0))
+        length = np.sqrt(np.maximum(squares, 0.0))
         normal, on_border = self._at(face, weights)
         turned = np.ones(len(face)) if sides is None else sides[surface.part[face]]
         side = np.where((away * normal).sum(axis=1) * turned < 0, -1.0, 1.0)
@@ -194,7 +205,22 @@ def _volumes(corners: Floats) -> Floats:
     return (a * np.cross(b, c)).sum(axis=1)
 
 
-def _is_odd(first: Ints, second: Ints) -> NDArray[np.bool_]:
-    """Return whether triangles (T, 3) of the same vertices are wound the other way."""
-    after = np.roll(second, -1, axis=1)[second == first[:, :1]]
-    return after != first[:, 1]
+def _wound_alike(faces: Ints) -> tuple[NDArray[np.bool_], Ints]:
+    """Return which triangles (T, 3) to turn, so that neighbours are wound alike, and the part of each, shapes (T,).
+
+    Neighbours share an edge that no third one has. A part that has one side alone is left as it is wound.
+    """
+    half, count = topology.half_edges(faces), len(faces)
+    _, group, uses = np.unique(topology.edge_keys(half), return_inverse=True, return_counts=True)
+    order = np.argsort(group.reshape(-1), kind="stable")
+    starts = np.concatenate([[0], np.cumsum(uses)[:-1]])[uses == 2]
+    one, other = order[starts], order[starts + 1]
+    against = (half[one] == half[other]).all(axis=1)  # two that run along their edge the same way
+    one, other = one // 3, other // 3
+    part = topology.components(np.stack([one, other], axis=1), count)
+    # Each triangle twice, as it is and turned, numbers T and more: those that are wound alike belong together.
+    as_is, turned = other + count * against, other + count * ~against
+    pairs = np.concatenate([np.stack([one, as_is], axis=1), np.stack([one + count, turned], axis=1)])
+    side = topology.components(pairs, 2 * count)[:count]
+    first = np.unique(part, return_index=True)[1]
+    return side != side[first[part]], part

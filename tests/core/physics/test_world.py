@@ -19,7 +19,7 @@ from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
 from ssilk_core.physics.world.felt import felt_gravity
-from ssilk_core.physics.world.surface import CollisionSurface
+from ssilk_core.physics.world.surface import CollisionSurface, Nearest
 from ssilk_core.physics.world.surroundings import Surroundings
 from ssilk_core.scene.assets import (
     LOOSE,
@@ -135,6 +135,43 @@ def test_distances_are_those_of_all_triangles_however_a_mesh_is_wound_and_split(
     np.testing.assert_allclose(found.normal, np.stack(slopes, axis=1), atol=1e-7)
     nearest = (points[found.corners] * found.weights[..., None]).sum(axis=1)
     np.testing.assert_allclose(np.linalg.norm(queries - nearest, axis=1), np.abs(found.distance), atol=1e-9)
+
+
+def test_sides_are_the_same_whatever_finds_the_nearest_points() -> None:
+    """As in Blender's Python, which has no libigl."""
+    solid, rng = SOLIDS["ring"], np.random.default_rng(3)
+    queries = rng.uniform(-1.5, 1.5, (200, 3))
+
+    def each_one(points: np.ndarray, faces: np.ndarray) -> Nearest:
+        def nearest(asked: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            many = (np.repeat(points[face][None], len(asked), axis=0) for face in faces)
+            found = np.stack([trimesh.triangles.closest_point(face, asked) for face in many])
+            squares = ((found - asked) ** 2).sum(axis=2)
+            face = squares.argmin(axis=0)
+            return squares.min(axis=0), face, found[face, np.arange(len(asked))]
+
+        return nearest
+
+    surface = CollisionSurface("ring", solid.vertices, solid.faces)
+    one, other = surface.at(solid.vertices).distance(queries), surface.at(solid.vertices, each_one).distance(queries)
+    np.testing.assert_allclose(one.distance, other.distance, atol=1e-12)
+    np.testing.assert_allclose(one.normal, other.normal, atol=1e-9)
+    assert (one.distance < 0).any() and (one.distance > 0).any()
+
+
+def test_a_band_that_has_one_side_alone_is_a_part_as_it_is_wound() -> None:
+    """A Moebius band cannot be wound alike; cloth meets it nevertheless."""
+    angle = np.arange(12) * np.pi / 6
+    across = np.stack([np.cos(angle) * np.cos(angle / 2), np.sin(angle) * np.cos(angle / 2), np.sin(angle / 2)], 1)
+    ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
+    points = np.concatenate([ring + 0.2 * across, ring - 0.2 * across])
+    low, high = np.arange(12), np.arange(12) + 12
+    after, above = np.append(low[1:], high[0]), np.append(high[1:], low[0])  # it comes back upside down
+    faces = np.concatenate([np.stack([low, after, high], 1), np.stack([high, after, above], 1)])
+    surface = CollisionSurface("/band", points, faces)
+    assert not surface.closed.any() and len(surface.closed) == 1
+    np.testing.assert_array_equal(np.sort(surface.faces, axis=1), np.sort(faces, axis=1))
+    assert np.abs(surface.at(points).distance(points).distance).max() < 1e-9
 
 
 def test_a_query_that_was_far_is_not_searched_for_again_and_none_is_missed() -> None:

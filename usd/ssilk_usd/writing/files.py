@@ -96,7 +96,7 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton, world: Sh
     """Write a motion as a SkelAnimation in its own file, one time code per frame, in metres and y up.
 
     Args:
-        world: whose gravity and wind the file says too.
+        world: what else the file says.
     """
     with replacing(path) as temporary:
         stage = new_stage(temporary, CORE_UNITS)
