@@ -21,12 +21,13 @@ def blocks(document: str, language: str) -> list[str]:
 def test_layers_of_artists_are_read():
     for text, attribute, codes in zip(
         blocks("docs/pipeline.md", "usda"),
-        ("/Shot/cape/Animation.blendShapeWeights", "/Hero/Cape.ssilk:free"),
-        ([12], [1020, 1028, 1050, 1058]),
+        ("/Shot/cape/Animation.blendShapeWeights", "/Hero/Cape.ssilk:free", "/Hero/Brooch.ssilk:rideVertices"),
+        ([12], [1020, 1028, 1050, 1058], []),
         strict=True,
     ):
         layer = Sdf.Layer.CreateAnonymous(".usda")
         assert layer.ImportFromString(text)
+        assert layer.GetAttributeAtPath(attribute)
         assert layer.ListTimeSamplesForPath(attribute) == codes
 
 

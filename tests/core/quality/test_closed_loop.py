@@ -109,7 +109,7 @@ def test_derivatives_of_a_network_are_central_differences(scene, toy_model, toy_
 def test_a_network_without_a_past_forgets_all(scene, toy_model, toy_body):
     model = toy_model(scene, scheme="quasi_static")
     before, now, rest = torch.randn(3, 8)
-    found = step_derivatives(model, before, now, rest, torch.zeros(60), toy_body(scene, 3, 1))
+    found = step_derivatives(model, before, now, rest, torch.zeros(model.described), toy_body(scene, 3, 1))
     assert spectral_radius(*found) == 0
 
 
