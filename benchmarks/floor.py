@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +26,8 @@ from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.events import TextReporter
-from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
+from ssilk_core.network.proximity import seen_proximity
 from ssilk_core.network.runtime import Player
-from ssilk_core.physics.world.felt import felt_proximity
 from ssilk_core.scene.assets import Collider, Floats, Motion, Scene, ShotWorld
 from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 
@@ -73,9 +71,7 @@ def floor_world(motion: Motion, height: float) -> ShotWorld:
 
 def seeing(subject: Subject, motion: Motion, world: ShotWorld) -> Motion:
     """Return a motion whose garment sees the colliders of a world."""
-    rows, reach = proximity_vertices(subject.scene, subject.file.config), proximity_reach(subject.scene)
-    near = felt_proximity(world, motion, subject.scene, rows, reach, partial(proximity, reach=reach))
-    return replace(motion, proximity=near)
+    return replace(motion, proximity=seen_proximity(world, motion, subject.scene, subject.file.config))
 
 
 def played(player: Player, motion: Motion) -> Floats:

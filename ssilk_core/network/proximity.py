@@ -15,9 +15,11 @@ below the shoulders, wherever the body would carry it.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
-from ..scene.assets import PINNED, Floats, Ints, Scene
+from ..scene.assets import PINNED, Floats, Ints, Motion, Scene, ShotWorld
 from .feedback import spread_vertices
 from .settings import ModelConfig
 
@@ -49,3 +51,16 @@ def proximity(distance: Floats, normal: Floats, reach: float) -> Floats:
     share = 1 - distance / reach
     length = np.where(distance > 0, np.maximum(share, 0) ** 2, np.minimum(2 * share - 1, MOST))
     return normal * length[..., None]
+
+
+def seen_proximity(world: ShotWorld | None, motion: Motion, scene: Scene, config: ModelConfig) -> Floats | None:
+    """Return what a network sees of the colliders of a shot in each frame of a motion, as `Motion.proximity`.
+
+    Args:
+        world: whose time runs from the first frame of the motion; None for none.
+    """
+    from ..physics.world.felt import felt_proximity
+
+    reach = proximity_reach(scene)
+    rows = proximity_vertices(scene, config)
+    return felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))

@@ -69,7 +69,7 @@ class Obstacles:
     def distance(self, points: Tensor, box: int) -> Tensor:
         """Return the distances of points (M, 3, N) to one box of each frame [m], shape (M, N)."""
         outside = self._local(points, box).abs() - self.half[box].T
-        return self._length(outside) + outside.amax(dim=1).clamp(max=0) - self.radius[box]
+        return self._signed(self._length(outside), outside.amax(dim=1), box)
 
     def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distances of points (M, 3, N) to the nearest box [m], (M, N), and directions away, (M, 3, N)."""
@@ -87,6 +87,9 @@ class Obstacles:
     def _length(outside: Tensor) -> Tensor:
         return torch.linalg.vector_norm(outside.clamp_min(0), dim=1)
 
+    def _signed(self, length: Tensor, deepest: Tensor, box: int) -> Tensor:
+        return length + deepest.clamp(max=0) - self.radius[box]
+
     def _away(self, points: Tensor, box: int) -> tuple[Tensor, Tensor]:
         local = self._local(points, box)
         outside = local.abs() - self.half[box].T
@@ -96,7 +99,7 @@ class Obstacles:
         own = torch.where((length > TINY)[:, None], outside.clamp_min(0), face)
         own = torch.copysign(nn.functional.normalize(own, dim=1, eps=TINY), local)
         away = torch.einsum("nab,mbn->man", self.turn[box], own)
-        return length + deepest.clamp(max=0) - self.radius[box], away
+        return self._signed(length, deepest, box), away
 
 
 class ObstacleDrawer:

@@ -163,14 +163,13 @@ class LoadedGarment:
         sight, scene = Sight.of(self.file, solved=request.latent_iterations > 0), self.deformer.scene
         if not (sight.pull or sight.colliders):
             return motion
-        from ...network.proximity import proximity, proximity_reach, proximity_vertices
-        from ...physics.world.felt import felt_gravity, felt_proximity
+        from ...network.proximity import seen_proximity
+        from ...physics.world.felt import felt_gravity
 
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
         world = world_of(request.motion, request.stage, scene, motion, asked, colliders=sight.colliders)
         gravity = felt_gravity(world, motion, scene, self.file.fabric) if sight.pull else None
-        rows, reach = proximity_vertices(scene, self.file.config), proximity_reach(scene)
-        near = felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
+        near = seen_proximity(world, motion, scene, self.file.config)
         return motion if gravity is near is None else replace(motion, gravity=gravity, proximity=near)
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:

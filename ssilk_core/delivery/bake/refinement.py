@@ -50,12 +50,7 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         return rollout
     if not rollout.request.refine:
         if not rollout.request.lbs:
-            missed = unseen(
-                *_surrounded(rollout),
-                report,
-                sight=rollout.sight,
-                drag=rollout.fabric.drag,
-            )
+            missed = unseen(*_surrounded(rollout), report, sight=rollout.sight, drag=rollout.fabric.drag)
             for words in filter(None, (missed, _too_strong(rollout.source))):
                 report(Message(f"{rollout.request.motion}: {words}", "warning"))
         return rollout
