@@ -44,6 +44,7 @@ def repeated(shot: MotionInputs, shots: int) -> MotionInputs:
         shot.pose.expand(-1, shots, -1),
         shot.character.expand(-1, -1, -1, -1, shots),
         shot.bend.expand(-1, -1, shots),
+        shot.planes.expand(-1, -1, -1, shots),
         shot.origins.expand(-1, -1, shots),
         shot.begins.expand(-1, shots, -1),
     )

@@ -9,8 +9,16 @@ changed last,
 
 is how far the free flight of each point departs from what the latents would do without a force, in the root's frame
 R_t. It knows no position, no heading and no steady velocity. It is zero for a garment at rest on a body at rest, so
-that the quasi-static state stays an equilibrium. S sees m_t in `UNIT`, saturated at `LIMIT`; it knows gravity from
-the pose.
+that the quasi-static state stays an equilibrium.
+
+Free flight ends at colliders. Points at which the network sees them (`network.proximity`) know a plane of the nearest
+one in each frame, with the normal n_t and the depth e_t(x) below it, about where the body carries the point. To them
+
+    m_t += R_t^T n_t max(e_t(2 x_{t-1} - x_{t-2}) - max(e_{t-1}(x_{t-1}), 0), 0)
+
+is added: they come no deeper than they were. It is zero, too, where nothing moves.
+
+S sees m_t in `UNIT`, saturated at `LIMIT`; it knows gravity from the pose.
 
 In the paper each state is decoded to give the garment "and the proxy animation feedback to the stepper module", and
 no equation says in what form. With `feedback_proxies` S sees, after the points, the proxies of z_{t-2} and then those
@@ -31,6 +39,11 @@ UNIT, LIMIT = 0.05, 4.0  # [m] of a feature of one, and where features saturate
 def feedback_vertices(scene: Scene, config: ModelConfig) -> Ints:
     """Return the vertices that S sees, shape (M,); empty without S."""
     return spread_vertices(scene, config.feedback_points if SCHEMES[config.scheme].states else 0)
+
+
+def stopped_points(scene: Scene, config: ModelConfig) -> int:
+    """Return how many of the first of `feedback_vertices` colliders stop: those that see them, too."""
+    return min(len(feedback_vertices(scene, config)), config.proximity_points)
 
 
 def spread_vertices(scene: Scene, count: int) -> Ints:

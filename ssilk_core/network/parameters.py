@@ -49,16 +49,22 @@ def descriptor_sizes(scene: Scene, joints: Ints, config: ModelConfig) -> tuple[i
     return proximity_size(scene, config) + posed, dynamic
 
 
-def seeing_colliders(parameters: Mapping[str, Floats], config: ModelConfig, features: int) -> dict[str, Floats]:
-    """Return the parameters of a network that sees none with `features` of proximity, which count nothing yet."""
+def seeing_more(
+    parameters: Mapping[str, Floats], scene: Scene, before: ModelConfig, after: ModelConfig
+) -> dict[str, Floats]:
+    """Return the parameters of a network that sees colliders and cloth at more points, which count nothing yet.
+
+    Points are those of before and others, so that the features of others come after theirs.
+    """
+    proximity, seen = proximity_size(scene, before), feedback_size(scene, before)
+    near, more = proximity_size(scene, after) - proximity, feedback_size(scene, after) - seen
+    states = SCHEMES[before.scheme].states * before.latent
     found = dict(parameters)
-    for name, before in (
-        ("initialiser.0.weight", 0),
-        ("stepper.0.weight", SCHEMES[config.scheme].states * config.latent),
-    ):
+    for name, first, last in (("initialiser.0.weight", 0, 0), ("stepper.0.weight", states, more)):
         if name in found:
-            blank = np.zeros((len(found[name]), features), found[name].dtype)
-            found[name] = np.concatenate([found[name][:, :before], blank, found[name][:, before:]], axis=1)
+            weights, at = found[name], first + proximity
+            blank = np.zeros((len(weights), near + last), weights.dtype)
+            found[name] = np.hstack([weights[:, :at], blank[:, :near], weights[:, at:], blank[:, near:]])
     return found
 
 

@@ -53,6 +53,17 @@ def proximity(distance: Floats, normal: Floats, reach: float) -> Floats:
     return normal * length[..., None]
 
 
+def nearest_planes(vectors: Floats, reach: float) -> tuple[Floats, Floats]:
+    """Return directions away from colliders (..., 3) and distances (...,) [m] from vectors (..., 3) of `proximity`.
+
+    Where nothing is near the direction is zero, and the distance that of the reach. No point is deeper inside than
+    half the reach.
+    """
+    length = np.linalg.norm(vectors, axis=-1)
+    direction = vectors / np.maximum(length, np.finfo(float).tiny)[..., None]
+    return direction, reach * np.where(length < 1, 1 - np.sqrt(length), (1 - length) / 2)
+
+
 def seen_proximity(world: ShotWorld | None, motion: Motion, scene: Scene, config: ModelConfig) -> Floats | None:
     """Return what a network sees of the colliders of a shot in each frame of a motion, as `Motion.proximity`.
 

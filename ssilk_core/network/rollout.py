@@ -110,7 +110,7 @@ def _advance(
     rest, diverged = _replace_diverged(model.initial(static))
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     starting = min(max(0, HISTORY - start), count)
-    body = BodyFrames.of(world, skeleton, parameter)[max(0, seen.frame_count - count + starting - HISTORY) :]
+    body = model.body_frames(seen, world)[max(0, seen.frame_count - count + starting - HISTORY) :]
     return _roll_and_recover(model, [*state, *rest[:starting]], rest[starting:], pose[starting:], body, diverged)
 
 

@@ -12,7 +12,7 @@ from .schemes import need_scheme
 DESCRIPTORS = ("relative", "absolute")
 MAX_SIZE = 65_536  # of a part of the network; larger ones fit into no machine
 NO_BOUND = 1e9  # upper limit of settings without a limit of their own
-PROXIMITY_POINTS = 24  # of networks that see colliders, where settings name no number
+PROXIMITY_POINTS = 64  # of networks that see colliders, where settings name no number
 STRONGEST_PULL = 4.0  # [g] of winds in training, beside gravity; the usual fabric feels it at 20 m/s
 
 # Constants of `model.integrators.SpringVerlet`, shared with the numpy runtime and explained there.

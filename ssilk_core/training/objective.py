@@ -151,17 +151,21 @@ class Objective:
             beneath: inner garments in these poses, where there are any.
             obstacles: likewise what else is there.
         """
-        z = self.model.initial(self._static_descriptor(frames, down, obstacles))
+        z = self.model.initial(self._static_descriptor(frames, down, self._near(frames, obstacles)))
         character = self.bank.character(frames)
         x = self._vertices(z, character, 0)
         return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles)
 
-    def _static_descriptor(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None) -> Tensor:
+    def _near(self, frames: Tensor, obstacles: Obstacles | None) -> tuple[Tensor, Tensor] | None:
+        """Return what is near in frames (N,), as `ObstacleDrawer.near` does; None without obstacles."""
+        return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames)
+
+    def _static_descriptor(self, frames: Tensor, down: Tensor, near: tuple[Tensor, Tensor] | None) -> Tensor:
         """Return static descriptors (N, S) of frames (N,), with the proximity of obstacles where there are any."""
         static = self.bank.static_descriptor(frames, down)
-        if obstacles is None or self.drawer is None:
+        if near is None or self.drawer is None:
             return static
-        return torch.cat([self.drawer.seen(obstacles, frames), static], dim=1)
+        return torch.cat([self.drawer.seen(near, frames), static], dim=1)
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -192,8 +196,8 @@ class Objective:
         batch = len(sampler.first)
         times = sampler.frames().reshape(-1)
         down = sampler.gravity().flatten(0, 1)
-        around = sampler.obstacles and sampler.obstacles.repeated(length)
-        static = self._static_descriptor(times, down, around)
+        near = self._near(times, sampler.obstacles and sampler.obstacles.repeated(length))
+        static = self._static_descriptor(times, down, near)
         heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
         pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
         # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
@@ -201,6 +205,8 @@ class Objective:
             target = model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         body = bank.body(times.reshape(length, batch))
+        if near is not None:
+            body = model.feedback.among(body, *near)
         with torch.set_grad_enabled(sampler.config.bptt):
             z = model.roll([*(start + noise)], target[2:], pose[2:], body)
         rolled = torch.cat(z[2:])
@@ -209,9 +215,10 @@ class Objective:
             states = torch.cat(z)
             before, now = states[: -2 * batch], states[batch:-batch]
             with torch.no_grad():
-                seen = model.seen_from(before, now, bank.triples(times[2 * batch :]))
+                seen = model.seen_from(before, now, body.triples())
             rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        quiet = model.initial(self._static_descriptor(frames, single_down, single_obstacles))
+        single_near = self._near(frames, single_obstacles)
+        quiet = model.initial(self._static_descriptor(frames, single_down, single_near))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.

@@ -7,8 +7,9 @@ large that it has one face. Their distances have closed forms, of which those ou
     q = |R^T (x - c)| - h,    d = |max(q, 0)| + min(max(q), 0) - r
 
 Bodies do not pass through floors and chairs, so that an obstacle is where the body does not come in the frames that
-it is drawn for: where it would, r shrinks until it does not, below zero at need. The same is done in each window that
-continues another: an obstacle that stands in the way draws back.
+it is drawn for. Where it would, one beside the garment is moved away, and then r shrinks until it does not, below
+zero at need. The same is done in each window that continues another: an obstacle that stands in the way draws back.
+Some obstacles are kept off the garment, too, as its body carries it: what is near is not always touched.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ from .motion_bank import MotionBank
 
 BODY_POINTS = 256  # spread over the body, by which it is kept out of obstacles
 SKIN = 0.005  # [m] between these and an obstacle that touches the body
-FLOORS, BOTH = 0.55, 0.25  # shares of poses with obstacles that have a floor or wall alone, and one beside something
+FLOORS, BOTH = 0.4, 0.25  # shares of poses with obstacles that have a floor or wall alone, and one beside something
 LYING = 0.6  # share of floors that the body touches
 LEVEL = 0.6  # share of floors that are level; others are tilted, or walls
 FURTHEST = 0.4  # of the reach, up to which others are away from the body
+UNTOUCHED = 0.4  # share of obstacles beside the garment that do not touch it; they are away as far as floors are
 LARGE = 50.0  # [m] half extents of a floor
+ABSENT = -2 * LARGE  # [m] radius of what is not there
 SMALLEST, LARGEST = 0.03, 0.5  # [m] half extents of boxes
 THINNEST, THICKEST = 0.02, 0.25  # [m] radii of capsules and balls
 OVERLAP, GAP = 0.2, 0.2  # [m] that what is drawn beside the garment reaches into it, and stays away from it
@@ -65,6 +68,12 @@ class Obstacles:
     @property
     def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         return self.turn, self.centre, self.half, self.radius
+
+    def without_empty(self) -> Obstacles:
+        """Return them with those away of which nothing is left."""
+        empty = self.radius <= -self.half.amin(dim=2)
+        radius = torch.where(empty, torch.full_like(self.radius, ABSENT), self.radius)
+        return Obstacles(self.turn, self.centre, self.half, radius)
 
     def distance(self, points: Tensor, box: int) -> Tensor:
         """Return the distances of points (M, 3, N) to one box of each frame [m], shape (M, N)."""
@@ -122,9 +131,17 @@ class ObstacleDrawer:
         self._body = _Carried(body.mesh.points, body.skin, rows, device)
         self._seen = _Carried(mesh.points, skin, proximity_vertices(scene, config), device)
 
-    def seen(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
-        """Return features of proximity (N, 3 M) in frames (N,), as `network.proximity` has them."""
-        distance, away = obstacles.nearest(self._seen(self.bank.character(frames)))
+    def near(self, obstacles: Obstacles, frames: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how near obstacles are in frames (N,) to the points that see them.
+
+        Returns:
+            Distances [m], shape (M, N), and directions away, shape (M, 3, N).
+        """
+        return obstacles.nearest(self._seen(self.bank.character(frames)))
+
+    def seen(self, near: tuple[Tensor, Tensor], frames: Tensor) -> Tensor:
+        """Return features of proximity (N, 3 M) of what is near in frames (N,), as `network.proximity` has them."""
+        distance, away = near
         vectors = away * proximity_length(distance, self.reach)[:, None]
         return proximity_features(vectors.permute(2, 0, 1), self.bank.down[frames, self.hub])
 
@@ -140,21 +157,30 @@ class ObstacleDrawer:
         floor = (chance[0] < self.share) & (chance[1] < FLOORS + BOTH)
         other = (chance[0] < self.share) & (chance[1] > FLOORS)
         points = self._seen(self.bank.character(middle))
-        parts = zip(self._floors(points, gravity).parts, self._others(points).parts)
-        found = Obstacles(*(torch.cat(both) for both in parts))
-        # A floor is at the body or further away, and others where they were put unless the body is there.
-        near, gap = self._clearance(found, frames), self._uniform(count) ** 2 * FURTHEST * self.reach
+        # A floor is at the body or further away, and others where they were put unless the body or cloth is there.
+        gap, beside = self._uniform(2, count) ** 2 * FURTHEST * self.reach
         gap = torch.where(chance[2] < LYING, torch.zeros_like(gap), gap)
-        radius = found.radius.clone()
-        radius[0] += near[0] - gap
-        radius[1] -= (-near[1]).clamp_min(0)
-        radius = torch.where(torch.stack([floor, other]), radius, torch.full_like(radius, -2 * LARGE))
-        return Obstacles(found.turn, found.centre, found.half, radius)
+        beside = torch.where(chance[3] < UNTOUCHED, beside, torch.full_like(beside, -LARGE))
+
+        def in_the_way(box: Obstacles) -> Tensor:
+            cloth = beside - box.distance(points, 0).amin(dim=0)
+            return torch.maximum(-self._clearance(box, frames)[0], cloth).clamp_min(0)
+
+        level, (box, way) = self._floors(points, gravity), self._others(points)
+        box = Obstacles(box.turn, box.centre + in_the_way(box)[:, None] * way, box.half, box.radius)
+        radius = torch.cat([
+            level.radius + self._clearance(level, frames) - gap,
+            box.radius - in_the_way(box),
+        ])  # fmt: skip
+        radius = torch.where(torch.stack([floor, other]), radius, torch.full_like(radius, ABSENT))
+        turn, centre, half = (torch.cat(both) for both in zip(level.parts[:3], box.parts[:3]))
+        return Obstacles(turn, centre, half, radius).without_empty()
 
     def drawn_back(self, obstacles: Obstacles, frames: Tensor) -> Obstacles:
         """Return obstacles that the body stays outside of in frames (T, N), too."""
         inside = (-self._clearance(obstacles, frames)).clamp_min(0)
-        return Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius - inside)
+        drawn = Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius - inside)
+        return drawn.without_empty()
 
     def _clearance(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
         """Return how far the body is outside of each obstacle in its frames (T, N), at least, [m], shape (K, N)."""
@@ -175,8 +201,8 @@ class ObstacleDrawer:
         half, radius = torch.full((count, 3), LARGE, device=device), torch.zeros(count, device=device)
         return Obstacles(turn[None], centre[None], half[None], radius[None])
 
-    def _others(self, points: Tensor) -> Obstacles:
-        """Return boxes, capsules and balls beside points (M, 3, N) of the garment."""
+    def _others(self, points: Tensor) -> tuple[Obstacles, Tensor]:
+        """Return boxes, capsules and balls beside points (M, 3, N) of the garment, and directions away (N, 3)."""
         count = points.shape[2]
         draw, chance = self._uniform(4, count), self._uniform(2, count, 1)
         turn = _frames_along(nn.functional.normalize(self._normal(count, 3), dim=1), self._normal(count, 3))
@@ -190,7 +216,7 @@ class ObstacleDrawer:
         way = nn.functional.normalize(self._normal(count, 3), dim=1)
         extent = ((turn.mT @ way[..., None])[..., 0].abs() * half).sum(dim=1) + radius
         away = extent + draw[2] * (OVERLAP + GAP) - OVERLAP
-        return Obstacles(turn[None], (beside + away[:, None] * way)[None], half[None], radius[None])
+        return Obstacles(turn[None], (beside + away[:, None] * way)[None], half[None], radius[None]), way
 
     def _uniform(self, *shape: int) -> Tensor:
         return torch.rand(*shape, generator=self.generator, device=self.bank.static.device)

@@ -13,8 +13,7 @@ from ..events import Message, Reporter, format_count, silent
 from ..network.checkpoint import ModelFile
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
-from ..network.parameters import seeing_colliders
-from ..network.proximity import proximity_size
+from ..network.parameters import seeing_more
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
@@ -127,9 +126,7 @@ def build_parts(
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed)
     if job.base and job.whole:
-        known = job.base.parameters
-        if added := model.proximity - proximity_size(scene, job.base.config):
-            known = seeing_colliders(known, job.base.config, added)
+        known = seeing_more(job.base.parameters, scene, job.base.config, job.model)
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)

@@ -23,12 +23,12 @@ import sys
 from dataclasses import replace
 import numpy as np
 from ssilk_core.network.checkpoint import load_model, save_model
-from ssilk_core.network.parameters import seeing_colliders
+from ssilk_core.network.parameters import seeing_more
 from ssilk_core.network.proximity import proximity_size
 file, rng = load_model(sys.argv[1]), np.random.default_rng(5)
 config = replace(file.config, proximity_points=12)
 features = proximity_size(file.scene, config)
-seeing = seeing_colliders(file.parameters, file.config, features)
+seeing = seeing_more(file.parameters, file.scene, file.config, config)
 for name, more in seeing.items():
     if more.shape != file.parameters[name].shape:
         blank = (more == 0).all(axis=0)

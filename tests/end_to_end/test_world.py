@@ -18,8 +18,8 @@ from ssilk_core.delivery.bake import BakeRequest, bake
 from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.world import world_of
 from ssilk_core.network.checkpoint import load_model, save_model
-from ssilk_core.network.parameters import seeing_colliders
-from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
+from ssilk_core.network.parameters import seeing_more
+from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
 from ssilk_core.network.runtime import Player
 from ssilk_core.physics.world.felt import felt_proximity
 from ssilk_core.scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices
@@ -111,7 +111,7 @@ def let_it_see(path: str) -> None:
     """Make a model's network see colliders, somehow."""
     file, dice = load_model(path), np.random.default_rng(3)
     config = replace(file.config, proximity_points=6)
-    blind, parameters = file.parameters, seeing_colliders(file.parameters, config, 18)
+    blind, parameters = file.parameters, seeing_more(file.parameters, file.scene, file.config, config)
     for name, value in parameters.items():
         if value.shape != blind[name].shape:
             parameters[name] = value + (value == 0) * dice.normal(0, 0.2, value.shape).astype(value.dtype)
@@ -194,7 +194,7 @@ def test_a_network_that_was_trained_in_wind_says_nothing_of_it(stage, capsys):
 def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
     file = load_model("model.safetensors")
     config = replace(file.config, proximity_points=5)
-    parameters = seeing_colliders(file.parameters, config, proximity_size(file.scene, config))
+    parameters = seeing_more(file.parameters, file.scene, file.config, config)
     for name in ("initialiser.0.weight", "stepper.0.weight"):
         empty = (parameters[name] == 0).all(axis=0)
         assert empty.sum() == 15

@@ -58,6 +58,13 @@ def proximity_length(distance: Tensor, reach: float) -> Tensor:
     return torch.where(distance > 0, share.clamp_min(0) ** 2, (2 * share - 1).clamp_max(MOST))
 
 
+def nearest_planes(vectors: Tensor, reach: float) -> tuple[Tensor, Tensor]:
+    """Return `network.proximity.nearest_planes` of vectors (..., 3): directions (..., 3) and distances (...,) [m]."""
+    length = torch.linalg.vector_norm(vectors, dim=-1)
+    direction = vectors / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]
+    return direction, reach * torch.where(length < 1, 1 - length.sqrt(), (1 - length) / 2)
+
+
 def proximity_features(vectors: Tensor, down: Tensor) -> Tensor:
     """Return vectors (N, M, 3) in the root's frame (N, 3 M), from the world-to-root rotations (N, 3, 3)."""
     return torch.einsum("nab,nmb->nma", down, vectors).flatten(1)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from ...files import replacing
 from ..parameters import descriptor_sizes
+from .descriptors import nearest_planes
 from .feedback import BodyFrames, DecodedState
 from .network import GarmentModel
 
@@ -29,30 +30,45 @@ class FrameNetwork(nn.Module):
     to_parent: Tensor
     bind_rotations: Tensor
     places: Tensor
+    hub_bind: Tensor
 
     def __init__(self, model: GarmentModel) -> None:
         super().__init__()
-        self.model = model
+        self.model, skeleton = model, model.scene.character.skeleton
         for name, values in (
             ("to_parent", model.axes.above.swapaxes(-1, -2)),
             ("bind_rotations", model.axes.own),
             ("places", model.axes.places),
+            ("hub_bind", skeleton.bind_transforms[skeleton.hub, :3, :3]),
         ):
             self.register_buffer(name, torch.tensor(values).float())
 
     @property
     def state_size(self) -> int:
-        """Numbers in a state: latents, and where S sees the cloth the outputs of D and the points that it sees."""
-        model = self.model
-        return model.config.latent + (model.decoder.output_count + 3 * model.feedback.count) * (
-            model.feedback.size > 0
-        )
+        """Numbers in a state: latents, and where S sees the cloth the outputs of D, the points that it sees, and how
+        deep they are in colliders."""
+        model, feedback = self.model, self.model.feedback
+        seen = model.decoder.output_count + 3 * feedback.count + len(feedback.carried)
+        return model.config.latent + seen * (feedback.size > 0)
 
     def _decoded(self, state: Tensor) -> DecodedState:
         """Return what S looks back on, from a state of this graph (N, state)."""
         latent, outputs = self.model.config.latent, self.model.decoder.output_count
-        _, output, points = state.tensor_split([latent, latent + outputs], dim=1)
-        return DecodedState(output, points.T.reshape(self.model.feedback.count, 3, state.shape[0]))
+        count = self.model.feedback.count
+        ends = [latent, latent + outputs, latent + outputs + 3 * count]
+        _, output, points, depth = state.tensor_split(ends, dim=1)
+        return DecodedState(output, points.T.reshape(count, 3, state.shape[0]), depth.T)
+
+    def _planes(self, static: Tensor, matrices: Tensor) -> Tensor | None:
+        """Return the planes (1, C, 4, N) of the colliders in static descriptors (N, S)."""
+        feedback = self.model.feedback
+        count = len(feedback.carried)
+        if not count:
+            return None
+        root = matrices[feedback.hub, :, :3].permute(2, 0, 1) @ self.hub_bind
+        vectors = static[:, : 3 * count].unflatten(1, (count, 3)) @ root.mT
+        away, distance = nearest_planes(vectors, feedback.reach)
+        return feedback.planes(distance.T, away.permute(1, 2, 0), matrices)[None]
 
     def _step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, body: BodyFrames | None) -> Tensor:
         model, latent = self.model, self.model.config.latent
@@ -83,15 +99,17 @@ class FrameNetwork(nn.Module):
         """
         model, body = self.model, None
         if matrices is not None and bend is not None:
-            body = BodyFrames(matrices.permute(1, 2, 3, 0)[None], bend.T[None])
+            own = matrices.permute(1, 2, 3, 0)
+            body = BodyFrames(own[None], bend.T[None], self._planes(static, own))
         rest = model.initial(static)
         z = torch.where(begins, rest, self._step(before, now, rest, torch.cat([static, rates], dim=1), body))
         output = model.output(z)
         activation, transforms = model.decoder.activations(output)
         state = z
         if model.feedback.size:
-            points = model.feedback.decoded(model.decoder, output, None if body is None else body.matrices[0]).points
-            state = torch.cat([z, output, points.flatten(0, 1).T], dim=1)
+            seen = model.feedback.decoded(model.decoder, output, body)
+            depth = [] if seen.depth is None else [seen.depth.T]
+            state = torch.cat([z, output, seen.points.flatten(0, 1).T, *depth], dim=1)
         weights = (activation.T / model.config.activation_range + 1) / 2
         if model.decoder.has_constant:
             weights = torch.cat([weights, torch.ones_like(z[:, :1])], dim=1)

@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from ...physics.skinning import transform_points
-from ...scene.assets import Floats, Scene, Skeleton
+from ...physics.skinning import Skinning, transform_points
+from ...scene.assets import Floats, Motion, Scene, Skeleton, SkinWeights
 from ...scene.kinematics import skinning_matrices
-from ..feedback import LIMIT, UNIT, bends, feedback_size, feedback_vertices
+from ..feedback import LIMIT, UNIT, bends, feedback_size, feedback_vertices, stopped_points
+from ..proximity import proximity_reach
 from ..settings import ModelConfig
 from .decoder import Decoder, transform_of
+from .descriptors import nearest_planes
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,10 +25,25 @@ class BodyFrames:
     Attributes:
         matrices: skinning matrices, whose positions are relative to an origin of each frame, (F, J, 3, 4, N).
         bend: second difference o_t - 2 o_{t-1} + o_{t-2} of these origins [m], (F, 3, N); unused in the first two.
+        planes: colliders that stop points, as `Feedback.planes` returns them; None where there are none.
     """
 
     matrices: Tensor
     bend: Tensor
+    planes: Tensor | None = None
+
+    def triples(self) -> BodyFrames:
+        """Return the two frames before each frame from the third on, and itself, F = 3, of (F - 2) N motions.
+
+        Their positions must be about one origin, so that bends are zero.
+        """
+        count = len(self.matrices) - 2
+
+        def shifted(values: Tensor) -> Tensor:
+            return torch.stack([values[at : at + count].movedim(0, -2).flatten(-2) for at in range(3)])
+
+        planes = None if self.planes is None else shifted(self.planes)
+        return BodyFrames(shifted(self.matrices), shifted(self.bend), planes)
 
     @classmethod
     def of(cls, world: Floats, skeleton: Skeleton, like: Tensor) -> BodyFrames:
@@ -40,15 +57,23 @@ class BodyFrames:
         return cls(torch.as_tensor(matrices).to(like)[..., None], torch.as_tensor(bends(origins)).to(like)[..., None])
 
     def __getitem__(self, frames: slice) -> BodyFrames:
-        return BodyFrames(self.matrices[frames], self.bend[frames])
+        planes = None if self.planes is None else self.planes[frames]
+        return BodyFrames(self.matrices[frames], self.bend[frames], planes)
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedState:
-    """A state as the feedback looks back on it: outputs of D (N, outputs), and points (M, 3, N) [m]."""
+    """A state as the feedback looks back on it.
+
+    Attributes:
+        output: of D, shape (N, outputs).
+        points: that S sees [m], shape (M, 3, N).
+        depth: of the first of these inside colliders, not negative [m], shape (C, N); None without any.
+    """
 
     output: Tensor
     points: Tensor
+    depth: Tensor | None = None
 
 
 class Feedback(nn.Module):
@@ -63,6 +88,7 @@ class Feedback(nn.Module):
 
     rows: Tensor
     places: Tensor
+    carried: Tensor
 
     def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
         super().__init__()
@@ -71,23 +97,68 @@ class Feedback(nn.Module):
         self.register_buffer("rows", rows, persistent=False)
         # Of each chosen vertex among those that are not pinned, which alone have blendshapes.
         self.register_buffer("places", torch.searchsorted(decoder.free, rows), persistent=False)
+        skin, own = scene.lbs_skin, rows[: stopped_points(scene, config)].numpy()
+        self.lbs = Skinning(SkinWeights(skin.path, skin.indices[own], skin.weights[own]))
+        self.reach = proximity_reach(scene)
+        carried = torch.tensor(scene.garment.mesh.points[own], dtype=torch.float32)
+        self.register_buffer("carried", carried, persistent=False)
 
     @property
     def count(self) -> int:
         """Points that S sees."""
         return len(self.rows)
 
-    def decoded(self, decoder: Decoder, output: Tensor, matrices: Tensor | None) -> DecodedState:
-        """Return a state by its outputs (N, outputs), under a character (J, 3, 4, N), which only points need."""
-        if matrices is None or not self.count:
+    def planes(self, distance: Tensor, away: Tensor, matrices: Tensor) -> Tensor:
+        """Return the planes (C, 4, N) of the nearest colliders in N frames: normals n, then offsets c [m].
+
+        A point x about the frame's origin lies c - n . x below its plane.
+
+        Args:
+            distance: of the points that colliders stop, as the body carries them [m], shape (C, N).
+            away: directions away from the colliders, zero where there are none, shape (C, 3, N).
+            matrices: of the character, shape (J, 3, 4, N).
+        """
+        points = self.lbs(self.carried, None, self.lbs.weights, matrices)
+        return torch.cat([away, ((away * points).sum(1) - distance.clamp_min(-self.reach / 2))[:, None]], dim=1)
+
+    def among(self, body: BodyFrames, distance: Tensor, away: Tensor) -> BodyFrames:
+        """Return F frames of N motions among colliders.
+
+        Args:
+            distance: of the first points, as the body carries them, frame after frame [m], shape (P, F N), P >= C.
+            away: likewise directions away from the colliders, shape (P, 3, F N).
+        """
+        frames, count = len(body.matrices), len(self.carried)
+        matrices = body.matrices.movedim(0, -2).flatten(-2)
+        planes = self.planes(distance[:count], away[:count], matrices).unflatten(-1, (frames, -1))
+        return replace(body, planes=planes.movedim(-2, 0))
+
+    def beside(self, body: BodyFrames, motion: Motion) -> BodyFrames:
+        """Return the frames of one motion among the colliders that it is near to."""
+        count = len(self.carried)
+        if motion.proximity is None or not count:
+            return body
+        vectors = torch.tensor(motion.proximity[:, :count])
+        away, distance = (values.to(body.matrices) for values in nearest_planes(vectors, self.reach))
+        return self.among(body, distance.T, away.permute(1, 2, 0))
+
+    def decoded(self, decoder: Decoder, output: Tensor, body: BodyFrames | None) -> DecodedState:
+        """Return a state by its outputs (N, outputs), under a character in one frame, which only points need."""
+        if body is None or not self.count:
             return DecodedState(output, output.new_zeros(0, 3, output.shape[0]))
+        points = self.placed(decoder, output, body.matrices[0])
+        depth = None if body.planes is None else _depth(points, body.planes[0]).clamp_min(0)
+        return DecodedState(output, points, depth)
+
+    def placed(self, decoder: Decoder, output: Tensor, matrices: Tensor) -> Tensor:
+        """Return the points (M, 3, N) [m] of outputs (N, outputs), under a character (J, 3, 4, N)."""
         activation, values = decoder.split(output)
         rest, shapes = decoder.free_rest()[self.places], decoder.shapes[self.places]
         points = rest[:, :, None] + torch.einsum("mak,kn->man", shapes, activation)
         joints = decoder.matrices(values, matrices)[decoder.used]
         weights = torch.softmax(decoder.logits[self.rows] + decoder.skin_offset[self.places], dim=1)
         affine = decoder.skin.dense(weights, self.rows) @ joints.flatten(1)
-        return DecodedState(output, transform_points(affine.reshape(self.count, *joints.shape[1:]), points))
+        return transform_points(affine.reshape(self.count, *joints.shape[1:]), points)
 
     def seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames | None) -> Tensor:
         """Return what S sees (N, size) from the two states before a frame, the older one first.
@@ -98,7 +169,7 @@ class Feedback(nn.Module):
         carried = None
         if body is not None and self.count:
             before, now = past
-            carried = self.decoded(decoder, 2 * now.output - before.output, body.matrices[0]).points
+            carried = self.placed(decoder, 2 * now.output - before.output, body.matrices[0])
         return self.features(decoder, past, carried, body)
 
     def features(
@@ -120,9 +191,18 @@ class Feedback(nn.Module):
     def _points_seen(self, past: tuple[DecodedState, DecodedState], carried: Tensor, body: BodyFrames) -> Tensor:
         before, now = past
         away = 2 * now.points - before.points - carried - body.bend[0]
+        if body.planes is not None and now.depth is not None:
+            flight, planes = away + carried, body.planes[0]
+            deeper = (_depth(flight, planes) - now.depth).clamp_min(0)
+            away = torch.cat([away[: len(planes)] + planes[:, :3] * deeper[:, None], away[len(planes) :]])
         turn = body.matrices[0, self.hub, :, :3]  # of the root, but for a constant
         own = torch.einsum("ban,mbn->man", turn, away)
         return LIMIT * torch.tanh(own.flatten(0, 1).T / (UNIT * LIMIT))
+
+
+def _depth(points: Tensor, planes: Tensor) -> Tensor:
+    """Return how deep the first of points (M, 3, N) lie below planes (C, 4, N) [m], shape (C, N)."""
+    return planes[:, 3] - (planes[:, :3] * points[: len(planes)]).sum(1)
 
 
 def _proxies(decoder: Decoder, output: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from ...errors import fail
-from ...scene.assets import Deformer, Floats, GarmentPose, Scene, SkinWeights
+from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Scene, SkinWeights
 from ...scene.kinematics import ProxyAxes
 from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
@@ -92,9 +92,14 @@ class GarmentModel(nn.Module):
         """
         return self.integrator(self.stepper, before, now, rest, self.completed(pose, self.described), seen)
 
-    def decoded(self, z: Tensor, matrices: Tensor) -> DecodedState:
-        """Return latents (N, latent) as the feedback looks back on them, under a character (J, 3, 4, N)."""
-        return self.feedback.decoded(self.decoder, self.output(z), matrices)
+    def body_frames(self, motion: Motion, world: Floats) -> BodyFrames:
+        """Return a motion as the feedback needs it, from its joint-to-world transforms (F, J, 4, 4)."""
+        body = BodyFrames.of(world, self.scene.character.skeleton, self.decoder.shapes)
+        return self.feedback.beside(body, motion)
+
+    def decoded(self, z: Tensor, body: BodyFrames) -> DecodedState:
+        """Return latents (N, latent) as the feedback looks back on them, under a character in one frame."""
+        return self.feedback.decoded(self.decoder, self.output(z), body)
 
     def seen(self, past: tuple[DecodedState, DecodedState] | None, body: BodyFrames) -> Tensor:
         """Return what S sees of the cloth in the frame of `body` (N, size), from the two states before it."""
@@ -106,7 +111,7 @@ class GarmentModel(nn.Module):
         """Return what S sees in the last of three frames of `body`, from the latents of the first two."""
         if not self.feedback.size:
             return self.seen(None, body[2:])
-        return self.seen((self.decoded(before, body.matrices[0]), self.decoded(now, body.matrices[1])), body[2:])
+        return self.seen((self.decoded(before, body[:1]), self.decoded(now, body[1:2])), body[2:])
 
     def roll(self, states: list[Tensor], rest: Tensor, pose: Tensor, body: BodyFrames) -> list[Tensor]:
         """Return `states`, each (batch, latent), followed by those of the next frames.
@@ -121,12 +126,12 @@ class GarmentModel(nn.Module):
         features, pose = self.feedback.size, self.completed(pose, self.described)
         precomputed = self.integrator.precompute(self.stepper, rest.flatten(0, 1), pose.flatten(0, 1), features)
         if features and len(rest):
-            past = self.decoded(states[-2], body.matrices[0]), self.decoded(states[-1], body.matrices[1])
+            past = self.decoded(states[-2], body[:1]), self.decoded(states[-1], body[1:2])
         for frame, given in enumerate(zip(*(values.unflatten(0, rest.shape[:2]) for values in precomputed)), 2):
             seen = self.seen(past, body[frame : frame + 1])
             states.append(self.integrator.step(self.stepper, states[-2], states[-1], given, seen))
             if past:
-                past = past[1], self.decoded(states[-1], body.matrices[frame])
+                past = past[1], self.decoded(states[-1], body[frame : frame + 1])
         return states
 
     def pose(self, z: Tensor) -> tuple[Tensor, Tensor]:

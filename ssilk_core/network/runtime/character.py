@@ -29,12 +29,14 @@ class CharacterFrames:
         all_matrices: skinning matrices relative to the root, of the two frames before and these, shape
             (J, 3, 4, F + 2), float32; the first frame stands for those before a motion.
         all_origins: positions of the root in these [m], shape (F + 2, 3).
+        proximity: to colliders in these, as `Motion` has it, shape (F + 2, M, 3); None where none are looked for.
     """
 
     static: NDArray
     rates: NDArray
     all_matrices: NDArray
     all_origins: Floats
+    proximity: Floats | None = None
 
     @property
     def matrices(self) -> NDArray:
@@ -74,8 +76,10 @@ def character_frames(
     static = np.concatenate([near, features.static, down], axis=1, dtype=np.float32)
     rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback
-    matrices, origins = _about_root(world[np.maximum(np.arange(-missing, len(world)), 0)], skeleton)
-    return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins)
+    every = np.maximum(np.arange(-missing, len(world)), 0)
+    matrices, origins = _about_root(world[every], skeleton)
+    met = None if motion.proximity is None else motion.proximity[every]
+    return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins, met)
 
 
 def _into(frames: Floats, gravity: Floats | None) -> Floats:

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.assets import Floats
+from ...scene.assets import Floats, SkinWeights
+from ...scene.kinematics import skin_points
 from ..checkpoint import ModelFile
-from ..feedback import LIMIT, UNIT, feedback_size, feedback_vertices
+from ..feedback import LIMIT, UNIT, feedback_size, feedback_vertices, stopped_points
+from ..proximity import nearest_planes, proximity_reach
 from .decoder import NumpyDecoder
 from .networks import LayerBuffers, as_float32
 from .two_frames import COLUMNS, PointRig, TwoFrames
@@ -31,12 +33,16 @@ class BodyCourse:
         affine: what the character's joints add to each point's matrix, shape (3, 4, F + 2, M).
         turns: rotations of the root, shape (F + 2, 3, 3).
         bend: second differences of the root's position [m], shape (F, 3, 1).
+        normals, offsets: of the planes of colliders (`network.feedback`), shapes (F + 2, 3, C), (F + 2, C); a point x
+            lies offset - normal . x below. C = 0 without any.
     """
 
     anchors: NDArray
     affine: NDArray
     turns: NDArray
     bend: NDArray
+    normals: NDArray
+    offsets: NDArray
 
 
 class ClothPoints:
@@ -51,9 +57,18 @@ class ClothPoints:
         self.rig = PointRig(file.scene, file.parameters, decoder, rows)
         self.count, self.hub = len(rows), file.scene.character.skeleton.hub
         self.size = feedback_size(file.scene, file.config)
+        skin, own = file.scene.lbs_skin, rows[: stopped_points(file.scene, file.config)]
+        self.lbs = SkinWeights(skin.path, skin.indices[own], skin.weights[own])
+        self.carried, self.reach = file.scene.garment.mesh.points[own], proximity_reach(file.scene)
 
-    def course(self, matrices: NDArray, bend: Floats) -> BodyCourse:
-        """Return F frames for the points, from skinning matrices of F + 2 (J, 3, 4, F + 2) and bends (F, 3)."""
+    def course(self, matrices: NDArray, bend: Floats, proximity: Floats | None = None) -> BodyCourse:
+        """Return F frames for the points.
+
+        Args:
+            matrices: skinning matrices of F + 2 frames, shape (J, 3, 4, F + 2).
+            bend: of the F frames, shape (F, 3).
+            proximity: to colliders in the F + 2 frames, shape (F + 2, P, 3); None for none.
+        """
         own = matrices[:, :, COLUMNS].transpose(1, 2, 3, 0)
         turns = matrices[self.hub, :, :3].transpose(2, 0, 1)
         return BodyCourse(
@@ -61,7 +76,17 @@ class ClothPoints:
             as_float32(own @ self.rig.of_character),
             as_float32(turns),
             as_float32(bend[:, :, None]),
+            *map(as_float32, self._planes(matrices, proximity)),
         )
+
+    def _planes(self, matrices: NDArray, proximity: Floats | None) -> tuple[Floats, Floats]:
+        """Return the normals and offsets of a course."""
+        frames, count = matrices.shape[3], len(self.carried)
+        if proximity is None or not count:
+            return np.zeros((frames, 3, 0)), np.zeros((frames, 0))
+        normals, distance = nearest_planes(proximity[:, :count], self.reach)
+        points = skin_points(self.carried, self.lbs, matrices.transpose(3, 0, 1, 2))
+        return normals.swapaxes(1, 2), (normals * points).sum(axis=2) - distance
 
     def proxies(self, outputs: NDArray) -> NDArray:
         """Return the proxies (C P, F) of outputs of D (outputs, F), as S sees them."""
@@ -115,11 +140,25 @@ class SeenCloth:
         np.subtract(away, self.before, away)
         np.subtract(away, carried, away)
         np.subtract(away, self.course.bend[self.frame], away)
+        if self.course.offsets.shape[1]:
+            self._stop(away, away + carried, now)
         np.matmul(away.T, self.course.turns[self.frame + 2], into.reshape(-1, 3))
         np.divide(into, SATURATION, into)
         np.tanh(into, into)
         np.multiply(into, np.float32(LIMIT), into)
         self.before = now
+
+    def _stop(self, away: NDArray, flight: NDArray, now: NDArray) -> None:
+        """Let points (3, M) come no deeper into colliders in free flight than they were in the frame before.
+
+        Args:
+            away: of the flight from where the points are carried, changed in place.
+        """
+        normals, offsets, frame = self.course.normals, self.course.offsets, self.frame + 1
+        count = offsets.shape[1]
+        was = offsets[frame] - (normals[frame] * now[:, :count]).sum(axis=0)
+        deeper = offsets[frame + 1] - (normals[frame + 1] * flight[:, :count]).sum(axis=0) - was.clip(0)
+        away[:, :count] += normals[frame + 1] * deeper.clip(0)
 
     def _points(self, outputs: NDArray, first: int) -> NDArray:
         """Return points of outputs (2, outputs) in two frames of the course, counted with the two before it."""

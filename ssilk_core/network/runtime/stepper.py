@@ -142,7 +142,7 @@ class NumpyStepper(ABC, Generic[Inputs]):
         """Return history, course, outputs and first frame of `StepperInputs`."""
         course, outputs = None, None
         if self.points.size:
-            course = self.points.course(character.all_matrices, character.bend)
+            course = self.points.course(character.all_matrices, character.bend, character.proximity)
             outputs = np.empty((len(rest), len(self.points.decoder.layers[-1].bias)), np.float32)
         history = np.empty((len(rest) + 2, 2, rest.shape[1]), dtype=np.float32)
         history[:-2, 0] = rest

@@ -14,7 +14,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import ModelFile, model_file
 from ssilk_core.network.descriptors import place_of_hub, pose_features
 from ssilk_core.network.model.descriptors import proximity_length
-from ssilk_core.network.parameters import parameter_shapes, seeing_colliders
+from ssilk_core.network.parameters import parameter_shapes, seeing_more
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
 from ssilk_core.network.settings import PROXIMITY_POINTS, ModelConfig
 from ssilk_core.physics.world.felt import felt_proximity
@@ -121,7 +121,8 @@ def test_the_body_stays_outside_and_the_share_without_has_nothing_near(scene, se
     found = draws.draw(frames, gravity)
     absent = found.radius < -LARGE
     assert 0.3 < absent.all(dim=0).float().mean() < 0.5
-    assert (~absent).all(dim=0).float().mean() == pytest.approx(0.6 * 0.25, abs=0.07)
+    # Of obstacles beside the garment some have no room.
+    assert 0.5 * 0.6 * 0.25 < (~absent).all(dim=0).float().mean() < 1.2 * 0.6 * 0.25
     body = scene.character.merged_body()
     for number in range(0, 300, 7):
         for frame in frames[:, number].tolist():
@@ -166,7 +167,8 @@ def test_the_network_sees_in_training_what_it_sees_of_the_same_collider_in_a_sho
     bank = build_bank([motion], skeleton, JOINTS, 30.0, CPU)
     start = motion_transforms(motion, skeleton.parents)[0, skeleton.hub, :3, 3]  # where the bank has its origin
     own = one_box(place[:3, :3], place[:3, 3] - start, (0.25, 0.2, 0.15), 0.0).repeated(12)
-    trained = drawer(scene, seeing, bank).seen(own, torch.arange(12))
+    draws, frames = drawer(scene, seeing, bank), torch.arange(12)
+    trained = draws.seen(draws.near(own, frames), frames)
     assert np.abs(seen).max() > 0.5
     np.testing.assert_allclose(trained.numpy(), seen, atol=2e-4)
     assert felt_proximity(ShotWorld(30.0), motion, scene, rows, reach, lambda d, n: n) is None
@@ -216,15 +218,15 @@ def test_proximity_is_nothing_from_the_reach_on_and_points_out_of_what_holds_it(
 
 def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model) -> None:
     before = toy_model(scene)
-    after = toy_model(scene, proximity_points=POINTS)
+    after = toy_model(scene, proximity_points=POINTS, feedback_points=before.config.feedback_points + 2)
     kept = {name: value.numpy() for name, value in before.state_dict().items()}
-    more = seeing_colliders(kept, before.config, after.proximity)
+    more = seeing_more(kept, scene, before.config, after.config)
     assert {name: value.shape for name, value in more.items()} == parameter_shapes(scene, after.config, JOINTS)
     after.load_state_dict({name: torch.tensor(value) for name, value in more.items()})
     static = torch.randn(4, before.initialiser[0].in_features)
     pose = torch.cat([static, torch.randn(4, before.described - static.shape[1])], dim=1)
-    rest, seen = before.initial(static), torch.randn(4, before.feedback.size)
-    blind = before.step(rest, rest + 0.1, rest, pose, seen)
+    rest, seen = before.initial(static), torch.randn(4, after.feedback.size)
+    blind = before.step(rest, rest + 0.1, rest, pose, seen[:, : before.feedback.size])
     for near in (torch.zeros(4, after.proximity), torch.rand(4, after.proximity)):
         given = torch.cat([near, static], dim=1), torch.cat([near, pose], dim=1)
         torch.testing.assert_close(after.initial(given[0]), rest)
