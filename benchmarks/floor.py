@@ -26,8 +26,8 @@ from ssilk_usd.stages import demo_body_path
 
 from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.events import TextReporter
-from ssilk_core.network.proximity import seen_proximity
 from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime.sight import seen_proximity
 from ssilk_core.scene.assets import Collider, Floats, Motion, Scene, ShotWorld
 from ssilk_core.scene.kinematics import motion_transforms, resample, skin_points, skinning_matrices
 
@@ -69,9 +69,9 @@ def floor_world(motion: Motion, height: float) -> ShotWorld:
     return ShotWorld(motion.fps, (Collider("the floor", faces, corners[None], np.eye(4)[None], whole),))
 
 
-def seeing(subject: Subject, motion: Motion, world: ShotWorld) -> Motion:
+def seeing(player: Player, motion: Motion, world: ShotWorld) -> Motion:
     """Return a motion whose garment sees the colliders of a world."""
-    return replace(motion, proximity=seen_proximity(world, motion, subject.scene, subject.file.config))
+    return replace(motion, proximity=seen_proximity(world, motion, player))
 
 
 def played(player: Player, motion: Motion) -> Floats:
@@ -89,7 +89,7 @@ def sunk(options: argparse.Namespace, subject: Subject) -> None:
             continue
         motion = clip_of(options, subject, entry["clip"])
         floor = floor_of(subject.scene, motion)
-        for name, seen in ("sees it", seeing(subject, motion, floor_world(motion, floor))), ("does not", motion):
+        for name, seen in ("sees it", seeing(player, motion, floor_world(motion, floor))), ("does not", motion):
             heights = played(player, seen)[..., 1] - floor
             every[name].append(heights)
             rows.append([entry["clip"], name, *_cells(Sunk.of(heights))])
@@ -99,12 +99,12 @@ def sunk(options: argparse.Namespace, subject: Subject) -> None:
 
 def look(options: argparse.Namespace, subject: Subject) -> None:
     """Draw simulator, network and linear blend skinning in one clip over its floor."""
-    motion, report = clip_of(options, subject, options.clip), TextReporter()
+    motion, report, player = clip_of(options, subject, options.clip), TextReporter(), Player(subject.file)
     world, skeleton = floor_world(motion, floor_of(subject.scene, motion)), subject.scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     rows = {
         "simulator": simulated_worlds(options.simulation, subject, motion, [world], report)[0],
-        "SSILK": played(Player(subject.file), seeing(subject, motion, world)),
+        "SSILK": played(player, seeing(player, motion, world)),
         "plain skinning": skin_points(subject.scene.garment.mesh.points, subject.scene.lbs_skin, matrices),
     }
     draw_rows(rows, subject.dressed, motion, options, report)

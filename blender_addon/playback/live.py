@@ -96,7 +96,7 @@ class Live:
         self.free, self.hold, self.world = None, 1, None
         self.colliders: MetColliders | None = None
         self._sight: ColliderSight | None = None
-        self._near: np.ndarray | None = None  # how near colliders are, (F, M, 3); None where there are none
+        self._near: np.ndarray | None = None  # how near colliders are, (F, M, 5); None where there are none
         self._frames = range(0)
         self.done: float | None = None
         self.stale = self.model_only = False
@@ -392,7 +392,7 @@ class Live:
     def _looking(
         self, trained: TrainedGarment, placed: np.ndarray, sight: ColliderSight | None
     ) -> Generator[float, None, np.ndarray | None]:
-        """Return how near colliders are to the garment in each frame, (F, M, 3); None where there are none."""
+        """Return how near colliders are to the garment in each frame, (F, M, 5); None where there are none."""
         if sight is None:
             return None
         motion, found = self._motion(trained, placed), []
@@ -420,7 +420,7 @@ class Live:
         """Return joints of the armature to the world, shape (F, J, 4, 4), as a motion of the model's skeleton.
 
         Args:
-            near: how near colliders are, shape (F, M, 3).
+            near: how near colliders are, shape (F, M, 5).
         """
         player = trained.player
         motion = motion_of(placed[:, trained.own], player.skeleton.parents, "the timeline")
@@ -505,7 +505,7 @@ class Live:
     def _near_again(
         self, trained: TrainedGarment, near: np.ndarray | None, frames: np.ndarray, sight: ColliderSight | None
     ) -> np.ndarray | None:
-        """Return how near colliders are, (F, M, 3), where the armature differs in some frames by now."""
+        """Return how near colliders are, (F, M, 5), where the armature differs in some frames by now."""
         if near is None or sight is None:
             return None
         near = near.copy()

@@ -11,7 +11,6 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,8 @@ import numpy as np
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model
-from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
 from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime.sight import collider_sight
 from ssilk_core.physics.world.felt import ColliderSight
 from ssilk_core.physics.world.surface import Search
 from ssilk_core.scene.assets import ShotWorld
@@ -298,9 +297,7 @@ class TrainedGarment:
 
     def sight(self, world: ShotWorld, search: Search) -> ColliderSight:
         """Return what the network sees of the colliders around it; `search` finds nearest points on triangles."""
-        scene, reach = self.player.file.scene, proximity_reach(self.player.file.scene)
-        rows = proximity_vertices(scene, self.player.file.config)
-        return ColliderSight(world, scene, rows, reach, partial(proximity, reach=reach), search)
+        return collider_sight(self.player, world, search)
 
     @property
     def proxies(self) -> np.ndarray:

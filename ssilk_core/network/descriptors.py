@@ -27,6 +27,7 @@ import numpy as np
 from ..physics.constants import GRAVITY
 from ..scene.assets import Floats, Motion, Skeleton
 from ..scene.kinematics import matrix_from_quaternion, motion_transforms
+from .proximity import proximity_vectors
 
 RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
 VECTORS = (
@@ -111,7 +112,9 @@ def pose_features(
     local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
     static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
     gravity = None if motion.gravity is None else seen_gravity(motion.gravity)
-    near = None if motion.proximity is None else (motion.proximity @ root).reshape(len(local), -1)
+    near = None
+    if motion.proximity is not None:
+        near = (proximity_vectors(motion.proximity) @ root).reshape(len(local), -1)
     if kind == "absolute":
         axes, places = six_d(root), world[:, centre, :3, 3]
         past = [_past(static, steps) for steps in (1, 2)]

@@ -1,29 +1,31 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the network sees of colliders: how near they are to points of the garment, as its body carries them.
+"""What the network knows of colliders: the nearest one to each of a few points of the cloth.
 
-Each of a few points, spread over the cloth that is not pinned, is carried by linear blend skinning. With d the
-distance from it to the nearest collider, negative inside, n the direction away from that, and r the reach,
+The points are spread over the cloth that is not pinned, where it would rest in the pose without colliders: in P's
+state, decoded. With X such a point, d the distance from it to the nearest collider, negative inside, and n the
+direction away from that, `Motion.proximity` holds n, d / D and c = n . (X - o) - d [m], with the garment's diagonal D
+and the root's position o. So a point x about the root is c - n . x below the plane of the collider there.
 
-    p = n max(1 - d / r, 0)^2 outside,    p = n min(1 - 2 d / r, 2) inside
+P and S see, in the root's frame as they see gravity in those of joints,
 
-is zero where nothing is near, has length one where the body would carry the point onto a collider, and is smooth.
-`Motion.proximity` holds these vectors in the world; the network sees them in the root's frame, as it sees gravity in
-those of joints. They depend on the pose alone, so that P knows where cloth comes to rest, a garment at rest stays
-there, and a step costs what it costs without. The reach is the garment's diagonal: the hem of a cape may hang so far
-below the shoulders, wherever the body would carry it.
+    p = n max(1 - d / r, 0)^2 outside,    p = n min(1 - 2 d / D, 2) inside
+
+with r a tenth of D. So what the cloth would not touch at rest does not change where it rests. Colliders are looked
+for up to D: they also stop what S sees of moving cloth (`network.feedback`), which may be far from rest. All this
+depends on the pose alone, so that P knows where cloth comes to rest, and a garment at rest stays there.
 """
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
-from ..scene.assets import PINNED, Floats, Ints, Motion, Scene, ShotWorld
+from ..scene.assets import PINNED, Floats, Ints, Scene
 from .feedback import spread_vertices
 from .settings import ModelConfig
 
-MOST = 2.0  # length of a vector, half a reach inside a collider
+MOST = 2.0  # length of a vector, half a diagonal inside a collider
+PLANE = (0, 1, 2, 4)  # columns n and c of proximity
+NEAR = 0.1  # of the diagonal, from which on colliders do not change where cloth rests
 
 
 def proximity_vertices(scene: Scene, config: ModelConfig) -> Ints:
@@ -46,32 +48,23 @@ def proximity_reach(scene: Scene) -> float:
     return scene.garment.mesh.diagonal
 
 
-def proximity(distance: Floats, normal: Floats, reach: float) -> Floats:
-    """Return vectors (..., 3) from distances (...,) [m] and directions away from colliders (..., 3)."""
-    share = 1 - distance / reach
-    length = np.where(distance > 0, np.maximum(share, 0) ** 2, np.minimum(2 * share - 1, MOST))
-    return normal * length[..., None]
-
-
-def nearest_planes(vectors: Floats, reach: float) -> tuple[Floats, Floats]:
-    """Return directions away from colliders (..., 3) and distances (...,) [m] from vectors (..., 3) of `proximity`.
-
-    Where nothing is near the direction is zero, and the distance that of the reach. No point is deeper inside than
-    half the reach.
-    """
-    length = np.linalg.norm(vectors, axis=-1)
-    direction = vectors / np.maximum(length, np.finfo(float).tiny)[..., None]
-    return direction, reach * np.where(length < 1, 1 - np.sqrt(length), (1 - length) / 2)
-
-
-def seen_proximity(world: ShotWorld | None, motion: Motion, scene: Scene, config: ModelConfig) -> Floats | None:
-    """Return what a network sees of the colliders of a shot in each frame of a motion, as `Motion.proximity`.
+def proximity(points: Floats, distance: Floats, normal: Floats, origin: Floats, reach: float) -> Floats:
+    """Return the proximity of one frame (M, 5), as `Motion` holds it.
 
     Args:
-        world: whose time runs from the first frame of the motion; None for none.
+        points: at which colliders are seen [m], shape (M, 3).
+        distance: to the nearest one [m], shape (M,); infinite where none was found.
+        normal: directions away from it, shape (M, 3); zero where none was found.
+        origin: position of the root [m], shape (3,).
+        reach: of `proximity_reach`.
     """
-    from ..physics.world.felt import felt_proximity
+    distance = np.minimum(distance, reach)
+    height = (normal * (points - origin)).sum(axis=1) - distance
+    return np.concatenate([normal, distance[:, None] / reach, height[:, None]], axis=1)
 
-    reach = proximity_reach(scene)
-    rows = proximity_vertices(scene, config)
-    return felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
+
+def proximity_vectors(values: Floats) -> Floats:
+    """Return the vectors (..., 3) that the network sees, from proximity (..., 5)."""
+    share = values[..., 3:4]
+    length = np.where(share > 0, np.maximum(1 - share / NEAR, 0) ** 2, np.minimum(1 - 2 * share, MOST))
+    return values[..., :3] * length

@@ -6,6 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..network.model.feedback import BodyFrames
 from ..network.model.network import GarmentModel
 from ..physics.collision import CollisionBody, Contacts, signed_distance_to_planes
 from ..physics.collision.contacts import no_planes
@@ -19,7 +20,7 @@ from .inner_garments import Beneath, InnerGarments
 from .latent_regularization import LATENT_SCALE, latent_distortion
 from .motion_bank import MotionBank
 from .newton_distance import NewtonDistance
-from .obstacles import ObstacleDrawer, Obstacles
+from .obstacles import Near, ObstacleDrawer, Obstacles
 from .windows import WindowSampler
 
 Terms = dict[str, Tensor]
@@ -151,16 +152,16 @@ class Objective:
             beneath: inner garments in these poses, where there are any.
             obstacles: likewise what else is there.
         """
-        z = self.model.initial(self._static_descriptor(frames, down, self._near(frames, obstacles)))
+        z = self.model.initial(self._static_descriptor(frames, down, self._near(frames, down, obstacles)))
         character = self.bank.character(frames)
         x = self._vertices(z, character, 0)
         return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles)
 
-    def _near(self, frames: Tensor, obstacles: Obstacles | None) -> tuple[Tensor, Tensor] | None:
-        """Return what is near in frames (N,), as `ObstacleDrawer.near` does; None without obstacles."""
-        return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames)
+    def _near(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None) -> Near | None:
+        """Return what is near in frames (N,) under gravity and wind (N, 3) [g]; None without obstacles."""
+        return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames, down)
 
-    def _static_descriptor(self, frames: Tensor, down: Tensor, near: tuple[Tensor, Tensor] | None) -> Tensor:
+    def _static_descriptor(self, frames: Tensor, down: Tensor, near: Near | None) -> Tensor:
         """Return static descriptors (N, S) of frames (N,), with the proximity of obstacles where there are any."""
         static = self.bank.static_descriptor(frames, down)
         if near is None or self.drawer is None:
@@ -196,7 +197,7 @@ class Objective:
         batch = len(sampler.first)
         times = sampler.frames().reshape(-1)
         down = sampler.gravity().flatten(0, 1)
-        near = self._near(times, sampler.obstacles and sampler.obstacles.repeated(length))
+        near = self._near(times, down, sampler.obstacles and sampler.obstacles.repeated(length))
         static = self._static_descriptor(times, down, near)
         heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
         pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
@@ -206,7 +207,8 @@ class Objective:
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         body = bank.body(times.reshape(length, batch))
         if near is not None:
-            body = model.feedback.among(body, *near)
+            planes = near.planes(model.feedback.stopped).unflatten(-1, (length, batch)).movedim(-2, 0)
+            body = BodyFrames(body.matrices, body.bend, planes)
         with torch.set_grad_enabled(sampler.config.bptt):
             z = model.roll([*(start + noise)], target[2:], pose[2:], body)
         rolled = torch.cat(z[2:])
@@ -217,7 +219,7 @@ class Objective:
             with torch.no_grad():
                 seen = model.seen_from(before, now, body.triples())
             rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        single_near = self._near(frames, single_obstacles)
+        single_near = self._near(frames, single_down, single_obstacles)
         quiet = model.initial(self._static_descriptor(frames, single_down, single_near))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))

@@ -9,7 +9,7 @@ large that it has one face. Their distances have closed forms, of which those ou
 Bodies do not pass through floors and chairs, so that an obstacle is where the body does not come in the frames that
 it is drawn for. Where it would, one beside the garment is moved away, and then r shrinks until it does not, below
 zero at need. The same is done in each window that continues another: an obstacle that stands in the way draws back.
-Some obstacles are kept off the garment, too, as its body carries it: what is near is not always touched.
+Some obstacles are kept off the garment, too, as it would rest: what is near is not always touched.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from ..network.feedback import spread_rows
 from ..network.model.descriptors import proximity_features, proximity_length
-from ..network.proximity import proximity_reach, proximity_vertices
-from ..network.settings import ModelConfig
+from ..network.model.network import GarmentModel
+from ..network.proximity import proximity_reach
 from ..physics.skinning import Skinning
-from ..scene.assets import Floats, Ints, Scene, SkinWeights
+from ..scene.assets import SkinWeights
 from .motion_bank import MotionBank
 
 BODY_POINTS = 256  # spread over the body, by which it is kept out of obstacles
@@ -111,38 +111,58 @@ class Obstacles:
         return self._signed(length, deepest, box), away
 
 
+@dataclass(frozen=True, eq=False)
+class Near:
+    """The nearest obstacle to each of M points in N frames.
+
+    Attributes:
+        points: where the cloth would rest without obstacles [m], shape (M, 3, N).
+        distance: from them [m], shape (M, N); away: directions away from obstacles, shape (M, 3, N).
+    """
+
+    points: Tensor
+    distance: Tensor
+    away: Tensor
+
+    def planes(self, count: int) -> Tensor:
+        """Return the planes (count, 4, N) at the first points, as `network.model.feedback.BodyFrames` has them."""
+        away = self.away[:count]
+        height = (away * self.points[:count]).sum(1) - self.distance[:count]
+        return torch.cat([away, height[:, None]], dim=1)
+
+
 class ObstacleDrawer:
     """Draws obstacles around the characters of a bank, and tells what the network sees of them.
 
     Args:
-        scene: character and garment; config: of the network.
+        model: of the garment, as it is trained.
         hub: the place of the skeleton's hub among the joints of the descriptors.
         share: of windows and poses that have any.
     """
 
     def __init__(
-        self, scene: Scene, config: ModelConfig, bank: MotionBank, hub: int, share: float, generator: torch.Generator
+        self, model: GarmentModel, bank: MotionBank, hub: int, share: float, generator: torch.Generator
     ) -> None:
-        device = bank.static.device
-        body, mesh, skin = scene.character.merged_body(), scene.garment.mesh, scene.lbs_skin
-        self.bank, self.hub, self.share, self.generator = bank, hub, share, generator
-        self.reach = proximity_reach(scene)
+        body = model.scene.character.merged_body()
+        self.model, self.bank, self.hub, self.share, self.generator = model, bank, hub, share, generator
+        self.reach = proximity_reach(model.scene)
         rows = spread_rows(body.mesh.points, BODY_POINTS)
-        self._body = _Carried(body.mesh.points, body.skin, rows, device)
-        self._seen = _Carried(mesh.points, skin, proximity_vertices(scene, config), device)
+        skin = SkinWeights(body.skin.path, body.skin.indices[rows], body.skin.weights[rows])
+        self._skin = Skinning(skin).to(bank.static.device)
+        self._body = torch.tensor(body.mesh.points[rows], dtype=torch.float32, device=bank.static.device)
 
-    def near(self, obstacles: Obstacles, frames: Tensor) -> tuple[Tensor, Tensor]:
+    def near(self, obstacles: Obstacles, frames: Tensor, gravity: Tensor) -> Near:
         """Return how near obstacles are in frames (N,) to the points that see them.
 
-        Returns:
-            Distances [m], shape (M, N), and directions away, shape (M, 3, N).
+        Args:
+            gravity: and wind [g], shape (N, 3).
         """
-        return obstacles.nearest(self._seen(self.bank.character(frames)))
+        points = self._resting(frames, gravity)
+        return Near(points, *obstacles.nearest(points))
 
-    def seen(self, near: tuple[Tensor, Tensor], frames: Tensor) -> Tensor:
+    def seen(self, near: Near, frames: Tensor) -> Tensor:
         """Return features of proximity (N, 3 M) of what is near in frames (N,), as `network.proximity` has them."""
-        distance, away = near
-        vectors = away * proximity_length(distance, self.reach)[:, None]
+        vectors = near.away * proximity_length(near.distance / self.reach)[:, None]
         return proximity_features(vectors.permute(2, 0, 1), self.bank.down[frames, self.hub])
 
     def draw(self, frames: Tensor, gravity: Tensor) -> Obstacles:
@@ -156,7 +176,7 @@ class ObstacleDrawer:
         chance = self._uniform(4, count)
         floor = (chance[0] < self.share) & (chance[1] < FLOORS + BOTH)
         other = (chance[0] < self.share) & (chance[1] > FLOORS)
-        points = self._seen(self.bank.character(middle))
+        points = self._resting(middle, gravity)
         # A floor is at the body or further away, and others where they were put unless the body or cloth is there.
         gap, beside = self._uniform(2, count) ** 2 * FURTHEST * self.reach
         gap = torch.where(chance[2] < LYING, torch.zeros_like(gap), gap)
@@ -182,9 +202,14 @@ class ObstacleDrawer:
         drawn = Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius - inside)
         return drawn.without_empty()
 
+    def _resting(self, frames: Tensor, gravity: Tensor) -> Tensor:
+        """Return the points that see obstacles (M, 3, N), where they would rest without in frames (N,)."""
+        return self.model.resting(self.bank.static_descriptor(frames, gravity), self.bank.character(frames))
+
     def _clearance(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
         """Return how far the body is outside of each obstacle in its frames (T, N), at least, [m], shape (K, N)."""
-        points = self._body(self.bank.character(frames.flatten()))
+        with torch.no_grad():
+            points = self._skin(self._body, None, self._skin.weights, self.bank.character(frames.flatten()))
         repeated = obstacles.repeated(len(frames))
         least = [repeated.distance(points, box).amin(dim=0) for box in range(len(obstacles.radius))]
         return torch.stack(least).unflatten(1, frames.shape).amin(dim=1) - SKIN
@@ -223,19 +248,6 @@ class ObstacleDrawer:
 
     def _normal(self, *shape: int) -> Tensor:
         return torch.randn(*shape, generator=self.generator, device=self.bank.static.device)
-
-
-class _Carried:
-    """Some vertices of a mesh, carried by linear blend skinning."""
-
-    def __init__(self, points: Floats, skin: SkinWeights, rows: Ints, device: torch.device) -> None:
-        self._skin = Skinning(SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])).to(device)
-        self._rest = torch.tensor(points[rows], dtype=torch.float32, device=device)
-
-    def __call__(self, character: Tensor) -> Tensor:
-        """Return positions (M, 3, N) [m] under skinning matrices (J, 3, 4, N)."""
-        with torch.no_grad():
-            return self._skin(self._rest, None, self._skin.weights, character)
 
 
 def _frames_along(first: Tensor, other: Tensor) -> Tensor:

@@ -89,9 +89,8 @@ class TrainingParts:
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         drawer = None
         if self.model.proximity and own.collider_fraction:
-            scene, joints = self.model.scene, self.model.joints
-            hub = place_of_hub(scene.character.skeleton, joints)
-            drawer = ObstacleDrawer(scene, self.model.config, self.bank, hub, own.collider_fraction, generator)
+            hub = place_of_hub(self.model.scene.character.skeleton, self.model.joints)
+            drawer = ObstacleDrawer(self.model, self.bank, hub, own.collider_fraction, generator)
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator, drawer)
         surface = config.closest_point == "triangles"
         objective = Objective(

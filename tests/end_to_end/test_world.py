@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,10 +18,10 @@ from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.world import world_of
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.parameters import seeing_more
-from ssilk_core.network.proximity import proximity, proximity_reach, proximity_vertices
+from ssilk_core.network.proximity import proximity
 from ssilk_core.network.runtime import Player
-from ssilk_core.physics.world.felt import felt_proximity
-from ssilk_core.scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices
+from ssilk_core.network.runtime.sight import RestingPoints, seen_proximity
+from ssilk_core.scene.kinematics import hub_places, motion_transforms
 
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
 
@@ -134,13 +133,13 @@ def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says
         read_motion("floored.usda", player.skeleton),
         load_rollout(BakeRequest(model="model.safetensors", stage="rigged.usda", motion="plain.usda")).deformer.scene,
     )
-    rows, reach = proximity_vertices(scene, player.file.config), proximity_reach(scene)
-    matrices = skinning_matrices(motion_transforms(motion, player.skeleton.parents), player.skeleton.bind_transforms)
-    skin = scene.lbs_skin
-    own = replace(skin, indices=skin.indices[rows], weights=skin.weights[rows])
-    above = skin_points(scene.garment.mesh.points[rows], own, matrices)[..., 1] - FLOOR
-    seen = proximity(above, np.tile([0.0, 1.0, 0.0], (*above.shape, 1)), reach)
-    playback = player.play(replace(motion, proximity=seen))
+    # Where each point of P's state for the pose alone is, and the floor beneath it.
+    points, reach = RestingPoints(player)(motion), scene.garment.mesh.diagonal
+    roots = motion_transforms(motion, player.skeleton.parents)[:, player.skeleton.hub, :3, 3]
+    up, above = np.tile([0.0, 1.0, 0.0], (points.shape[1], 1)), points[..., 1] - FLOOR
+    assert above.max() < reach
+    seen = [proximity(own, high, up, root, reach) for own, high, root in zip(points, above, roots)]
+    playback = player.play(replace(motion, proximity=np.stack(seen)))
     expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
     np.testing.assert_allclose(points_of("floored.usdc"), expected, atol=1e-5)
     assert np.abs(points_of("plain.usdc") - expected).max() > 1e-3
@@ -207,8 +206,7 @@ def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
     player, motion = Player.load("seeing.safetensors"), read_motion("floored.usda", file.scene.character.skeleton)
     scene = player.file.scene
     world = world_of("floored.usda", "rigged.usda", scene, motion, None)
-    rows, reach = proximity_vertices(scene, config), proximity_reach(scene)
-    near = felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
+    near = seen_proximity(world, motion, player)
     assert len(world.colliders) == 1 and np.abs(near).max() > 0.5
     for name, felt in ("seen.usdc", near), ("blind.usdc", None):
         playback = player.play(replace(motion, proximity=felt))

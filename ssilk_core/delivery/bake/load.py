@@ -163,14 +163,16 @@ class LoadedGarment:
         sight, scene = Sight.of(self.file, solved=request.latent_iterations > 0), self.deformer.scene
         if not (sight.pull or sight.colliders):
             return motion
-        from ...network.proximity import seen_proximity
+        from ...network.runtime.garment import NumpyGarment
+        from ...network.runtime.sight import seen_proximity
         from ...physics.world.felt import felt_gravity
 
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
         world = world_of(request.motion, request.stage, scene, motion, asked, colliders=sight.colliders)
         gravity = felt_gravity(world, motion, scene, self.file.fabric) if sight.pull else None
-        near = seen_proximity(world, motion, scene, self.file.config)
-        return motion if gravity is near is None else replace(motion, gravity=gravity, proximity=near)
+        motion = motion if gravity is None else replace(motion, gravity=gravity)
+        near = seen_proximity(world, motion, NumpyGarment(self.file)) if sight.colliders else None
+        return motion if near is None else replace(motion, proximity=near)
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""

@@ -38,7 +38,7 @@ class NetworkSteps:
     @torch.no_grad()
     def __init__(self, model: GarmentModel) -> None:
         self.model, parameter = model, next(model.parameters())
-        self.dtype, rows = parameter.dtype, model.feedback.rows
+        self.dtype, rows = parameter.dtype, model.feedback.points.rows
         self._points = FreeDecoder(model, rows, self.dtype) if len(rows) else None
 
     @torch.no_grad()

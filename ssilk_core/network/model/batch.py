@@ -79,7 +79,7 @@ def _span_inputs(model: GarmentModel, motion: Motion, met: bool) -> tuple[Tensor
     origins = torch.as_tensor(world[:, skeleton.hub, :3, 3].copy()).to(parameter.device)
     planes = body.planes
     if planes is None:
-        planes = parameter.new_zeros(motion.frame_count, met * len(model.feedback.carried), 4, 1)
+        planes = parameter.new_zeros(motion.frame_count, met * model.feedback.stopped, 4, 1)
     return (
         model.initial(static),
         model.completed(pose, model.described),

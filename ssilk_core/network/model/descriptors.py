@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...scene.assets import Floats
 from ..descriptors import VECTORS, PoseFeatures
-from ..proximity import MOST
+from ..proximity import MOST, NEAR
 
 DOWN = (0.0, -1.0, 0.0)  # where gravity points, but in training
 
@@ -52,17 +52,9 @@ def gravity_features(down: Tensor, gravity: Tensor) -> Tensor:
     return torch.einsum("njab,nb->nja", down, gravity).flatten(1)
 
 
-def proximity_length(distance: Tensor, reach: float) -> Tensor:
-    """Return the lengths of `network.proximity` at distances [m]."""
-    share = 1 - distance / reach
-    return torch.where(distance > 0, share.clamp_min(0) ** 2, (2 * share - 1).clamp_max(MOST))
-
-
-def nearest_planes(vectors: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """Return `network.proximity.nearest_planes` of vectors (..., 3): directions (..., 3) and distances (...,) [m]."""
-    length = torch.linalg.vector_norm(vectors, dim=-1)
-    direction = vectors / length.clamp_min(torch.finfo(length.dtype).tiny)[..., None]
-    return direction, reach * torch.where(length < 1, 1 - length.sqrt(), (1 - length) / 2)
+def proximity_length(share: Tensor) -> Tensor:
+    """Return the lengths of `network.proximity` at distances that are shares of the garment's diagonal."""
+    return torch.where(share > 0, (1 - share / NEAR).clamp_min(0) ** 2, (1 - 2 * share).clamp_max(MOST))
 
 
 def proximity_features(vectors: Tensor, down: Tensor) -> Tensor:

@@ -3,19 +3,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from ...physics.skinning import Skinning, transform_points
-from ...scene.assets import Floats, Motion, Scene, Skeleton, SkinWeights
+from ...physics.skinning import transform_points
+from ...scene.assets import Floats, Ints, Scene, Skeleton
 from ...scene.kinematics import skinning_matrices
 from ..feedback import LIMIT, UNIT, bends, feedback_size, feedback_vertices, stopped_points
-from ..proximity import proximity_reach
 from ..settings import ModelConfig
 from .decoder import Decoder, transform_of
-from .descriptors import nearest_planes
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +23,8 @@ class BodyFrames:
     Attributes:
         matrices: skinning matrices, whose positions are relative to an origin of each frame, (F, J, 3, 4, N).
         bend: second difference o_t - 2 o_{t-1} + o_{t-2} of these origins [m], (F, 3, N); unused in the first two.
-        planes: colliders that stop points, as `Feedback.planes` returns them; None where there are none.
+        planes: of the colliders at the first C points: directions away n, then c [m], so that a point x about the
+            origin is c - n . x below, (F, C, 4, N); None where there are none.
     """
 
     matrices: Tensor
@@ -76,6 +75,33 @@ class DecodedState:
     depth: Tensor | None = None
 
 
+class DecodedPoints(nn.Module):
+    """Decodes a few vertices of a garment.
+
+    Args:
+        rows: the vertices (M,), none of which is pinned; decoder: of the garment.
+    """
+
+    rows: Tensor
+    places: Tensor
+
+    def __init__(self, rows: Ints, decoder: Decoder) -> None:
+        super().__init__()
+        self.register_buffer("rows", torch.as_tensor(rows), persistent=False)
+        # Of each vertex among those that are not pinned, which alone have blendshapes.
+        self.register_buffer("places", torch.searchsorted(decoder.free, self.rows), persistent=False)
+
+    def forward(self, decoder: Decoder, output: Tensor, matrices: Tensor) -> Tensor:
+        """Return positions (M, 3, N) [m] of outputs of D (N, outputs), under a character (J, 3, 4, N)."""
+        activation, values = decoder.split(output)
+        rest, shapes = decoder.free_rest()[self.places], decoder.shapes[self.places]
+        points = rest[:, :, None] + torch.einsum("mak,kn->man", shapes, activation)
+        joints = decoder.matrices(values, matrices)[decoder.used]
+        weights = torch.softmax(decoder.logits[self.rows] + decoder.skin_offset[self.places], dim=1)
+        affine = decoder.skin.dense(weights, self.rows) @ joints.flatten(1)
+        return transform_points(affine.reshape(len(self.rows), *joints.shape[1:]), points)
+
+
 class Feedback(nn.Module):
     """Decodes the points and the proxies that S sees.
 
@@ -84,81 +110,28 @@ class Feedback(nn.Module):
 
     Attributes:
         size: number of features of both.
+        points: those that S sees.
+        stopped: how many of these colliders stop.
     """
-
-    rows: Tensor
-    places: Tensor
-    carried: Tensor
 
     def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
         super().__init__()
-        self.hub = scene.character.skeleton.hub
-        self.size, rows = feedback_size(scene, config), torch.as_tensor(feedback_vertices(scene, config))
-        self.register_buffer("rows", rows, persistent=False)
-        # Of each chosen vertex among those that are not pinned, which alone have blendshapes.
-        self.register_buffer("places", torch.searchsorted(decoder.free, rows), persistent=False)
-        skin, own = scene.lbs_skin, rows[: stopped_points(scene, config)].numpy()
-        self.lbs = Skinning(SkinWeights(skin.path, skin.indices[own], skin.weights[own]))
-        self.reach = proximity_reach(scene)
-        carried = torch.tensor(scene.garment.mesh.points[own], dtype=torch.float32)
-        self.register_buffer("carried", carried, persistent=False)
+        self.hub, self.size = scene.character.skeleton.hub, feedback_size(scene, config)
+        self.points = DecodedPoints(feedback_vertices(scene, config), decoder)
+        self.stopped = stopped_points(scene, config)
 
     @property
     def count(self) -> int:
         """Points that S sees."""
-        return len(self.rows)
-
-    def planes(self, distance: Tensor, away: Tensor, matrices: Tensor) -> Tensor:
-        """Return the planes (C, 4, N) of the nearest colliders in N frames: normals n, then offsets c [m].
-
-        A point x about the frame's origin lies c - n . x below its plane.
-
-        Args:
-            distance: of the points that colliders stop, as the body carries them [m], shape (C, N).
-            away: directions away from the colliders, zero where there are none, shape (C, 3, N).
-            matrices: of the character, shape (J, 3, 4, N).
-        """
-        points = self.lbs(self.carried, None, self.lbs.weights, matrices)
-        return torch.cat([away, ((away * points).sum(1) - distance.clamp_min(-self.reach / 2))[:, None]], dim=1)
-
-    def among(self, body: BodyFrames, distance: Tensor, away: Tensor) -> BodyFrames:
-        """Return F frames of N motions among colliders.
-
-        Args:
-            distance: of the first points, as the body carries them, frame after frame [m], shape (P, F N), P >= C.
-            away: likewise directions away from the colliders, shape (P, 3, F N).
-        """
-        frames, count = len(body.matrices), len(self.carried)
-        matrices = body.matrices.movedim(0, -2).flatten(-2)
-        planes = self.planes(distance[:count], away[:count], matrices).unflatten(-1, (frames, -1))
-        return replace(body, planes=planes.movedim(-2, 0))
-
-    def beside(self, body: BodyFrames, motion: Motion) -> BodyFrames:
-        """Return the frames of one motion among the colliders that it is near to."""
-        count = len(self.carried)
-        if motion.proximity is None or not count:
-            return body
-        vectors = torch.tensor(motion.proximity[:, :count])
-        away, distance = (values.to(body.matrices) for values in nearest_planes(vectors, self.reach))
-        return self.among(body, distance.T, away.permute(1, 2, 0))
+        return len(self.points.rows)
 
     def decoded(self, decoder: Decoder, output: Tensor, body: BodyFrames | None) -> DecodedState:
         """Return a state by its outputs (N, outputs), under a character in one frame, which only points need."""
         if body is None or not self.count:
             return DecodedState(output, output.new_zeros(0, 3, output.shape[0]))
-        points = self.placed(decoder, output, body.matrices[0])
+        points = self.points(decoder, output, body.matrices[0])
         depth = None if body.planes is None else _depth(points, body.planes[0]).clamp_min(0)
         return DecodedState(output, points, depth)
-
-    def placed(self, decoder: Decoder, output: Tensor, matrices: Tensor) -> Tensor:
-        """Return the points (M, 3, N) [m] of outputs (N, outputs), under a character (J, 3, 4, N)."""
-        activation, values = decoder.split(output)
-        rest, shapes = decoder.free_rest()[self.places], decoder.shapes[self.places]
-        points = rest[:, :, None] + torch.einsum("mak,kn->man", shapes, activation)
-        joints = decoder.matrices(values, matrices)[decoder.used]
-        weights = torch.softmax(decoder.logits[self.rows] + decoder.skin_offset[self.places], dim=1)
-        affine = decoder.skin.dense(weights, self.rows) @ joints.flatten(1)
-        return transform_points(affine.reshape(self.count, *joints.shape[1:]), points)
 
     def seen(self, decoder: Decoder, past: tuple[DecodedState, DecodedState], body: BodyFrames | None) -> Tensor:
         """Return what S sees (N, size) from the two states before a frame, the older one first.
@@ -169,7 +142,7 @@ class Feedback(nn.Module):
         carried = None
         if body is not None and self.count:
             before, now = past
-            carried = self.placed(decoder, 2 * now.output - before.output, body.matrices[0])
+            carried = self.points(decoder, 2 * now.output - before.output, body.matrices[0])
         return self.features(decoder, past, carried, body)
 
     def features(

@@ -14,10 +14,10 @@ from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Scene, SkinWe
 from ...scene.kinematics import ProxyAxes
 from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
-from ..proximity import proximity_size, sees_at
+from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
 from .decoder import Decoder
-from .feedback import BodyFrames, DecodedState, Feedback
+from .feedback import BodyFrames, DecodedPoints, DecodedState, Feedback
 from .integrators import integrator
 
 
@@ -62,6 +62,7 @@ class GarmentModel(nn.Module):
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
         scheme, self.feedback = self.integrator.scheme, Feedback(scene, config, self.decoder)
+        self.sight = DecodedPoints(proximity_vertices(scene, config), self.decoder)
         inputs = scheme.states * z + static + dynamic + self.feedback.size
         self.stepper = (
             mlp(inputs, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
@@ -95,7 +96,20 @@ class GarmentModel(nn.Module):
     def body_frames(self, motion: Motion, world: Floats) -> BodyFrames:
         """Return a motion as the feedback needs it, from its joint-to-world transforms (F, J, 4, 4)."""
         body = BodyFrames.of(world, self.scene.character.skeleton, self.decoder.shapes)
-        return self.feedback.beside(body, motion)
+        if motion.proximity is None or not self.feedback.stopped:
+            return body
+        planes = motion.proximity[:, : self.feedback.stopped, PLANE, None]
+        return BodyFrames(body.matrices, body.bend, torch.as_tensor(planes).to(body.bend))
+
+    @torch.no_grad()
+    def resting(self, static: Tensor, matrices: Tensor) -> Tensor:
+        """Return the points (M, 3, N) [m] at which the network sees colliders, at rest without any.
+
+        Args:
+            static: descriptors without proximity, shape (N, S).
+            matrices: of the character, shape (J, 3, 4, N).
+        """
+        return self.sight(self.decoder, self.output(self.initial(static)), matrices)
 
     def decoded(self, z: Tensor, body: BodyFrames) -> DecodedState:
         """Return latents (N, latent) as the feedback looks back on them, under a character in one frame."""

@@ -29,7 +29,7 @@ class CharacterFrames:
         all_matrices: skinning matrices relative to the root, of the two frames before and these, shape
             (J, 3, 4, F + 2), float32; the first frame stands for those before a motion.
         all_origins: positions of the root in these [m], shape (F + 2, 3).
-        proximity: to colliders in these, as `Motion` has it, shape (F + 2, M, 3); None where none are looked for.
+        proximity: to colliders in these, as `Motion` has it, shape (F + 2, M, 5); None where none are looked for.
     """
 
     static: NDArray

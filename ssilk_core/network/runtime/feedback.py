@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.assets import Floats, SkinWeights
-from ...scene.kinematics import skin_points
+from ...scene.assets import Floats
 from ..checkpoint import ModelFile
 from ..feedback import LIMIT, UNIT, feedback_size, feedback_vertices, stopped_points
-from ..proximity import nearest_planes, proximity_reach
+from ..proximity import PLANE
 from .decoder import NumpyDecoder
 from .networks import LayerBuffers, as_float32
 from .two_frames import COLUMNS, PointRig, TwoFrames
@@ -57,9 +56,7 @@ class ClothPoints:
         self.rig = PointRig(file.scene, file.parameters, decoder, rows)
         self.count, self.hub = len(rows), file.scene.character.skeleton.hub
         self.size = feedback_size(file.scene, file.config)
-        skin, own = file.scene.lbs_skin, rows[: stopped_points(file.scene, file.config)]
-        self.lbs = SkinWeights(skin.path, skin.indices[own], skin.weights[own])
-        self.carried, self.reach = file.scene.garment.mesh.points[own], proximity_reach(file.scene)
+        self.stopped = stopped_points(file.scene, file.config)
 
     def course(self, matrices: NDArray, bend: Floats, proximity: Floats | None = None) -> BodyCourse:
         """Return F frames for the points.
@@ -67,26 +64,20 @@ class ClothPoints:
         Args:
             matrices: skinning matrices of F + 2 frames, shape (J, 3, 4, F + 2).
             bend: of the F frames, shape (F, 3).
-            proximity: to colliders in the F + 2 frames, shape (F + 2, P, 3); None for none.
+            proximity: to colliders in the F + 2 frames, shape (F + 2, P, 5); None for none.
         """
-        own = matrices[:, :, COLUMNS].transpose(1, 2, 3, 0)
+        own, met = matrices[:, :, COLUMNS].transpose(1, 2, 3, 0), np.zeros((matrices.shape[3], 0, 4))
+        if proximity is not None:
+            met = proximity[:, : self.stopped, PLANE]
         turns = matrices[self.hub, :, :3].transpose(2, 0, 1)
         return BodyCourse(
             as_float32(own[..., self.rig.anchors]),
             as_float32(own @ self.rig.of_character),
             as_float32(turns),
             as_float32(bend[:, :, None]),
-            *map(as_float32, self._planes(matrices, proximity)),
+            as_float32(met[..., :3].swapaxes(1, 2)),
+            as_float32(met[..., 3]),
         )
-
-    def _planes(self, matrices: NDArray, proximity: Floats | None) -> tuple[Floats, Floats]:
-        """Return the normals and offsets of a course."""
-        frames, count = matrices.shape[3], len(self.carried)
-        if proximity is None or not count:
-            return np.zeros((frames, 3, 0)), np.zeros((frames, 0))
-        normals, distance = nearest_planes(proximity[:, :count], self.reach)
-        points = skin_points(self.carried, self.lbs, matrices.transpose(3, 0, 1, 2))
-        return normals.swapaxes(1, 2), (normals * points).sum(axis=2) - distance
 
     def proxies(self, outputs: NDArray) -> NDArray:
         """Return the proxies (C P, F) of outputs of D (outputs, F), as S sees them."""

@@ -8,7 +8,7 @@ are trained in air that moves with the character's root, w = r. Air that moves o
 depends on no velocity of the cloth: where w is the same all over the garment, that is gravity of another strength and
 direction, and nothing else. An uneven wind is averaged over the garment as its body carries it.
 
-Colliders are seen from points of the garment that the body carries, too (`proximity`).
+Colliders are seen from points of the garment (`network.proximity`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from .colliders import VOTERS, ColliderPoser, Nearby
 from .surface import Search, boxes
 
 PLACES = 32  # vertices at which the air is averaged
-Proximity = Callable[[Floats, Floats], Floats]
+Places = Callable[[Motion], Floats]
+Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
 
 
 def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: Fabric) -> Floats | None:
@@ -48,55 +49,40 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     return found
 
 
-def felt_proximity(
-    world: ShotWorld | None, motion: Motion, scene: Scene, rows: Ints, within: float, see: Proximity
-) -> Floats | None:
-    """Return how near colliders are to vertices `rows` (M,) in each frame of a motion, shape (F, M, 3).
-
-    Args:
-        world: as for `felt_gravity`.
-        within, see: as for `ColliderSight`.
-
-    Returns:
-        None where there are no colliders.
-    """
-    if world is None or not world.colliders or not len(rows):
-        return None
-    return ColliderSight(world, scene, rows, within, see).near(motion, np.arange(motion.frame_count))
-
-
 class ColliderSight:
     """What a garment sees of the colliders of its shot.
 
     Args:
         world: its time runs from the first frame of motions.
-        rows: vertices from which colliders are seen (M,).
+        places: takes a motion, and returns the points from which colliders are seen in its frames [m], (F, M, 3).
         within: distance up to which they count [m].
-        see: takes distances (M,) and directions away from what is nearest (M, 3), and returns vectors (M, 3).
+        see: takes the points of a frame (M, 3), distances (M,), directions away from what is nearest (M, 3) and the
+            position of the root (3,), and returns what is seen (M, 5); where nothing is near distances are infinite
+            and directions zero.
         search: finds nearest points on triangles.
     """
 
     def __init__(
-        self, world: ShotWorld, scene: Scene, rows: Ints, within: float, see: Proximity, search: Search = boxes
+        self, world: ShotWorld, scene: Scene, places: Places, within: float, see: Proximity, search: Search = boxes
     ) -> None:
-        self._world, self._scene, self._rows, self._within, self._see = world, scene, rows, within, see
+        self._world, self._scene, self._places, self._within, self._see = world, scene, places, within, see
         self._voters = _spread(np.arange(scene.garment.mesh.vertex_count), VOTERS)
         self._poser = ColliderPoser(search)
 
     def near(self, motion: Motion, frames: Ints) -> Floats:
-        """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 3)."""
+        """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
-        points, voters = (_carried(own, self._scene, some) for some in (self._rows, self._voters))
-        found = np.zeros((len(frames), len(self._rows), 3))
-        for row, (frame, here, votes) in enumerate(zip(frames.tolist(), points, voters)):
-            distance, normal = np.full(len(self._rows), np.inf), np.zeros((len(self._rows), 3))
+        points, voters = self._places(own), _carried(own, self._scene, self._voters)
+        roots, found = hub_places(self._scene.character.skeleton, own.rotations, own.translations), []
+        for frame, here, votes, root in zip(frames.tolist(), points, voters, roots):
+            distance, normal = np.full(len(here), np.inf), np.zeros((len(here), 3))
             close = Nearby.of(here, self._within)
             for collider in self._poser.at(self._world, frame / motion.fps, np.zeros(3), votes, close):
                 near, met = collider.near(here, self._within)
                 closer = met.distance < distance[near]
                 distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
-            found[row] = self._see(distance, normal)
-        return found
+            found.append(self._see(here, distance, normal, root))
+        return np.stack(found)
 
 
 def _loose(scene: Scene) -> Ints:

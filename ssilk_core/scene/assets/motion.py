@@ -24,7 +24,7 @@ class Motion:
         start: index of the first frame, counted from time zero at `fps`; it begins at `start / fps` seconds.
         gravity: acceleration that cloth feels, wind included [m/s2], shape (F, 3); None for the usual one.
         proximity: to colliders at M points of a garment, as its network sees them (`network.proximity`), shape
-            (F, M, 3); None where it sees none.
+            (F, M, 5); None where it sees none.
     """
 
     path: str
@@ -61,8 +61,8 @@ class Motion:
             assign(self, gravity=gravity)
         if self.proximity is not None:
             proximity = frozen(self.proximity, np.float64)
-            if not (proximity.ndim == 3 and len(proximity) == len(rotations) and proximity.shape[2] == 3):
-                fail(self.path, f"proximity of shape {proximity.shape}", f"({len(rotations)}, points, 3) is needed")
+            if not (proximity.ndim == 3 and len(proximity) == len(rotations) and proximity.shape[2] == 5):
+                fail(self.path, f"proximity of shape {proximity.shape}", f"({len(rotations)}, points, 5) is needed")
             need_finite(proximity, self.path, "frames of proximity")
             assign(self, proximity=proximity)
 

@@ -20,10 +20,12 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import descriptor_sizes
 from ssilk_core.network.proximity import proximity_reach, proximity_vertices
 from ssilk_core.network.rollout import garment_poses
+from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime.sight import RestingPoints
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.scene.assets import TIGHT, ProxyRig, Scene
 from ssilk_core.scene.fabrics import FABRICS
-from ssilk_core.scene.kinematics import matrix_from_quaternion
+from ssilk_core.scene.kinematics import matrix_from_quaternion, motion_transforms
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: the extra 'dev' brings it")
 
@@ -47,8 +49,11 @@ def exported(model, tmp_path_factory):
     return session, json.loads(told.getvalue().splitlines()[-1])["detail"]
 
 
-def played(session, model, shots) -> list[np.ndarray]:
-    """Play all shots at once; return weights (F, N, K + 1), rotations (F, N, P, 3, 3), translations (F, N, P, 3)."""
+def played(session, model, shots, near=None) -> list[np.ndarray]:
+    """Play all shots at once; return weights (F, N, K + 1), rotations (F, N, P, 3, 3), translations (F, N, P, 3).
+
+    Where the network sees colliders, `near` is their proximity (F, N, M, 5), and the points that see come last.
+    """
     static = descriptor_sizes(model.scene, model.joints, model.config)[0]
     sizes = {each.name: each.shape[1] for each in session.get_inputs()}
     before = now = np.zeros((shots.pose.shape[1], sizes["before"]), np.float32)
@@ -59,17 +64,20 @@ def played(session, model, shots) -> list[np.ndarray]:
         given = {
             "before": before,
             "now": now,
-            "static": pose[:, :static],
+            "static": pose[:, model.proximity : static],
             "rates": pose[:, static:],
             "begins": begins,
         }
         if model.feedback.count:
             given["matrices"] = np.moveaxis(shots.character[frame].numpy(), -1, 0)
             given["bend"] = shots.bend[frame].numpy().T
+        if near is not None:
+            given["proximity"] = near[frame].astype(np.float32)
         state, *found = session.run(names, given)
         before, now = now, state
         frames.append(found)
-    assert names == ["state", "weights", "rotations", "translations"][: len(names)]
+    expected = ["state", "weights", "rotations", *["translations"] * model.config.translations]
+    assert names == [*expected, *["resting"] * (near is not None)]
     return [np.array(values) for values in zip(*frames)]
 
 
@@ -120,12 +128,21 @@ def test_a_network_that_sees_colliders_is_exported_and_where_it_sees_them_told(
     assert told["and up to [m]"] == pytest.approx(proximity_reach(scene))
     session = onnxruntime.InferenceSession(tmp_path / "toy.onnx", providers=["CPUExecutionProvider"])
     plain = toy_motion(scene, FRAMES)
-    near = np.sin(np.arange(FRAMES * 15)).reshape(FRAMES, 5, 3)
-    found = []
-    for motion in (plain, replace(plain, proximity=near)):
-        found.append(played(session, seeing, motion_inputs(seeing, [motion]))[0][:, 0])
+    dice = np.random.default_rng(4)
+    away = dice.normal(size=(FRAMES, 5, 3))
+    away /= np.linalg.norm(away, axis=2, keepdims=True)
+    near = np.concatenate([away, dice.uniform(-0.1, 0.1, (FRAMES, 5, 1)), dice.normal(size=(FRAMES, 5, 1))], axis=2)
+    nothing, found = np.tile([0.0, 0, 0, 1, -1], (FRAMES, 5, 1)), []
+    for values in (nothing, near):
+        motion = replace(plain, proximity=values)
+        weights, *_, resting = played(session, seeing, motion_inputs(seeing, [motion]), values[:, None])
+        found.append(weights[:, 0])
         (expected,) = garment_poses(seeing, motion, motion.fps)
         np.testing.assert_allclose(found[-1], expected.weights, atol=2e-5)
+        own = RestingPoints(Player(model_file(seeing, FABRICS["silk"], {})))(plain)
+        hub = scene.character.skeleton.hub
+        roots = motion_transforms(plain, scene.character.skeleton.parents)[:, hub, :3, 3]
+        np.testing.assert_allclose(resting[:, 0] + roots[:, None], own, atol=1e-5)
     assert np.abs(found[0] - found[1]).max() > 1e-3
 
 

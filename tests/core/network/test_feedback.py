@@ -56,7 +56,7 @@ def test_what_is_seen_is_free_flight_less_the_course_of_the_latents(scene, toy_m
     matrices = torch.tensor((world @ np.linalg.inv(skeleton.bind_transforms))[:, :, :3])[..., None]
 
     def points(output: torch.Tensor, frame: int) -> torch.Tensor:
-        return model.decoder.vertices(output, matrices[frame])[model.feedback.rows, :, 0]
+        return model.decoder.vertices(output, matrices[frame])[model.feedback.points.rows, :, 0]
 
     outputs = [model.output(state) for state in z]
     away = 2 * points(outputs[1], 1) - points(outputs[0], 0) - points(2 * outputs[1] - outputs[0], 2)

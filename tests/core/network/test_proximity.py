@@ -30,8 +30,9 @@ def motion(scene, toy_motion):
     plain, frames = toy_motion(scene, FRAMES), np.arange(FRAMES)
     moved = plain.translations.copy()
     moved[25:, 0, 0] += 50
-    near = np.maximum(np.sin(0.2 * frames[:, None, None] + np.arange(POINTS)[:, None]), 0) * [0.1, 0.7, -0.4]
-    return replace(plain, translations=moved, proximity=near)
+    share = 0.15 * np.sin(0.2 * frames[:, None, None] + np.arange(POINTS)[:, None])
+    away = np.broadcast_to([0.6, 0.8, 0.0], (FRAMES, POINTS, 3))
+    return replace(plain, translations=moved, proximity=np.concatenate([away, share, 0.3 - 2 * share], axis=2))
 
 
 def vertices(player: Player, motion) -> np.ndarray:
@@ -47,7 +48,7 @@ def test_players_agree_on_what_is_near(scene, seeing, motion) -> None:
     for name, each in (
         ("near", motion),
         ("without", without),
-        ("nothing", replace(motion, proximity=0 * motion.proximity)),
+        ("nothing", replace(motion, proximity=motion.proximity * 0 + [0, 0, 0, 1, -1])),
     ):
         poses = garment_poses(seeing, each, each.fps)
         played[name] = vertices(player, each)

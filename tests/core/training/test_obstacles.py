@@ -15,9 +15,10 @@ from ssilk_core.network.checkpoint import ModelFile, model_file
 from ssilk_core.network.descriptors import place_of_hub, pose_features
 from ssilk_core.network.model.descriptors import proximity_length
 from ssilk_core.network.parameters import parameter_shapes, seeing_more
-from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
+from ssilk_core.network.proximity import proximity, proximity_size, proximity_vectors
+from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime.sight import seen_proximity
 from ssilk_core.network.settings import PROXIMITY_POINTS, ModelConfig
-from ssilk_core.physics.world.felt import felt_proximity
 from ssilk_core.physics.world.surface import CollisionSurface
 from ssilk_core.scene.assets import Collider, ShotWorld
 from ssilk_core.scene.fabrics import FABRICS
@@ -78,7 +79,13 @@ def bank(scene, toy_motion):
 
 def drawer(scene, model, bank, share: float = 1.0, seed: int = 0) -> ObstacleDrawer:
     hub = place_of_hub(scene.character.skeleton, model.joints)
-    return ObstacleDrawer(scene, model.config, bank, hub, share, torch.Generator().manual_seed(seed))
+    return ObstacleDrawer(model, bank, hub, share, torch.Generator().manual_seed(seed))
+
+
+def looked(model, motion, *colliders: Collider) -> np.ndarray | None:
+    """What a network sees of colliders of a shot."""
+    player = Player(model_file(model, FABRICS["silk"], {}))
+    return seen_proximity(ShotWorld(30.0, colliders), motion, player)
 
 
 @pytest.mark.parametrize("name", boxes())
@@ -151,42 +158,42 @@ def test_an_obstacle_in_the_way_draws_back_and_others_stay(scene, seeing, bank) 
 def test_the_network_sees_in_training_what_it_sees_of_the_same_collider_in_a_shot(scene, seeing, toy_motion) -> None:
     """A box as an obstacle of training, and as a mesh of a stage; one that no network saw is all zeros."""
     motion = toy_motion(scene, 12, speed=2.0)
-    skeleton, rows = scene.character.skeleton, proximity_vertices(scene, seeing.config)
-    assert len(rows) == POINTS and proximity_size(scene, seeing.config) == 3 * POINTS
+    skeleton = scene.character.skeleton
+    assert proximity_size(scene, seeing.config) == 3 * POINTS
     box = trimesh.creation.box((0.5, 0.4, 0.3))
     place = np.eye(4)
     place[:3, :3] = trimesh.transformations.random_rotation_matrix(np.array([0.7, 0.1, 0.4]))[:3, :3]
-    place[:3, 3] = (0.05, 0.75, -0.3)
+    place[:3, 3] = (0.05, 1.0, -0.3)
     whole = np.ones(1, dtype=bool)
     collider = Collider("/box", np.array(box.faces), np.array(box.vertices)[None], place[None], whole)
-    reach = proximity_reach(scene)
-    vectors = felt_proximity(
-        ShotWorld(30.0, (collider,)), motion, scene, rows, reach, lambda d, n: proximity(d, n, reach)
-    )
-    seen = pose_features(replace(motion, proximity=vectors), skeleton, JOINTS).proximity
+    near = looked(seeing, motion, collider)
+    seen = pose_features(replace(motion, proximity=near), skeleton, JOINTS).proximity
     bank = build_bank([motion], skeleton, JOINTS, 30.0, CPU)
     start = motion_transforms(motion, skeleton.parents)[0, skeleton.hub, :3, 3]  # where the bank has its origin
     own = one_box(place[:3, :3], place[:3, 3] - start, (0.25, 0.2, 0.15), 0.0).repeated(12)
     draws, frames = drawer(scene, seeing, bank), torch.arange(12)
-    trained = draws.seen(draws.near(own, frames), frames)
+    met = draws.near(own, frames, torch.tensor([0.0, -1.0, 0.0]).expand(12, 3))
+    trained = draws.seen(met, frames)
     assert np.abs(seen).max() > 0.5
     np.testing.assert_allclose(trained.numpy(), seen, atol=2e-4)
-    assert felt_proximity(ShotWorld(30.0), motion, scene, rows, reach, lambda d, n: n) is None
+    hubs = motion_transforms(motion, skeleton.parents)[:, skeleton.hub, :3, 3]
+    planes = met.planes(POINTS).permute(2, 0, 1).numpy()
+    # About the root of each frame, and about where the bank has its origin.
+    height = near[..., 4] + (near[..., :3] * (hubs - start)[:, None]).sum(axis=2)
+    np.testing.assert_allclose(planes, np.concatenate([near[..., :3], height[..., None]], axis=2), atol=2e-4)
+    assert looked(seeing, motion) is None
 
 
 def test_colliders_beyond_the_reach_are_not_searched(scene, seeing, toy_motion, monkeypatch) -> None:
     """A stage may have a thousand props; those near the character count, wherever they move."""
     motion, whole, still = toy_motion(scene, 6), np.ones(1, dtype=bool), np.eye(4)[None]
-    rows, reach = proximity_vertices(scene, seeing.config), proximity_reach(scene)
     box = trimesh.creation.box((0.2, 0.3, 0.4))
 
     def prop(name: str, place, moves: np.ndarray = still) -> Collider:
         return Collider(name, np.array(box.faces), (np.array(box.vertices) + place)[None], moves, whole)
 
     def seen(*props: Collider) -> np.ndarray:
-        found = felt_proximity(
-            ShotWorld(30.0, props), motion, scene, rows, reach, lambda d, n: proximity(d, n, reach)
-        )
+        found = looked(seeing, motion, *props)
         assert found is not None
         return found
 
@@ -205,15 +212,20 @@ def test_colliders_beyond_the_reach_are_not_searched(scene, seeing, toy_motion, 
     assert built == ["/near", "/comes"]
 
 
-def test_proximity_is_nothing_from_the_reach_on_and_points_out_of_what_holds_it() -> None:
-    normal = np.array([[0.0, 1.0, 0.0]] * 5)
-    found = proximity(np.array([2.0, 1.0, 0.5, 0.0, -3.0]), normal, 1.0)
-    np.testing.assert_allclose(found[:, 1], [0, 0, 0.25, 1, 2])
-    distance = np.linspace(-0.6, 1.2, 181)
-    length = proximity(distance, np.tile([[1.0, 0, 0]], (181, 1)), 1.0)[:, 0]
-    np.testing.assert_allclose(proximity_length(torch.tensor(distance), 1.0).numpy(), length, atol=1e-12)
-    slope = np.diff(length[10:]) / 0.01  # smooth from half a reach inside on
-    assert np.abs(np.diff(slope)).max() < 0.03
+def test_what_is_not_near_is_not_seen_and_what_holds_a_point_is_seen_from_inside() -> None:
+    """A floor at the height of 0.3 m, about a root at 1 m, for a garment of 2 m."""
+    height = np.array([3.0, 0.5, 0.4, 0.3, -0.7, -5.0])
+    points = np.stack([np.zeros(6), height, np.ones(6)], axis=1)
+    away = np.tile([0.0, 1.0, 0.0], (6, 1))
+    near = proximity(points, height - 0.3, away, np.array([0.0, 1.0, 0.0]), 2.0)
+    np.testing.assert_allclose(near[:, 3], [1, 0.1, 0.05, 0, -0.5, -2.65])
+    # The plane of the floor is 0.7 m below the root, but for what is so far away that it is not known.
+    np.testing.assert_allclose(near[:, 4], [0, -0.7, -0.7, -0.7, -0.7, -0.7])
+    vectors = proximity_vectors(near)
+    np.testing.assert_allclose(vectors[:, 1], [0, 0, 0.25, 1, 2, 2], atol=1e-12)
+    assert not vectors[:, [0, 2]].any()
+    length = proximity_length(torch.tensor(near[:, 3])).numpy()
+    np.testing.assert_allclose(length, vectors[:, 1], atol=1e-12)
 
 
 def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model) -> None:
@@ -240,7 +252,7 @@ def test_obstacles_go_on_with_their_windows_and_are_restored(scene, seeing, bank
     def sampler(seed: int) -> WindowSampler:
         dice = torch.Generator().manual_seed(seed)
         hub = place_of_hub(scene.character.skeleton, seeing.joints)
-        draws = ObstacleDrawer(scene, seeing.config, bank, hub, config.collider_fraction, dice)
+        draws = ObstacleDrawer(seeing, bank, hub, config.collider_fraction, dice)
         return WindowSampler(bank, config, 3, dice, draws)
 
     one, other = sampler(1), sampler(2)

@@ -61,7 +61,7 @@ def test_the_stepper_goes_on_and_what_it_did_not_see_counts_nothing_yet(
     assert torch.equal(new[:, : old.shape[1]], old) and not new[:, old.shape[1] :].any()
     assert torch.equal(model.integrator.beta, trained.integrator.beta)
     # The points that S sees are the first of those that it sees now.
-    assert torch.equal(model.feedback.rows[:before], trained.feedback.rows)
+    assert torch.equal(model.feedback.points.rows[:before], trained.feedback.points.rows)
 
 
 @pytest.mark.parametrize("model", [{"feedback_points": 2}, {"scheme": "verlet", "feedback_points": 5}])

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a trained garment sees of the colliders of its shot (`network.proximity`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ...physics.world.felt import ColliderSight
+from ...physics.world.surface import Search, boxes
+from ...scene.assets import Floats, Motion, ShotWorld
+from ..proximity import proximity, proximity_reach, proximity_vertices
+from .character import character_frames
+from .garment import NumpyGarment
+from .networks import as_float32, evaluate
+from .two_frames import COLUMNS, PointRig, TwoFrames
+
+AT_ONCE = 256  # frames, to bound memory
+
+
+class RestingPoints:
+    """The points at which a garment sees colliders, where they would rest without any."""
+
+    def __init__(self, garment: NumpyGarment) -> None:
+        self._garment, file = garment, garment.file
+        rows = proximity_vertices(file.scene, file.config)
+        self._rig = PointRig(file.scene, file.parameters, garment.decoder, rows)
+
+    def __call__(self, motion: Motion) -> Floats:
+        """Return the points in each frame of a motion [m], shape (F, M, 3)."""
+        alone, count = replace(motion, proximity=None), motion.frame_count
+        parts = [self._of(alone.picked(slice(at, at + AT_ONCE))) for at in range(0, count, AT_ONCE)]
+        return np.concatenate(parts)
+
+    def _of(self, motion: Motion) -> Floats:
+        garment, rig, count = self._garment, self._rig, motion.frame_count
+        file, skeleton = garment.file, garment.skeleton
+        frames = character_frames(motion, skeleton, file.joints, kind=file.config.descriptors, seen=garment.proximity)
+        outputs = evaluate(garment.decoder.layers, garment.quasi_static(frames.static).T).T
+        own = frames.matrices[:, :, COLUMNS].transpose(1, 2, 3, 0)
+        anchors, affine = as_float32(own[..., rig.anchors]), as_float32(own @ rig.of_character)
+        pairs, found = TwoFrames(rig), []
+        for at in range(0, count, 2):
+            two = [at, min(at + 1, count - 1)]
+            points = pairs.points(as_float32(outputs[two]), anchors[:, :, two], affine[:, :, two])
+            found.append(points.transpose(1, 2, 0).copy())
+        return np.concatenate(found)[:count] + frames.origins[:, None]
+
+
+def collider_sight(garment: NumpyGarment, world: ShotWorld, search: Search = boxes) -> ColliderSight:
+    """Return what a garment sees of the colliders of a world, whose time runs from the first frame of motions."""
+    scene = garment.file.scene
+    reach = proximity_reach(scene)
+    return ColliderSight(world, scene, RestingPoints(garment), reach, partial(proximity, reach=reach), search)
+
+
+def seen_proximity(world: ShotWorld | None, motion: Motion, garment: NumpyGarment) -> Floats | None:
+    """Return what a garment sees of the colliders of a shot in each frame of a motion, as `Motion.proximity`.
+
+    Args:
+        world: as for `collider_sight`; None for none.
+
+    Returns:
+        None where there are no colliders, or the garment sees none.
+    """
+    if world is None or not world.colliders or not garment.proximity:
+        return None
+    return collider_sight(garment, world).near(motion, np.arange(motion.frame_count))
