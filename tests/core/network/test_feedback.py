@@ -67,6 +67,42 @@ def test_what_is_seen_is_free_flight_less_the_course_of_the_latents(scene, toy_m
 
 
 @torch.no_grad()
+def test_free_flight_comes_no_deeper_into_colliders_than_points_were(scene, toy_model, toy_motion):
+    """A wall at each of the first points, between where it was and where it would fly, or behind, or nowhere."""
+    stopped, skeleton = 4, scene.character.skeleton
+    model = toy_model(scene, proximity_points=stopped).double()
+    motion, z = toy_motion(scene, 3), states(2).double()
+    world = motion_transforms(motion, skeleton.parents)
+    roots, plain = world[:, skeleton.hub, :3, 3], model.body_frames(motion, world)
+    before, now = (model.decoded(state, plain[at : at + 1]).points[..., 0].numpy() for at, state in enumerate(z))
+    flight = 2 * (now + roots[1]) - (before + roots[0])  # in the world
+    way = (flight - now - roots[1])[:stopped]
+    length = np.linalg.norm(way, axis=1)
+    assert length.min() > 1e-3
+    toward = way / length[:, None]
+    # The share of its way after which each point meets its wall; it is behind the third one, and the fourth has none.
+    share = np.array([0.0, 0.7, -0.5, 0.0])
+    place = ((now + roots[1])[:stopped] * toward).sum(axis=1) + share * length  # of the walls, along the way
+    away = -toward * (np.arange(stopped) < 3)[:, None]
+
+    def near(root: np.ndarray) -> np.ndarray:
+        height = np.where(np.arange(stopped) < 3, (toward @ root) - place, -1.0)
+        return np.concatenate([away, np.zeros((stopped, 1)), height[:, None]], axis=1)
+
+    met = replace(motion, proximity=np.stack([near(root) for root in roots]))
+    seen = model.seen_from(*z, model.body_frames(met, world))[0]
+    free = model.seen_from(*z, plain)[0]
+    pushed = np.array([1.0, 0.3, 1.0, 0.0]) * length  # the third comes no deeper than it was
+    turn = world[2, skeleton.hub, :3, :3] @ np.linalg.inv(skeleton.bind_transforms[skeleton.hub, :3, :3])
+    more = UNIT * LIMIT * (torch.atanh(seen / LIMIT) - torch.atanh(free / LIMIT)).reshape(-1, 3).numpy()
+    np.testing.assert_allclose(more[:stopped], (pushed[:, None] * away) @ turn, atol=2e-5)
+    assert not more[stopped:].any()
+    still = replace(toy_motion(scene, 3).picked(np.zeros(3, dtype=int)), proximity=met.proximity[:1].repeat(3, axis=0))
+    frames = model.body_frames(still, motion_transforms(still, skeleton.parents))
+    assert model.seen_from(z[0], z[0], frames).abs().max() < 1e-9  # nothing moves, deep in walls or not
+
+
+@torch.no_grad()
 def test_position_heading_and_a_steady_velocity_do_not_show(scene, toy_model, toy_motion):
     model = toy_model(scene)
     motion, z = toy_motion(scene, 3), states(2)
