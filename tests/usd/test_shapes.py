@@ -279,6 +279,10 @@ def deactivated(stage: Usd.Stage) -> None:
     body(stage).GetPrim().SetActive(False)
 
 
+def made_a_guide(stage: Usd.Stage) -> None:
+    UsdGeom.Imageable(body(stage)).CreatePurposeAttr("guide")
+
+
 def swapped(stage: Usd.Stage) -> None:
     padded(stage)
     with_more_points(stage, "/Hero/Padding")
@@ -295,14 +299,20 @@ def retopologized(stage: Usd.Stage) -> None:
     with_more_points(stage, "/Hero/Body")
 
 
-LACKS = "it has no mesh Body; cloth meets it, and it is seen in what is written"
+LACKS = "it shows no mesh Body that is the character's; cloth meets it, and it is seen in what is written"
 ALONE = "Padding follows its skeleton and is not in the character's stage; "
 OTHER = "it shapes Body otherwise, with other points; "
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
-    [(deactivated, [LACKS]), (swapped, [LACKS, ALONE]), (padded, [ALONE]), (retopologized, [OTHER])],
+    [
+        (deactivated, [LACKS]),
+        (made_a_guide, [LACKS]),
+        (swapped, [LACKS, ALONE]),
+        (padded, [ALONE]),
+        (retopologized, [OTHER]),
+    ],
 )
 def test_a_body_that_a_shot_lacks_swaps_or_adds_is_told(tmp_path, change, words):
     hero, stage = over(tmp_path)
@@ -310,6 +320,20 @@ def test_a_body_that_a_shot_lacks_swaps_or_adds_is_told(tmp_path, change, words)
     stage.Save()
     told = shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")
     assert len(told) == len(words) and all(text.startswith(word) for text, word in zip(told, words))
+
+
+def test_of_bodies_that_were_not_chosen_nothing_is_told(tmp_path):
+    hero = dressed(tmp_path, [0.0, 1.0])
+    stage = Usd.Stage.Open(hero)
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), "/Hero/Hair")
+    stage.Save()
+    shot = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    shot.GetRootLayer().subLayerPaths.append("./hero.usda")
+    shot.GetPrimAtPath("/Hero/Hair").SetActive(False)
+    shot.Save()
+    words = [*shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape", bodies=["Body"])]
+    assert words == []
+    assert len(shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")) == 1
 
 
 def test_a_shot_of_another_character_lacks_nothing(tmp_path):

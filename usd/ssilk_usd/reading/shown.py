@@ -6,7 +6,7 @@ Blendshapes that it weighs otherwise or alone has, points that it has moved, poi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
@@ -40,10 +40,11 @@ def tell_shown_otherwise(
     *,
     root: str | None = None,
     garment: str | None = None,
+    bodies: Sequence[str] = (),
 ) -> None:
     """Report what of a character's meshes motions show otherwise than its stage, in which cloth does not meet them.
 
-    Args are those of `animated_shapes`, for each of several motions.
+    Args are those of `shown_otherwise`, for each of several motions.
 
     Raises:
         SsilkError: as `animated_shapes`.
@@ -52,7 +53,7 @@ def tell_shown_otherwise(
     tell_animated_shapes(source, paths, report, root=root, garment=garment)
     for motion in paths:
         weighed = {found.mesh for found in animated_shapes(source, motion, root=root, garment=garment)}
-        for text in shown_otherwise(source, motion, root=root, garment=garment, known=weighed):
+        for text in shown_otherwise(source, motion, root=root, garment=garment, bodies=bodies, known=weighed):
             report(Message(f"{motion}: {text}", "warning"))
 
 
@@ -63,6 +64,7 @@ def shown_otherwise(
     *,
     root: str | None = None,
     garment: str | None = None,
+    bodies: Sequence[str] = (),
     known: Iterable[str] = (),
 ) -> list[str]:
     """Return in words what a motion's stage shows of a character's meshes otherwise than the character's stage.
@@ -71,7 +73,11 @@ def shown_otherwise(
 
     Args:
         source, motion, root, garment: as for `animated_shapes`.
+        bodies: those that cloth meets, as for `read_character`.
         known: names of meshes whose shape is known to differ.
+
+    Raises:
+        SsilkError: as `read_motion` and `read_character`.
     """
     stage, (file, prim) = open_stage(source), split_location(motion)
     skel = find_skeleton(stage, root=root, garment=garment)
@@ -87,7 +93,7 @@ def shown_otherwise(
     if there.prim == skel.prim:
         return [*filter(None, found)]
     same = _same_meshes(there, own)
-    character = read_character(stage, root=root, garment=garment)
+    character = read_character(stage, root=root, bodies=bodies, garment=garment)
     compared = _Compared(character, read_motion(of_motion, character.skeleton, prim=prim, root=root), there)
     for mesh, original in same.items():
         name, body = mesh.GetName(), not is_garment(original)
@@ -214,9 +220,11 @@ def _other_bodies(
     """Yield in words which bodies a shot lacks, and which it alone has, if it is a shot of this character."""
     if not same and not _is_same_character(skel, there):
         return
+    guides = [own for mesh, own in same.items() if UsdGeom.Imageable(mesh).ComputePurpose() == UsdGeom.Tokens.guide]
     for body in bodies:
-        if body not in same.values():
-            yield f"it has no mesh {body.GetName()}; cloth meets it, and it is seen in what is written"
+        if body not in same.values() or body in guides:
+            text = f"it shows no mesh {body.GetName()} that is the character's"
+            yield f"{text}; cloth meets it, and it is seen in what is written"
     extra = [mesh for mesh in _meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
     for mesh in extra:
         if not is_stand_in(mesh):
