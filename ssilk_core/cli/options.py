@@ -380,7 +380,8 @@ def tell_shapes(options: argparse.Namespace, motions: Iterable[Motion], report: 
     from ssilk_usd.reading.shown import tell_shown_otherwise
 
     paths = [motion.path for motion in motions]
-    tell_shown_otherwise(options.stage, paths, report, root=options.root, garment=options.garment)
+    chosen = {"root": options.root, "garment": options.garment, "bodies": options.body}
+    tell_shown_otherwise(options.stage, paths, report, **chosen)
 
 
 def load_scene(

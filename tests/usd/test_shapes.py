@@ -202,6 +202,152 @@ def test_a_body_of_another_shape_in_a_shot_is_told_with_how_far_it_is_off(tmp_pa
     assert told.startswith(f"it shapes Body otherwise, by up to {1000 * off:.3g} mm")
 
 
+def reweighed(stage: Usd.Stage) -> None:
+    """Other weights, which only a posed body shows."""
+    UsdSkel.BindingAPI(body(stage)).GetJointIndicesPrimvar().Set([1, 1, 0, 1])
+    look = UsdSkel.Animation(stage.GetPrimAtPath("/Hero/Rig/Look"))
+    rest = look.GetRotationsAttr().Get()
+    for code, turn in ((1, Gf.Quatf(1)), (5, Gf.Quatf(0.8, 0.6, 0, 0))):
+        look.GetRotationsAttr().Set([rest[0], rest[1] * turn], code)
+
+
+def moving_bind(stage: Usd.Stage) -> None:
+    """A geomBindTransform that changes over time, while a joint moves."""
+    reweighed(stage)
+    binding = UsdSkel.BindingAPI(body(stage))
+    binding.GetPrim().RemoveProperty("primvars:skel:jointIndices")
+    for code in (1, 5):
+        binding.GetGeomBindTransformAttr().Set(GEOM * Gf.Matrix4d().SetTranslate((0, 0, code - 1)), code)
+
+
+def sculpted_in_another_bind_pose(stage: Usd.Stage) -> None:
+    in_another_bind_pose(stage)
+    sculpted(stage)
+
+
+def bound_lower(stage: Usd.Stage) -> None:
+    """Another bind pose of the skeleton alone, which takes the body with it."""
+    rig = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    moved = Gf.Matrix4d().SetTranslate(Gf.Vec3d(0, 30, 0))
+    rig.GetBindTransformsAttr().Set([bind * moved for bind in rig.GetBindTransformsAttr().Get()])
+
+
+def unbound(stage: Usd.Stage) -> None:
+    """A body that no joint moves any more: it stands where its points are."""
+    UsdSkel.BindingAPI(body(stage)).GetSkeletonRel().SetTargets([])
+
+
+POSED = [reweighed, moving_bind, sculpted_in_another_bind_pose, bound_lower, unbound]
+
+
+@pytest.mark.parametrize("change", POSED)
+def test_a_body_that_a_shot_moves_otherwise_is_told_with_how_far_it_is_off(tmp_path, change):
+    """Posed by the shot's joints: by the weights, bind pose and placement of the shot, and by the character's."""
+    hero, stage = over(tmp_path)
+    change(stage)
+    stage.Save()
+    shot = str(tmp_path / "shot.usda")
+    alone = Usd.Stage.CreateNew(str(tmp_path / "alone.usda"))  # the character's own body, in the shot's motion
+    alone.GetRootLayer().subLayerPaths.append("./hero.usda")
+    if look := stage.GetRootLayer().GetPrimAtPath("/Hero/Rig/Look"):
+        Sdf.CreatePrimInLayer(alone.GetRootLayer(), "/Hero/Rig")
+        Sdf.CopySpec(stage.GetRootLayer(), look.path, alone.GetRootLayer(), look.path)
+    alone.Save()
+    off = max(
+        np.linalg.norm(
+            seen(shot, "/Hero/Body", code) - seen(str(tmp_path / "alone.usda"), "/Hero/Body", code), axis=1
+        ).max()
+        for code in (1, 5)
+    )
+    (told,) = shown_otherwise(hero, shot, garment="Cape")
+    assert off > 0.005 and told.startswith(f"it shapes Body otherwise, by up to {1000 * off:.3g} mm")
+
+
+def with_more_points(stage: Usd.Stage, path: str) -> None:
+    """A body of another level of detail: one more point, a hand's breadth away."""
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath(path))
+    points = [*mesh.GetPointsAttr().Get(), Gf.Vec3f(0, 90, 20)]
+    mesh.GetPointsAttr().Set(points)
+    mesh.GetFaceVertexCountsAttr().Set([3, 3, 3])
+    mesh.GetFaceVertexIndicesAttr().Set([0, 1, 2, 0, 3, 1, 0, 3, 4])
+    binding = UsdSkel.BindingAPI(mesh)
+    binding.GetJointIndicesPrimvar().Set([0, 0, 1, 0, 0])
+    binding.GetJointWeightsPrimvar().Set([1.0] * 5)
+
+
+def deactivated(stage: Usd.Stage) -> None:
+    body(stage).GetPrim().SetActive(False)
+
+
+def made_a_guide(stage: Usd.Stage) -> None:
+    UsdGeom.Imageable(body(stage)).CreatePurposeAttr("guide")
+
+
+def swapped(stage: Usd.Stage) -> None:
+    padded(stage)
+    with_more_points(stage, "/Hero/Padding")
+    deactivated(stage)
+
+
+def padded(stage: Usd.Stage) -> None:
+    layer = Sdf.Layer.FindOrOpen(str(Path(stage.GetRootLayer().realPath).parent / "hero.usda"))
+    Sdf.CreatePrimInLayer(stage.GetRootLayer(), "/Hero")
+    Sdf.CopySpec(layer, "/Hero/Body", stage.GetRootLayer(), "/Hero/Padding")
+
+
+def retopologized(stage: Usd.Stage) -> None:
+    with_more_points(stage, "/Hero/Body")
+
+
+LACKS = "it shows no mesh Body that is the character's; cloth meets it, and it is seen in what is written"
+ALONE = "Padding follows its skeleton and is not in the character's stage; "
+OTHER = "it shapes Body otherwise, with other points; "
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (deactivated, [LACKS]),
+        (made_a_guide, [LACKS]),
+        (swapped, [LACKS, ALONE]),
+        (padded, [ALONE]),
+        (retopologized, [OTHER]),
+    ],
+)
+def test_a_body_that_a_shot_lacks_swaps_or_adds_is_told(tmp_path, change, words):
+    hero, stage = over(tmp_path)
+    change(stage)
+    stage.Save()
+    told = shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")
+    assert len(told) == len(words) and all(text.startswith(word) for text, word in zip(told, words))
+
+
+def test_of_bodies_that_were_not_chosen_nothing_is_told(tmp_path):
+    hero = dressed(tmp_path, [0.0, 1.0])
+    stage = Usd.Stage.Open(hero)
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), "/Hero/Hair")
+    stage.Save()
+    shot = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    shot.GetRootLayer().subLayerPaths.append("./hero.usda")
+    shot.GetPrimAtPath("/Hero/Hair").SetActive(False)
+    shot.Save()
+    words = [*shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape", bodies=["Body"])]
+    assert words == []
+    assert len(shown_otherwise(hero, str(tmp_path / "shot.usda"), garment="Cape")) == 1
+
+
+def test_a_shot_of_another_character_lacks_nothing(tmp_path):
+    hero = dressed(tmp_path, [0.0, 1.0])
+    (tmp_path / "other").mkdir()
+    stage = Usd.Stage.Open(dressed(tmp_path / "other", [0.0, 1.0]))
+    padded(stage)
+    for name in ("Body", "Cape"):
+        stage.RemovePrim(f"/Hero/{name}")
+    UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Padding")).GetFaceVertexIndicesAttr().Set([0, 2, 1, 0, 1, 3])
+    stage.Save()
+    assert shown_otherwise(hero, str(tmp_path / "other/hero.usda"), garment="Cape") == []
+
+
 def exported(stage: Usd.Stage, names: dict[str, str], folder: Path) -> str:
     """Write a shot as programs export it that give meshes other names; return its path."""
     layer = Sdf.Layer.CreateNew(str(folder / "exported.usda"))

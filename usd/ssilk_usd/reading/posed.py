@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.scene.assets import Floats
 
-from ..opening.stage import PRIMS, apply, column_matrix
+from ..opening.stage import EARLIEST, PRIMS, apply, column_matrix
 
 Skinned = dict[Usd.Prim, tuple[Usd.Prim, UsdSkel.SkeletonQuery, UsdSkel.SkinningQuery]]
 
@@ -47,7 +47,7 @@ class SkinnedMesh:
 
     def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
         """Return the posed points in stage units, shape (V, 3)."""
-        points = self.rest.Get(time)
+        points = self.rest.Get(EARLIEST)  # where UsdSkel begins, whatever later ones are
         if self.shapes:
             weights = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
             own = self.skinning.GetBlendShapeMapper().Remap(weights)

@@ -6,7 +6,7 @@ Blendshapes that it weighs otherwise or alone has, points that it has moved, poi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
@@ -14,18 +14,19 @@ from pxr import Usd, UsdGeom, UsdSkel
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Floats
+from ssilk_core.scene import kinematics
+from ssilk_core.scene.assets import Character, Floats, Motion
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, apply, needs_whole_files, open_stage
+from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage
 from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
-from .character import geom_to_core, is_skinned
+from .character import is_skinned, read_character
 from .clips import spread
-from .mesh import is_drawn, is_garment, is_rider
-from .motion import find_animation
-from .shapes import animated_shapes, shape_offsets, tell_animated_shapes
+from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in
+from .motion import find_animation, read_motion
+from .posed import posed_mesh, skinning_of
+from .shapes import animated_shapes, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
-from .skin import match_joints
 from .spaces import SkelSource
 
 SAME = 1e-3  # of a mesh's size, by which its points may differ unseen
@@ -39,10 +40,11 @@ def tell_shown_otherwise(
     *,
     root: str | None = None,
     garment: str | None = None,
+    bodies: Sequence[str] = (),
 ) -> None:
     """Report what of a character's meshes motions show otherwise than its stage, in which cloth does not meet them.
 
-    Args are those of `animated_shapes`, for each of several motions.
+    Args are those of `shown_otherwise`, for each of several motions.
 
     Raises:
         SsilkError: as `animated_shapes`.
@@ -51,7 +53,7 @@ def tell_shown_otherwise(
     tell_animated_shapes(source, paths, report, root=root, garment=garment)
     for motion in paths:
         weighed = {found.mesh for found in animated_shapes(source, motion, root=root, garment=garment)}
-        for text in shown_otherwise(source, motion, root=root, garment=garment, known=weighed):
+        for text in shown_otherwise(source, motion, root=root, garment=garment, bodies=bodies, known=weighed):
             report(Message(f"{motion}: {text}", "warning"))
 
 
@@ -62,6 +64,7 @@ def shown_otherwise(
     *,
     root: str | None = None,
     garment: str | None = None,
+    bodies: Sequence[str] = (),
     known: Iterable[str] = (),
 ) -> list[str]:
     """Return in words what a motion's stage shows of a character's meshes otherwise than the character's stage.
@@ -70,7 +73,11 @@ def shown_otherwise(
 
     Args:
         source, motion, root, garment: as for `animated_shapes`.
+        bodies: those that cloth meets, as for `read_character`.
         known: names of meshes whose shape is known to differ.
+
+    Raises:
+        SsilkError: as `read_motion` and `read_character`.
     """
     stage, (file, prim) = open_stage(source), split_location(motion)
     skel = find_skeleton(stage, root=root, garment=garment)
@@ -86,18 +93,18 @@ def shown_otherwise(
     if there.prim == skel.prim:
         return [*filter(None, found)]
     same = _same_meshes(there, own)
+    character = read_character(stage, root=root, bodies=bodies, garment=garment)
+    compared = _Compared(character, read_motion(of_motion, character.skeleton, prim=prim, root=root), there)
     for mesh, original in same.items():
-        if not is_garment(original) and _is_cache(mesh, there):
-            text = f"{mesh.GetName()} is a point cache, which is not followed"
+        name, body = mesh.GetName(), not is_garment(original)
+        if body and _is_cache(mesh, there):
+            text = f"{name} is a point cache, which is not followed"
             found.append(f"{text}; cloth meets it as its joints move it")
-    for mesh, original in same.items():
-        if bound_skeleton(mesh) != there.prim:
-            continue
-        name, known_by = mesh.GetName(), original.GetName()
-        if not is_garment(original) and known_by not in known and (away := _moved(original, skel, mesh, there)):
-            text = f"it shapes {name} otherwise, by up to {1000 * away:.3g} mm"
-            found.append(f"{text}; cloth meets the shape of the character's stage throughout")
+        elif body and original.GetName() not in known and (away := compared.away(original, mesh)) != 0:
+            found.append(_otherwise(name, away))
         found.append(_hidden(mesh, there))
+    shown = [mesh for mesh in own.values() if str(mesh.GetPath()) in compared.bodies and not is_stand_in(mesh)]
+    found += _other_bodies(shown, same, skel, there)
     return [*filter(None, found)]
 
 
@@ -113,7 +120,11 @@ def _same_meshes(there: SkelSource, own: Mapping[str, Usd.Prim]) -> dict[Usd.Pri
 
     They have its name, or its faces alone: programs add a namespace to names, or a number.
     """
-    meshes = [prim for prim in Usd.PrimRange(there.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    every = [prim for prim in Usd.PrimRange(there.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    bound = {prim.GetName() for prim in every if bound_skeleton(prim) == there.prim}
+    meshes = [
+        prim for prim in every if (to := bound_skeleton(prim)) == there.prim or not (to or prim.GetName() in bound)
+    ]
     found = {mesh: own[mesh.GetName()] for mesh in meshes if mesh.GetName() in own}
     others = [mesh for mesh in meshes if mesh not in found]
     missing = [mesh for mesh in own.values() if others and mesh not in found.values()]
@@ -132,54 +143,93 @@ def _faces(mesh: Usd.Prim) -> tuple[bytes, bytes]:
     return counts, indices
 
 
+def _otherwise(name: str, away: float | None) -> str:
+    """Return in words that a shot has a body of another shape, by so much [m], or of other points if None."""
+    how = "with other points" if away is None else f"by up to {1000 * away:.3g} mm"
+    return f"it shapes {name} otherwise, {how}; cloth meets the shape of the character's stage throughout"
+
+
 def _is_cache(mesh: Usd.Prim, skel: SkelSource) -> bool:
     """Return whether no joint moves a mesh, and its points change over time."""
     return not is_skinned(mesh, skel) and len(change_times([UsdGeom.Mesh(mesh).GetPointsAttr()])) > 1
 
 
-def _moved(own: Usd.Prim, skel: SkelSource, other: Usd.Prim, there: SkelSource) -> float:
-    """Return how far points of a mesh in a shot are at most from where its character has them [m]; 0 if unseen.
+class _Compared:
+    """Bodies as a motion's joints move those of the character, beside the meshes that its own stage shows."""
 
-    The same points are compared: a mesh of another number of points, or in another bind pose, is another one.
-    """
-    if not _same_binds(skel, there):
-        return 0.0
-    before = _core_points(own, skel, EARLIEST)
-    away = 0.0
-    for code in _codes(other, there):
-        after = _core_points(other, there, code)
-        if len(after) != len(before) or not len(before):
+    def __init__(self, character: Character, motion: Motion, there: SkelSource) -> None:
+        self.bodies = {
+            "/" + body.mesh.path.rpartition(":/")[2]: body for body in (*character.bodies, *character.stand_ins)
+        }
+        self.motion, self.skeleton, self.there = motion, character.skeleton, there
+        self.skinned = skinning_of(there.stage)
+
+    def away(self, own: Usd.Prim, other: Usd.Prim) -> float | None:
+        """Return how far points of a body are at most from where the motion shows them [m], 0 if unseen.
+
+        None: these are other points, and not in the same places.
+        """
+        body = self.bodies.get(str(own.GetPath()))
+        if body is None:
             return 0.0
-        away = max(away, float(np.linalg.norm(after - before, axis=1).max()))
-    return away if away > SAME * float(np.ptp(before, axis=0).max(initial=0)) else 0.0
+        codes = self._codes(other)
+        at = np.array(codes) * self.motion.fps / self.there.stage.GetTimeCodesPerSecond() - self.motion.start
+        frames = np.clip(at.round().astype(int), 0, self.motion.frame_count - 1)
+        shown, away = posed_mesh(other, self.skinned), 0.0
+        unseen = SAME * float(np.ptp(body.mesh.points, axis=0).max(initial=0))
+        for code, frame in zip(codes, frames):
+            rigid = self.motion.clip(frame, frame + 1)
+            world = kinematics.motion_transforms(rigid, self.skeleton.parents)
+            matrices = kinematics.skinning_matrices(world, self.skeleton.bind_transforms)
+            (met,) = kinematics.skin_points(body.mesh.points, body.skin, matrices)
+            seen = self.there.units.points_to_core(shown.points(Usd.TimeCode(code), UsdGeom.XformCache(code)))
+            unseen = max(unseen, 1e-6 * float(np.abs(met).max(initial=0)))  # of float32, far from the origin
+            if len(seen) != len(met):
+                return None if _nearest(met, seen) > unseen else 0.0
+            away = max(away, float(np.linalg.norm(seen - met, axis=1).max(initial=0)))
+        return away if away > unseen else 0.0
+
+    def _codes(self, mesh: Usd.Prim) -> list[float]:
+        """Return times of frames, and of changes of blendshapes that are at one or beyond them; some if many."""
+        rate = self.there.stage.GetTimeCodesPerSecond() / self.motion.fps
+        frames = (self.motion.start + np.arange(self.motion.frame_count)) * rate
+        animation = animation_source(self.there.prim).prim
+        shaped = animation and UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get()
+        times = np.array(change_times([UsdSkel.Animation(animation).GetBlendShapeWeightsAttr()] if shaped else []))
+        whole = np.abs((times - frames[0]) / rate % 1 - 0.5) > 0.49
+        times = times[(times < frames[0]) | (times > frames[-1]) | whole]
+        return sorted({*spread(frames, LOOKED_AT).tolist(), *spread(times, LOOKED_AT).tolist()})
 
 
-def _codes(mesh: Usd.Prim, skel: SkelSource) -> list[Usd.TimeCode]:
-    """Return times at which blendshapes of a mesh change, some of them if many; the earliest if none."""
-    animation = animation_source(skel.prim).prim
-    shaped = animation and UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get()
-    attributes = [UsdSkel.Animation(animation).GetBlendShapeWeightsAttr()] if shaped else []
-    times = spread(np.array(change_times(attributes)), LOOKED_AT)
-    return [Usd.TimeCode(time) for time in times.tolist()] or [EARLIEST]
+def _nearest(points: Floats, others: Floats) -> float:
+    """Return how far points are at most from the nearest of others; infinite without others."""
+    from scipy.spatial import cKDTree
+
+    return float(max(cKDTree(a).query(b)[0].max(initial=0) for a, b in ((points, others), (others, points))))
 
 
-def _core_points(mesh: Usd.Prim, skel: SkelSource, code: Usd.TimeCode) -> Floats:
-    """Return the points of a mesh with the blendshapes that are on, in the core's bind space [m], shape (V, 3).
-
-    UsdSkel begins with the earliest points, whatever later ones are.
-    """
-    points = np.array(UsdGeom.Mesh(mesh).GetPointsAttr().Get(EARLIEST) or [], dtype=np.float64).reshape(-1, 3)
-    offsets = shape_offsets(mesh, skel, code)
-    shaped = points if offsets is None or len(offsets) != len(points) else points + offsets
-    return apply(geom_to_core(mesh, skel), shaped)
+def _is_same_character(skel: SkelSource, there: SkelSource) -> bool:
+    """Return whether a file has a say in the skeletons of both a character's stage and a shot's."""
+    own, other = ({spec.layer.identifier for spec in each.prim.GetPrimStack()} for each in (skel, there))
+    return bool(own & other)
 
 
-def _same_binds(one: SkelSource, other: SkelSource) -> bool:
-    """Return whether the joints that two skeletons have in common are bound alike."""
-    match = np.array(match_joints(one.joints, other.joints))
-    binds = (one.binds_to_core(one.bind[match >= 0]), other.binds_to_core(other.bind[match[match >= 0]]))
-    size = float(np.abs(binds[0][:, :3, 3]).max(initial=0)) + SAME
-    return bool(np.abs(binds[0] - binds[1]).max(initial=0) < SAME * max(size, 1))
+def _other_bodies(
+    bodies: Iterable[Usd.Prim], same: Mapping[Usd.Prim, Usd.Prim], skel: SkelSource, there: SkelSource
+) -> Iterator[str]:
+    """Yield in words which bodies a shot lacks, and which it alone has, if it is a shot of this character."""
+    if not same and not _is_same_character(skel, there):
+        return
+    guides = [own for mesh, own in same.items() if UsdGeom.Imageable(mesh).ComputePurpose() == UsdGeom.Tokens.guide]
+    for body in bodies:
+        if body not in same.values() or body in guides:
+            text = f"it shows no mesh {body.GetName()} that is the character's"
+            yield f"{text}; cloth meets it, and it is seen in what is written"
+    extra = [mesh for mesh in _meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
+    for mesh in extra:
+        if not is_stand_in(mesh):
+            text = f"{mesh.GetName()} follows its skeleton and is not in the character's stage"
+            yield f"{text}; cloth does not meet it, and what is written lacks it"
 
 
 def _hidden(mesh: Usd.Prim, skel: SkelSource, where: str = "") -> str:
