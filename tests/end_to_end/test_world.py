@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel
 from ssilk_usd.reading.facts import read_provenance
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.shots.play import Shot
@@ -16,7 +16,7 @@ from ssilk_usd.shots.play import Shot
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
 from ssilk_core.delivery.bake.load import load_rollout
-from ssilk_core.delivery.bake.world import world_of
+from ssilk_core.delivery.bake.world import ShotSurroundings
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.parameters import seeing_colliders
 from ssilk_core.network.proximity import proximity, proximity_reach, proximity_size, proximity_vertices
@@ -99,8 +99,6 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     clip = Usd.Stage.Open("floored.usda")
     clip.GetPrimAtPath("/Set/Floor").GetAttribute("faceVertexCounts").Set([4], 3)  # what the solver cannot meet
     clip.GetRootLayer().Save()
-    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
-    assert "cloth meets" not in (told := capsys.readouterr().err) and "does not see colliders:" in told
     assert main([*BAKE, "floored.usda", "-o", "refined.usdc", "--refine", "1"]) == 2
     assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
@@ -144,6 +142,74 @@ def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says
     expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
     np.testing.assert_allclose(points_of("floored.usdc"), expected, atol=1e-5)
     assert np.abs(points_of("plain.usdc") - expected).max() > 1e-3
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_a_network_goes_on_without_a_collider_that_cannot_be_read(stage, capsys, sees):
+    if sees:
+        let_it_see("model.safetensors")
+    assert main([*BAKE, "floored.usda", "-o", "whole.usdc"]) == 0
+    clip = Usd.Stage.Open("floored.usda")
+    for path in "/Set/Bad", "/Set/Flat":
+        mesh = UsdGeom.Mesh.Define(clip, path)
+        mesh.CreatePointsAttr([(0, 0.9, 0), (1, 0.9, 0), (1, 0.9, 1) if path == "/Set/Bad" else (2, 0.9, 0)])
+        mesh.CreateFaceVertexCountsAttr([3])
+        mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+        UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    clip.GetPrimAtPath("/Set/Bad").GetAttribute("faceVertexCounts").Set([3], 3)
+    clip.GetRootLayer().Save()
+    capsys.readouterr()
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
+    told = capsys.readouterr().err
+    left_out = "warning: floored.usda:/Set/Bad: its faces change over time; the topology of a collider stays"
+    assert told.count(left_out) == 1 and "Cloth does not meet it." in told
+    assert told.count("floored.usda:/Set/Flat: no triangle of it has an area") == 1
+    assert ("the network sees /Set/Floor\n" in told) is sees
+    np.testing.assert_array_equal(points_of("network.usdc"), points_of("whole.usdc"))
+    assert main(["verify", "network.usdc"]) == 0
+    for command in ([*BAKE, "floored.usda", "--refine", "1"], [*SIMULATE, "floored.usda"]):
+        assert main([*command, "-o", "solved.usdc"]) == 2
+        assert "/Set/Bad: its faces change over time" in capsys.readouterr().err
+
+
+def test_a_wrong_name_is_answered_with_the_stages_that_were_searched_and_what_is_there(stage, capsys):
+    assert main([*BAKE, "floored.usda", "-o", "refused.usdc", "--collider", "Flor"]) == 2
+    told = capsys.readouterr().err
+    assert "--collider Flor: floored.usda and rigged.usda have no such prim; there are /Set/Floor in" in told
+    assert "did you mean '/Set/Floor'?" not in told and "did you mean 'Floor'?" in told
+
+
+def capsule_on(path: str, name: str, radius: float, height: float, at: tuple[float, float, float]) -> None:
+    """Add a capsule that collides and goes with the hips of the toy's clip, as a ragdoll's do."""
+    clip = Usd.Stage.Open(path)
+    shape = UsdGeom.Capsule.Define(clip, f"/Ragdoll/{name}")
+    for attribute, value in ((shape.CreateRadiusAttr(), radius), (shape.CreateHeightAttr(), height)):
+        attribute.Set(value)
+    shape.CreateAxisAttr("Y")
+    place, hips = shape.AddTranslateOp(), UsdSkel.Animation(clip.GetPrimAtPath("/Clip")).GetTranslationsAttr()
+    for code in hips.GetTimeSamples():
+        sway = hips.Get(code)[0][0]
+        place.Set(Gf.Vec3d(at[0] + sway, *at[1:]), code)
+    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
+    clip.GetRootLayer().Save()
+
+
+def test_shapes_inside_the_body_are_its_own_unless_they_are_asked_for(stage, capsys):
+    """The body is a pillar of a radius of 15 cm."""
+    capsule_on("floored.usda", "Trunk", 0.13, 0.5, (0, 1.0, 0))
+    capsule_on("floored.usda", "Beside", 0.13, 0.5, (0.3, 1.0, 0))
+    command = [*SIMULATE, "floored.usda", "-o"]
+    assert main([*command, "own.usdc"]) == 0
+    told = capsys.readouterr().err
+    own = "floored.usda: cloth does not meet /Ragdoll/Trunk, inside the character's body in each frame, as"
+    assert told.count(own) == 1 and "cloth meets /Set/Floor, /Ragdoll/Beside\n" in told
+    assert main([*command, "asked.usdc", "--collider", "Trunk"]) == 0
+    told = capsys.readouterr().err
+    assert own not in told and "cloth meets /Set/Floor, /Ragdoll/Trunk, /Ragdoll/Beside\n" in told
+    let_it_see("model.safetensors")
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
+    told = capsys.readouterr().err
+    assert told.count(own) == 1 and "the network sees /Set/Floor, /Ragdoll/Beside\n" in told
 
 
 def test_gusts_are_the_same_in_whatever_range_of_a_shot(toy, stage):
@@ -206,7 +272,7 @@ def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
     assert main(["verify", "seen.usdc"]) == 0
     player, motion = Player.load("seeing.safetensors"), read_motion("floored.usda", file.scene.character.skeleton)
     scene = player.file.scene
-    world = world_of("floored.usda", "rigged.usda", scene, motion, None)
+    world = ShotSurroundings("floored.usda", "rigged.usda", scene, motion, None).seen
     rows, reach = proximity_vertices(scene, config), proximity_reach(scene)
     near = felt_proximity(world, motion, scene, rows, reach, partial(proximity, reach=reach))
     assert len(world.colliders) == 1 and np.abs(near).max() > 0.5
