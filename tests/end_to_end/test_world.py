@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 
@@ -24,6 +25,7 @@ from ssilk_core.network.runtime import Player
 from ssilk_core.physics.world.felt import felt_proximity
 from ssilk_core.scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices
 
+CLIPS = ("floored", "plain")
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
 
 
@@ -142,6 +144,41 @@ def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says
     expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
     np.testing.assert_allclose(points_of("floored.usdc"), expected, atol=1e-5)
     assert np.abs(points_of("plain.usdc") - expected).max() > 1e-3
+
+
+def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
+    clip = Usd.Stage.Open("floored.usda")
+    box = UsdGeom.Cube.Define(clip, "/Set/Box")  # around the body, above the floor
+    box.CreateSizeAttr(0.4)
+    box.AddTranslateOp().Set((0, 0.95, 0))
+    UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+    clip.GetRootLayer().Save()
+    baked = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion"]
+    for more in ([], ["--lbs"], ["--refine", "2", "--refined-output", "points"]):
+        assert main([*baked, "floored.usda", "-o", "shot.usdc", *more]) == 0
+        told, found = capsys.readouterr().err, points_of("shot.usdc")
+        depths = FLOOR - found[..., 1], 0.2 - np.abs(found - [0, 0.95, 0]).max(axis=-1)
+        under, boxed = (depth > 5e-3 for depth in depths)
+        share = (under | boxed).mean(axis=1)
+        said = read_provenance("shot.usdc")["sunk_cloth"]
+        assert said["frames"] == 5 and said["mean"] == pytest.approx(share.mean(), rel=1e-3)
+        assert said["worst"] == pytest.approx(share.max(), rel=1e-3) and said["frame"] == share.argmax()
+        together = under.sum() + boxed.sum()
+        assert boxed.any() and said["colliders"] == pytest.approx(
+            {"/Set/Floor": under.sum() / together, "/Set/Box": boxed.sum() / together}, abs=1e-4
+        )
+        assert said["deepest"] == pytest.approx(max(depth.max() for depth in depths), rel=1e-3)
+        assert f"cloth inside colliders: {share.mean():.3%}, in 5 frames" in told
+        assert f"{share.max():.2%}, floored at time code {share.argmax()}" in told and "/Set/Floor" in told
+    layers = [*baked, "floored.usda", "plain.usda", "-o", "layers"]
+    assert main(layers) == 0
+    records = [json.loads(next((stage / f"layers/shots/{shot}").glob("*/bake.json")).read_text()) for shot in CLIPS]
+    assert records[0]["detail"]["sunk"]["frames"] == 5 and "sunk" not in records[1]["detail"]
+    capsys.readouterr()
+    assert main(layers) == 0 and "current" in capsys.readouterr().err
+    assert main([*baked, "plain.usda", "-o", "plain.usdc"]) == 0
+    assert "colliders" not in capsys.readouterr().err and "sunk_cloth" not in read_provenance("plain.usdc")
+    assert main(["verify", "shot.usdc"]) == 0
 
 
 @pytest.mark.parametrize("sees", [True, False])

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib.util import find_spec
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
@@ -135,8 +136,8 @@ class ShotSurroundings:
 
     def _without_own_shapes(self, world: ShotWorld | None) -> ShotWorld | None:
         """Return a world without the shapes that stand for the character's own body, unless they were asked for."""
-        if world is None or not (world.colliders and self._scene.character.bodies):
-            return world
+        if world is None or not (world.colliders and self._scene.character.bodies) or find_spec("igl") is None:
+            return world  # networks that see none are baked without libigl, too
         from ...physics.world.own_shapes import OwnShapes
 
         shapes, asked = OwnShapes(self._scene, self.motion), self.found.asked
@@ -151,17 +152,12 @@ class ShotSurroundings:
 
 def listed(colliders: Sequence[Collider]) -> str:
     """Return the paths of colliders in their stage, the first few of many."""
-    paths = [prim_of(each) for each in colliders]
+    paths = [each.name for each in colliders]
     return f"{', '.join(paths[:4])}{f' and {len(paths) - 4} more' if len(paths) > 4 else ''}"
 
 
 def _file_of(colliders: Sequence[Collider]) -> str:
     return split_location(colliders[0].path)[0]
-
-
-def prim_of(collider: Collider) -> str:
-    """Return the path of a collider in its stage."""
-    return split_location(collider.path)[1] or collider.path
 
 
 @dataclass(frozen=True)

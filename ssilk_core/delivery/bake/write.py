@@ -103,6 +103,7 @@ def result_of(
         recovered=tuple(rollout.recovered),
         shown_skin=counts.shown_skin,
         intersections=counts.intersections,
+        sunk=counts.sunk,
     )
 
 

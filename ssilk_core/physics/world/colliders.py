@@ -27,12 +27,12 @@ class PosedCollider:
     """A collider in one frame, relative to the character's root.
 
     Attributes:
-        path: of its mesh, as `Collider` has it.
+        name: as `Collider` has it.
         points: of its mesh, shape (P, 3).
     """
 
-    def __init__(self, path: str, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats) -> None:
-        self.path = path
+    def __init__(self, name: str, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats) -> None:
+        self.name = name
         self._surface, self._turn, self._place = surface, turn, place
         self._sides = surface.outside(self._inward(carried))
         self._known: tuple[Floats, Floats] | None = None
@@ -139,7 +139,7 @@ class ColliderPoser:
             if key not in self._still:
                 self._still[key] = self._surfaces[key].at(collider.points[0], self._search)
             surface = self._still[key]
-        return PosedCollider(collider.path, surface, place[:3, :3], place[:3, 3] - root, carried)
+        return PosedCollider(collider.name, surface, place[:3, :3], place[:3, 3] - root, carried)
 
 
 def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
@@ -148,6 +148,12 @@ def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])
     return skin_points(scene.garment.mesh.points[rows], own, matrices)
+
+
+def voting_points(motion: Motion, scene: Scene) -> Floats:
+    """Return vertices of a garment by which floors have their outside, as `carried_points`, shape (F, P, 3)."""
+    count = scene.garment.mesh.vertex_count
+    return carried_points(motion, scene, np.linspace(0, count - 1, min(VOTERS, count)).astype(int))
 
 
 def _placed(placements: Floats, world: ShotWorld, seconds: float) -> Floats:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...scene.assets import Collider, Floats, Motion, Scene
 from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
-from .colliders import VOTERS, carried_points
+from .colliders import voting_points
 from .surface import CollisionSurface, PosedSurface, Search, boxes
 
 INSIDE = 0.7  # share of a shape that lies inside the body, from which on it is the body's own
@@ -59,10 +59,8 @@ class OwnShapes:
             motion, scene = self._motion.picked(np.array([frame])), self._scene
             body, skeleton = scene.character.merged_body(), scene.character.skeleton
             matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-            count = scene.garment.mesh.vertex_count
-            voters = np.linspace(0, count - 1, min(VOTERS, count)).astype(int)
             points = skin_points(body.mesh.points, body.skin, matrices)[0]
-            self._posed[frame] = points, carried_points(motion, scene, voters)[0]
+            self._posed[frame] = points, voting_points(motion, scene)[0]
         return self._posed[frame]
 
     def _skin(self, frame: int) -> tuple[PosedSurface, Floats]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import fail
+from ...files import split_location
 from .arrays import Floats, Ints, assign, frozen, need_finite
 from .mesh import Mesh
 
@@ -51,6 +52,11 @@ class Collider:
         if not np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max() < RIGID_TOLERANCE:
             fail(self.path, "a placement that scales or shears", "placements are rigid")
         assign(self, faces=faces, points=points, placements=placements, present=present)
+
+    @property
+    def name(self) -> str:
+        """Its path in its stage, or what else its source is called."""
+        return split_location(self.path)[1] or self.path
 
 
 @dataclass(frozen=True, eq=False)
