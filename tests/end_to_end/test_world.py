@@ -176,6 +176,13 @@ def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
     assert records[0]["detail"]["sunk"]["frames"] == 5 and "sunk" not in records[1]["detail"]
     capsys.readouterr()
     assert main(layers) == 0 and "current" in capsys.readouterr().err
+    for shot, page in ("shot.usdc", "file"), ("layers/shots/floored/shot.usda", "layers"):
+        assert main(["report", shot, "-o", f"{page}.html"]) == 0
+        assert ": cloth in colliders: " in capsys.readouterr().err
+        assert "it is inside colliders" in (text := (stage / f"{page}.html").read_text())
+        assert "of its vertices were more than 5 mm inside colliders on average" in text and "/Set/Floor" in text
+    assert main(["report", "layers/shots/plain/shot.usda", "-o", "plain.html"]) == 0
+    assert "colliders" not in capsys.readouterr().err and "inside colliders" not in (stage / "plain.html").read_text()
     assert main([*baked, "plain.usda", "-o", "plain.usdc"]) == 0
     assert "colliders" not in capsys.readouterr().err and "sunk_cloth" not in read_provenance("plain.usdc")
     assert main(["verify", "shot.usdc"]) == 0

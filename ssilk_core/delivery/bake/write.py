@@ -104,6 +104,7 @@ def result_of(
         shown_skin=counts.shown_skin,
         intersections=counts.intersections,
         sunk=counts.sunk,
+        entered=counts.entered,
     )
 
 

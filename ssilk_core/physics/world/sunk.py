@@ -13,7 +13,7 @@ from .colliders import ColliderPoser, Nearby
 from .surface import Search, boxes
 
 DEPTH = 5e-3  # [m] inside a collider from which on a vertex counts: less is hidden by its own thickness
-MOST_MEAN = 1e-3  # share of the vertices on average, which the eye finds
+MOST_SUNK = 1e-3  # share of the vertices on average, which the eye finds
 LISTED = 4  # colliders that figures name
 
 
