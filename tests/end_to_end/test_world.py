@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel
 from ssilk_usd.reading.facts import read_provenance
 from ssilk_usd.reading.motion import read_motion
@@ -186,6 +188,41 @@ def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
     assert main([*baked, "plain.usda", "-o", "plain.usdc"]) == 0
     assert "colliders" not in capsys.readouterr().err and "sunk_cloth" not in read_provenance("plain.usdc")
     assert main(["verify", "shot.usdc"]) == 0
+
+
+def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys):
+    clip = Usd.Stage.Open("floored.usda")
+    box = UsdGeom.Cube.Define(clip, "/Set/Box")
+    box.CreateSizeAttr(0.6)
+    place = box.AddTranslateOp()
+    for code in range(5):
+        place.Set((-0.9 + 0.2 * code, 1.0, -0.6), code)
+    UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+    clip.GetRootLayer().Save()
+    baked = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "floored.usda", "plain.usda"]
+    assert main([*baked, "-o", "layers"]) == 0
+    assert main([*baked[:-1], "-o", "shot.usdc"]) == 0
+    with_box, found = prop_pixels("shot.usdc"), prop_pixels("layers/shots/floored/shot.usda")
+    np.testing.assert_array_equal(with_box, found)
+    assert with_box[0].sum() > 200 and prop_pixels("layers/shots/plain/shot.usda").sum() == 0
+    middles = [np.argwhere(each)[:, 1].mean() for each in with_box]
+    assert middles[0] + 10 < middles[1]  # it moves
+    capsys.readouterr()
+    Path("floored.usda").unlink()
+    assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
+    told = capsys.readouterr().err
+    assert "warning: shot.usdc: the colliders that it met are not drawn: shot.usdc: the motion that it was baked" in told
+
+
+SHEET = ["--columns", "2", "--size", "200x200", "--azimuth", "0"]
+
+
+def prop_pixels(shot: str) -> np.ndarray:
+    """Which pixels of the first and the last frame of a shot have the colour of props, bluer than all else."""
+    assert main(["view", shot, "-o", "sheet.png", *SHEET]) == 0
+    picture = np.asarray(Image.open("sheet.png").convert("RGB")).astype(int)
+    panels = np.stack([picture[:, :200], picture[:, -200:]])
+    return (panels[..., 2] > panels[..., 0] + 12) & (panels.sum(axis=-1) < 3 * 175)
 
 
 @pytest.mark.parametrize("sees", [True, False])

@@ -119,11 +119,10 @@ class ColliderPoser:
         near: Nearby | None,
     ) -> PosedCollider | None:
         """Return a collider at a time; None where cloth does not meet it then."""
-        frame = min(max(int(seconds * world.fps + 1e-6), 0), len(collider.present) - 1)
-        if not collider.present[frame]:
+        if not collider.is_there(world.fps, seconds):
             return None
         key = id(collider)
-        place = _placed(collider.placements, world, seconds)
+        place = placed_at(collider.placements, world, seconds)
         if near:
             if key not in self._balls:
                 low, high = collider.points.min(axis=(0, 1)), collider.points.max(axis=(0, 1))
@@ -156,7 +155,7 @@ def voting_points(motion: Motion, scene: Scene) -> Floats:
     return carried_points(motion, scene, np.linspace(0, count - 1, min(VOTERS, count)).astype(int))
 
 
-def _placed(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
+def placed_at(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
     """Return the placement (4, 4) at a time; between frames it turns at a constant rate."""
     low, part = frame_at(seconds, world.fps, len(placements))
     if part == 0:

@@ -53,6 +53,11 @@ class Collider:
             fail(self.path, "a placement that scales or shears", "placements are rigid")
         assign(self, faces=faces, points=points, placements=placements, present=present)
 
+    def is_there(self, fps: float, seconds: float) -> bool:
+        """Return whether cloth meets it at a time since the first frame."""
+        frame = min(max(int(seconds * fps + 1e-6), 0), len(self.present) - 1)
+        return bool(self.present[frame])
+
     @property
     def name(self) -> str:
         """Its path in its stage, or what else its source is called."""
