@@ -21,7 +21,6 @@ from helpers.reports import table, write_results
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.settings import PROXIMITY_POINTS, ModelConfig
 from ssilk_core.physics.collision import CollisionBody
-from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import (
     LOOSE,
@@ -160,7 +159,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if options.only:
-        print(json.dumps(measure(*json.loads(options.only), torch.device(options.device))))
+        vertices, body, frames, surface, colliders = json.loads(options.only)
+        print(json.dumps(measure(vertices, body, frames, surface, colliders, torch.device(options.device))))
         return
     cases = [(vertices, BODY, frames, "triangles", 0.0) for vertices in VERTICES for frames in FRAMES]
     cases += [(vertices, BODY // 4, FRAMES[-1], "triangles", 0.0) for vertices in VERTICES]

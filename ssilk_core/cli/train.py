@@ -213,7 +213,8 @@ def _need_settings_of(base: ModelConfig, model: ModelConfig, train: TrainConfig,
         if name == "static_fraction" and train.static_fraction:
             what = "training that goes on from a model has no static part"
             fail(where, what, "0 is allowed", "leave it out")
-        if name == "collider_fraction" and train.collider_fraction and not (base.proximity_points or options.start_from):
+        blind = options.stepper_of and not base.proximity_points
+        if name == "collider_fraction" and train.collider_fraction and blind:
             what = "the given model sees no colliders, and its stepper alone cannot learn to"
             fail(where, what, "0 is allowed", "leave it out, or give --start-from in place of --stepper-of")
 

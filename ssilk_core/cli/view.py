@@ -64,7 +64,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if suffix == PAGE:
         count = _write_page(options.output, players, labels, report)
     elif film:
-        count = film_of_shots(options.output, players, labels=labels, fps=options.fps, look=look, props=props, report=report)
+        count = film_of_shots(
+            options.output, players, labels=labels, fps=options.fps, look=look, props=props, report=report
+        )
     else:
         count = sheet_of_shots(
             options.output,

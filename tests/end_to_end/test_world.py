@@ -211,7 +211,7 @@ def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys)
     Path("floored.usda").unlink()
     assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
     told = capsys.readouterr().err
-    assert "warning: shot.usdc: the colliders that it met are not drawn: shot.usdc: the motion that it was baked" in told
+    assert "warning: shot.usdc: the colliders that it met are not drawn: the motion that it was baked" in told
 
 
 SHEET = ["--columns", "2", "--size", "200x200", "--azimuth", "0"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is counted in a written file: covered skin that shows, cloth that passes through cloth, and cloth in colliders.
+"""What is counted in a written file: covered skin that shows, cloth through cloth, and cloth in colliders.
 
 Its own meshes are posed as its format says. Skin and colliders are counted in every frame, and triangles that
 intersect others in every `EVERY`-th from the first.
@@ -64,7 +64,7 @@ class ShotCounts:
 
 @dataclass(frozen=True, eq=False)
 class MetWorld:
-    """What surrounds the character of a shot, and the time of each of its samples there, from its first frame on [s]."""
+    """What surrounds the character of a shot, and the time of each of its samples in it [s]."""
 
     world: ShotWorld
     seconds: Callable[[int], float]
@@ -132,11 +132,12 @@ def state_counts(
         samples = samples_per_frame * np.arange(first, first + len(some))
         if sunk and met:
             voters = voting_points(motion.picked(samples), scene)
-            for cloth_points, each, sample, time in zip(posed, voters, samples.tolist(), some):
-                sunk.add(cloth_points[garment], each, met.seconds(sample), time)
-        for each, time in zip(posed, some) if entered else ():
-            ridden = [points for mesh, points in zip(shot.meshes, each) if mesh.is_rider]
-            entered.add(each[garment], ridden, time)
+            for points_there, votes, sample, time in zip(posed, voters, samples.tolist(), some):
+                sunk.add(points_there[garment], votes, met.seconds(sample), time)
+        if entered:
+            for each, time in zip(posed, some):
+                ridden = [points for mesh, points in zip(shot.meshes, each) if mesh.is_rider]
+                entered.add(each[garment], ridden, time)
         if skin:
             bodies = None if body is None else [np.concatenate([each[mesh] for mesh in body]) for each in posed]
             shown.append(_shown([each[garment] for each in posed], skin, bodies, scene, motion, some, samples))

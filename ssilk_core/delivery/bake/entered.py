@@ -37,7 +37,8 @@ class EnteredCloth:
 
     def summary(self, clock: str = "frame") -> dict[str, str]:
         """Return figures for people; `clock` is what `frame` counts."""
-        return {f"{self.rider} enters the cloth by": f"{1000 * self.depth:.1f} mm, {self.clip} at {clock} {self.frame:g}"}
+        when = f"{self.clip} at {clock} {self.frame:g}"
+        return {f"{self.rider} enters the cloth by": f"{1000 * self.depth:.1f} mm, {when}"}
 
     def to_metadata(self) -> dict[str, object]:
         """Return figures of four digits, as a shot stores them by the rider's name."""

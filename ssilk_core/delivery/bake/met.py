@@ -34,11 +34,12 @@ def props_of(shot: Path, report: Reporter) -> ShotProps | None:
     try:
         asked = read_origin(shot, {}).request
         # Nothing is played again.
-        still = {"lbs": True, "refine": 0, "feedback": False, "latent_iterations": 0, "keep": None}
-        rollout = load_rollout(replace(asked, **still))
+        still = replace(asked, lbs=True, refine=0, feedback=False, latent_iterations=0, keep=None)
+        rollout = load_rollout(still)
         world = rollout.around.seen
     except (SsilkError, ModuleNotFoundError) as error:  # a place for pictures alone may have no torch
-        report(Message(f"{shot}: the colliders that it met are not drawn: {error}", "warning"))
+        why = str(error).removeprefix(f"{shot}: ").partition("; ")[0]
+        report(Message(f"{shot}: the colliders that it met are not drawn: {why}", "warning"))
         return None
     samples = asked.samples_per_frame
     return ShotProps(world, lambda frame: rollout.seconds(frame * samples)) if world else None

@@ -90,9 +90,14 @@ class ShotSurroundings:
         from ssilk_usd.reading.world import find_world
 
         garment = split_location(self._scene.garment.mesh.path)[1]
-        character, report = self._scene.character, self._events.append
         return find_world(
-            self.source, self._stage, character, self.motion, self._asked, garment=garment, report=report
+            self.source,
+            self._stage,
+            self._scene.character,
+            self.motion,
+            self._asked,
+            garment=garment,
+            report=self._keep,
         )
 
     def read(self, report: Reporter) -> ShotWorld | None:
@@ -114,7 +119,7 @@ class ShotSurroundings:
         Raises:
             SsilkError: as `found`.
         """
-        return self._without_own_shapes(self.found.read(lenient=self._events.append))
+        return self._without_own_shapes(self.found.read(lenient=self._keep))
 
     @property
     def colliders(self) -> tuple[Collider, ...]:
@@ -125,6 +130,9 @@ class ShotSurroundings:
     def pull(self) -> ShotWorld:
         """Gravity and wind alone, for which no shape is read."""
         return ShotWorld(self.found.fps, (), self.found.gravity, self.found.air)
+
+    def _keep(self, event: Event) -> None:
+        self._events.append(event)
 
     def tell(self, report: Reporter) -> None:
         """Report what was found out so far, each thing once."""

@@ -78,9 +78,7 @@ def shot_sections(
     return [first, Section("The shot", played([player]), plays=True), *between, *others]
 
 
-def _sections(
-    player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None
-) -> list[Section]:
+def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # a raised garment is no worse
     apart = max(1, round(APART * player.fps))

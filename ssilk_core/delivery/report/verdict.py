@@ -87,8 +87,8 @@ def verdict(
         if sunk.mean > MOST_SUNK:
             faults.append("it is inside colliders")
         most = f", {sunk.worst:.1%} at most, in frame {sunk.frame:g} ({sunk.where})" if sunk.worst else ""
-        share = f"{sunk.mean:.2%} of its vertices were more than {1000 * DEPTH:g} mm inside colliders on average{most}"
-        words.append(f"{share.replace('%', ' %')}, as its bake counted.")
+        share = f"{sunk.mean:.2%} of its vertices were more than {1000 * DEPTH:g} mm inside colliders"
+        words.append(f"{share} on average{most}, as its bake counted.".replace("%", " %"))
     first = (
         f"Look at {name}: {' and '.join(faults)}." if faults else f"{name} holds: nothing that the eye would find."
     )

@@ -35,8 +35,8 @@ def test_more_of_anything_needs_more(scene):
     base = step.needed(64)
     wider = replace(MODEL, widths=(256, 512, 513))
     assert step.needed(65) > base
-    more = {"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"contours": True}, {"obstacles": True}
-    for change in (*more, {"model": wider}):
+    more = {"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"contours": True}
+    for change in (*more, {"obstacles": True}, {"model": wider}):
         assert replace(step, **change).needed(64) > base
 
 
