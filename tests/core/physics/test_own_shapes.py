@@ -64,7 +64,7 @@ def capsule(radius: float, height: float = 0.2) -> trimesh.Trimesh:
     return along_the_arm(trimesh.creation.capsule(height=height, radius=radius, count=(24, 24)))
 
 
-@pytest.mark.parametrize(("radius", "is_own"), [(0.03, True), (0.056, True), (0.07, False)])
+@pytest.mark.parametrize(("radius", "is_own"), [(0.03, True), (0.063, True), (0.08, False)])
 def test_capsules_of_a_limb_are_its_own_though_they_stick_out_a_little(dressed, motion, radius, is_own):
     found = posed("/Ragdoll/Arm", capsule(radius, 0.08), carried(motion, 1))
     assert OwnShapes(dressed, motion).has(found) is is_own
