@@ -2,9 +2,9 @@
 """Colliders that stand for the character's own body: capsules of ragdolls, and other shapes of physics rigs.
 
 They collide for a rigid body solver. Cloth meets the body that they fill, so as props they would only push it off
-skin that it may touch. Such a shape lies inside the body in each frame: half of its volume or more, or of its area where
-it is open. Much of a capsule in a limb may stick out, as the limb is not round; hardly any of a bracelet is inside, and
-of a chair what its cushion overlaps.
+skin that it may touch. Such a shape lies inside the body in each frame: half of its volume or more, or of its area
+where it is open. Much of a capsule in a limb may stick out, as the limb is not round; hardly any of a bracelet is
+inside, and of a chair what its cushion overlaps.
 """
 
 from __future__ import annotations
