@@ -11,6 +11,7 @@ import argparse
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,9 +19,8 @@ from helpers.peak import Peak
 from helpers.reports import table, write_results
 
 from ssilk_core.network.model.network import GarmentModel
-from ssilk_core.network.settings import ModelConfig
+from ssilk_core.network.settings import PROXIMITY_POINTS, ModelConfig
 from ssilk_core.physics.collision import CollisionBody
-from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import (
     LOOSE,
@@ -41,6 +41,7 @@ from ssilk_core.scene.kinematics import local_transforms, rigid
 from ssilk_core.training.memory import StepMemory, decoded_frames
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.objective import Objective
+from ssilk_core.training.obstacles import ObstacleDrawer
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.shape_smoothing import ShapeSmoothing
 from ssilk_core.training.step import Stepper
@@ -48,11 +49,13 @@ from ssilk_core.training.windows import WindowSampler
 
 VERTICES, FRAMES, BODY = (500, 1500, 3000), (32, 64, 128), 4000
 JOINTS, PROXIES, WINDOW, MOTION = 24, 20, 16, 200
+COLLIDERS = 0.25  # share of poses with obstacles
 HEADER = [
     "garment vertices",
     "body vertices",
     "frames",
     "surface",
+    "with obstacles",
     "measured [MiB]",
     "predicted [MiB]",
     "predicted / measured",
@@ -99,7 +102,7 @@ def scene(vertices: int, body_vertices: int) -> Scene:
 
 
 def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
-    bones, model = whole.character.skeleton, ModelConfig()
+    bones, model = whole.character.skeleton, model_config(config)
     turns = np.random.default_rng(0).normal(scale=0.02, size=(MOTION, JOINTS, 4)) + [1, 0, 0, 0]
     places = np.broadcast_to(bones.rest_transforms[:, :3, 3], (MOTION, JOINTS, 3))
     joints = np.arange(JOINTS)
@@ -108,17 +111,26 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     energy = GarmentEnergy(whole.garment.mesh, Fabric("default"), whole.classes, device=device)
     body = CollisionBody(whole.character.merged_body(), JOINTS, device=device)
     generator = torch.Generator(device).manual_seed(0)
-    sampler = WindowSampler(bank, config, model.latent, generator)
-    objective = Objective(network, energy, body, bank, config.closest_point == "triangles")
+    drawer = None
+    if config.collider_fraction:
+        drawer = ObstacleDrawer(whole, model, bank, 0, config.collider_fraction, generator)
+    sampler = WindowSampler(bank, config, model.latent, generator, drawer)
+    objective = Objective(network, energy, body, bank, config.closest_point == "triangles", drawer=drawer)
     return Stepper(network, objective, sampler, config, smoothing=ShapeSmoothing.of(network, config.shape_smoothing))
 
 
-def measure(vertices: int, body_vertices: int, frames: int, surface: str, device: torch.device) -> dict[str, int]:
+def model_config(config: TrainConfig) -> ModelConfig:
+    return ModelConfig(proximity_points=PROXIMITY_POINTS if config.collider_fraction else 0)
+
+
+def measure(
+    vertices: int, body_vertices: int, frames: int, surface: str, colliders: float, device: torch.device
+) -> dict[str, int]:
     """Return the measured and the predicted peak of a step that decodes `frames` at once [bytes]."""
     whole = scene(vertices, body_vertices)
     config = TrainConfig(
         batch=frames // (2 * WINDOW), static_batch=frames // 2, window=WINDOW, pretraining_batch=frames,
-        closest_point=surface,
+        closest_point=surface, collider_fraction=colliders,
     )  # fmt: skip
     assert decoded_frames(config, config.batch) == frames
     steps = stepper(whole, config, device)
@@ -127,12 +139,12 @@ def measure(vertices: int, body_vertices: int, frames: int, surface: str, device
         steps.run(iteration)
         steps.run(iteration + 1)  # beside the optimiser's moments, which the first step makes
     body = whole.character.bodies[0].mesh.vertex_count
-    samples = len(contact_samples(whole.garment.mesh, Fabric("default")).area)
-    predicted = StepMemory(whole, ModelConfig(), body, samples).needed(frames)
+    memory = StepMemory.of(whole, model_config(config), replace(config, shape_smoothing=0), Fabric("default"), body)
+    predicted = replace(memory, contours=False).needed(frames)
     return {"measured": peak.bytes(), "predicted": predicted}
 
 
-def measured_apart(case: tuple[int, int, int, str], options: argparse.Namespace) -> dict[str, int]:
+def measured_apart(case: tuple[int, int, int, str, float], options: argparse.Namespace) -> dict[str, int]:
     """Measure in a process of its own: what another measurement left behind would hide a peak."""
     words = [sys.executable, __file__, "--threads", str(options.threads), "--device", options.device, "--only"]
     done = subprocess.run([*words, json.dumps(case)], capture_output=True, text=True, check=True)
@@ -147,12 +159,12 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if options.only:
-        vertices, body, frames, surface = json.loads(options.only)
-        print(json.dumps(measure(vertices, body, frames, surface, torch.device(options.device))))
+        vertices, body, frames, surface, colliders = json.loads(options.only)
+        print(json.dumps(measure(vertices, body, frames, surface, colliders, torch.device(options.device))))
         return
-    cases = [(vertices, BODY, frames, "triangles") for vertices in VERTICES for frames in FRAMES]
-    cases += [(vertices, BODY // 4, FRAMES[-1], "triangles") for vertices in VERTICES]
-    cases += [(vertices, BODY, FRAMES[-1], "vertices") for vertices in VERTICES]
+    cases = [(vertices, BODY, frames, "triangles", 0.0) for vertices in VERTICES for frames in FRAMES]
+    cases += [(vertices, BODY // 4, FRAMES[-1], "triangles", 0.0) for vertices in VERTICES]
+    cases += [(vertices, BODY, FRAMES[-1], "vertices", share) for vertices in VERTICES for share in (0.0, COLLIDERS)]
     rows, results = [], []
     for case in cases:
         found = measured_apart(case, options)

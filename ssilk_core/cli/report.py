@@ -19,6 +19,7 @@ from ..events import Reporter, Result, Started
 from ..files import replacing
 from ..physics.intersections.figures import LAYERS, LayerFigures, SelfIntersections
 from ..physics.skin.figures import ShownSkin
+from ..physics.world.sunk import SunkCloth
 from ..scene.fabrics import Fabric
 from .options import check_output
 
@@ -76,6 +77,8 @@ def _told(figures: dict[str, Any]) -> dict[str, object]:
         found[name] = str(ShownSkin(**skin)) if skin else "it covers no skin"
         if crossed := own.get("intersections"):
             found[f"{name}: cloth through cloth"] = str(SelfIntersections(**crossed))
+        if sunk := own.get("sunk_cloth"):
+            found[f"{name}: cloth in colliders"] = str(SunkCloth(**sunk))
         if own.get("non-finite frames"):
             found[f"{name}: frames that are not finite"] = own["non-finite frames"]
     return found
@@ -100,6 +103,7 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     from ssilk_usd.shots.read import read_parts
     from ssilk_usd.writing.body_faces import open_with_full_bodies
 
+    from ..delivery.bake.counted import stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
 
@@ -117,7 +121,8 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
         fail(str(path), "the shot has no frames", "at least one is needed")
     others = {index for index, mesh in enumerate(shot.meshes) if mesh.is_garment or mesh.is_rider}
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
-    sections = shot_sections(shot, garments, bodies, report)
+    sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
+    sections = shot_sections(shot, garments, bodies, report, sunk=sunk)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     return [*sections, Section("Provenance", facts({**read_provenance(path), **records}))]
 

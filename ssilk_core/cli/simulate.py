@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from ..delivery.bake import naming
 from ..delivery.bake.request import parse_range
-from ..delivery.bake.world import asked_world, world_of
+from ..delivery.bake.world import ShotSurroundings, asked_world
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
 from ..files import replacing
@@ -190,7 +190,8 @@ def _written(
     simulator = Simulator(scene, fabric, settings, device=device, report=report)
     motions = [shot.motion for shot in shots]
     stage = str(options.stage)
-    worlds = [world_of(shot.source, stage, scene, shot.motion, shot.asked, report) for shot in shots]
+    around = [ShotSurroundings(shot.source, stage, scene, shot.motion, shot.asked) for shot in shots]
+    worlds = [each.read(report) for each in around]
     played = shots_of(motions, scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))

@@ -176,6 +176,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     base = load_model(trained) if trained else None
     if base:
         _need_settings_of(base.config, model, train, options)
+        if options.stepper_of and train.collider_fraction and not base.config.proximity_points:
+            text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
+            report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
     over = [InnerModel.load(path) for path in options.over]
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
@@ -210,6 +213,10 @@ def _need_settings_of(base: ModelConfig, model: ModelConfig, train: TrainConfig,
         if name == "static_fraction" and train.static_fraction:
             what = "training that goes on from a model has no static part"
             fail(where, what, "0 is allowed", "leave it out")
+        blind = options.stepper_of and not base.proximity_points
+        if name == "collider_fraction" and train.collider_fraction and blind:
+            what = "the given model sees no colliders, and its stepper alone cannot learn to"
+            fail(where, what, "0 is allowed", "leave it out, or give --start-from in place of --stepper-of")
 
 
 def _take_fabric(options: argparse.Namespace, report: Reporter) -> None:

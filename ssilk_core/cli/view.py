@@ -49,6 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Draw."""
+    from ..delivery.bake.met import props_of
     from ..delivery.bake.opened import open_shot
     from ..delivery.view.output import FILM, PICTURE, check_suffix
     from ..delivery.view.shots import film_of_shots, sheet_of_shots
@@ -59,10 +60,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     players = [open_shot(path) for path in options.shots]
     labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
     look = _look(options, film)
+    props = [] if suffix == PAGE else [props_of(path, report) for path in options.shots]
     if suffix == PAGE:
         count = _write_page(options.output, players, labels, report)
     elif film:
-        count = film_of_shots(options.output, players, labels=labels, fps=options.fps, look=look, report=report)
+        count = film_of_shots(
+            options.output, players, labels=labels, fps=options.fps, look=look, props=props, report=report
+        )
     else:
         count = sheet_of_shots(
             options.output,
@@ -70,6 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             labels=labels,
             columns=options.columns,
             look=look,
+            props=props,
             report=report,
         )
     report(Result("view", {"picture": str(options.output), "frames": count}))

@@ -25,6 +25,7 @@ DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way 
 MAX_SEARCHED = 1 << 25  # pairs of a sample and a triangle of the body at once, as `collision.closest_point` takes
 CONTOUR_BYTES = 160  # for each triangle of a frame that is searched: bounds, corners, and places for pairs
 CONTOUR_VERTEX_BYTES = 72  # likewise for each vertex: positions and gradients, which are summed in whole numbers
+OBSTACLE_NUMBERS = 24  # for each contact sample of a frame: the distances to two obstacles, and the ways from them
 STITCH_NUMBERS = 60  # for each frame: arms, normal and offset, with their gradients
 MEMINFO = Path("/proc/meminfo")
 CONTAINER = Path("/sys/fs/cgroup")
@@ -75,6 +76,7 @@ class StepMemory:
         stitches: that hold its islands on one another.
         smoothed: vertices whose blendshapes are smoothed by a matrix that is still to be built.
         contours: whether the garment's intersections with itself are searched for.
+        obstacles: whether there are any around the character.
     """
 
     scene: Scene
@@ -84,6 +86,7 @@ class StepMemory:
     stitches: int = 0
     smoothed: int = 0
     contours: bool = False
+    obstacles: bool = False
 
     @classmethod
     def of(
@@ -94,12 +97,14 @@ class StepMemory:
         samples = len(contact_samples(mesh, fabric).area)
         stitches = len(held_stitches(mesh, fabric, scene.classes))
         smoothed, contours = smoothed_vertices(scene, model, config), searches_contours(scene, config)
-        return cls(scene, model, body_vertices, samples, stitches, smoothed, contours)
+        obstacles = bool(config.collider_fraction and model.proximity_points)
+        return cls(scene, model, body_vertices, samples, stitches, smoothed, contours, obstacles)
 
     def needed(self, frames: int) -> int:
         """Predict the bytes of a step that decodes so many frames at once."""
         mesh = self.scene.garment.mesh
         cloth = 200 * mesh.vertex_count + 25 * self.samples + STITCH_NUMBERS * self.stitches
+        cloth += OBSTACLE_NUMBERS * (self.samples + self.model.proximity_points) if self.obstacles else 0
         numbers = cloth + 22 * self.body_vertices + 60 * len(self.scene.joint_names)
         network = 12 * sum(self.model.widths) + 20 * self.model.latent
         searched = self.samples * self.body_vertices

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from pxr import Sdf
 
+from ssilk_core.cli import main
+
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("docs/pipeline.md", "docs/farm.md")
 
@@ -21,14 +23,30 @@ def blocks(document: str, language: str) -> list[str]:
 def test_layers_of_artists_are_read():
     for text, attribute, codes in zip(
         blocks("docs/pipeline.md", "usda"),
-        ("/Shot/cape/Animation.blendShapeWeights", "/Hero/Cape.ssilk:free", "/Hero/Brooch.ssilk:rideVertices"),
-        ([12], [1020, 1028, 1050, 1058], []),
+        (
+            "/Shot/cape/Animation.blendShapeWeights",
+            "/Set/Floor.points",
+            "/Hero/Cape.ssilk:free",
+            "/Hero/Brooch.ssilk:rideVertices",
+        ),
+        ([12], [], [1020, 1028, 1050, 1058], []),
         strict=True,
     ):
         layer = Sdf.Layer.CreateAnonymous(".usda")
         assert layer.ImportFromString(text)
         assert layer.GetAttributeAtPath(attribute)
         assert layer.ListTimeSamplesForPath(attribute) == codes
+
+
+def test_the_floor_and_the_table_of_a_shot_are_met(toy, tmp_path, monkeypatch, capsys):
+    toy.copy(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    toy.write_clip(tmp_path / "walk.usda", frames=3)
+    (text,) = [block for block in blocks("docs/pipeline.md", "usda") if "PhysicsCollisionAPI" in block]
+    Path("shot.usda").write_text(text.replace("@walk.usd@", "@walk.usda@"))
+    words = "simulate rigged.usda --no-body --points --tolerance 0.5 --motion shot.usda -o met.usdc"
+    assert main(words.split()) == 0
+    assert "shot.usda: cloth meets /Set/Floor, /Set/Table/Top, /Set/Table/Leg\n" in capsys.readouterr().err
 
 
 def is_there(name: str) -> bool:

@@ -161,7 +161,17 @@ def test_settings_that_a_given_model_cannot_take_are_refused(copy, capsys, onwar
     ):
         assert run(f"{train} model.safetensors --set {setting}") == 2
         assert complaint in capsys.readouterr().err
+    alone, blind = onward == "--stepper-of", "the given model sees no colliders, and its stepper alone cannot learn"
+    if alone:
+        assert run(f"{train} model.safetensors --set collider_fraction=0.5") == 2
+        assert blind in capsys.readouterr().err
     assert sorted(copy.iterdir()) == before
     words = "--set latent=8 --set static_fraction=0 --set iterations=2 --set batch=2 --set window=4"
     assert run(f"{train} model.safetensors {words} --set valid_frames=8") in (0, 5)
     assert load_model("more.safetensors").config.latent == 8
+    assert "it sees no colliders" not in capsys.readouterr().err  # nor does the preset have any
+    if alone:
+        small = words.replace("latent=8", "widths=16").replace("--set static_fraction=0 ", "")
+        train = train.replace("--preset draft", "--preset preview").replace("more.", "seen.")
+        assert run(f"{train} model.safetensors {small} --set valid_frames=8 --set newton_weight=0") in (0, 5)
+        assert "warning: model.safetensors: it sees no colliders" in capsys.readouterr().err

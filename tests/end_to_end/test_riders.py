@@ -8,9 +8,11 @@ import shlex
 from dataclasses import replace
 from pathlib import Path
 
+import igl
 import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
+from ssilk_usd.reading.facts import read_provenance
 from ssilk_usd.shots.play import Shot
 from ssilk_usd.shots.read import read_baked
 from ssilk_usd.stages import demo_body_path
@@ -331,6 +333,57 @@ def test_what_cannot_ride_is_refused_in_one_sentence(hero, capsys, change, says)
     said = capsys.readouterr().err
     assert re.search(f"/Hero/Button0: .*{says}", said) and len(said.strip().splitlines()) == 1, said
     assert not Path("shot.usdc").exists()
+
+
+UNDER, TURNED_BY = 85, 81  # faces of the skirt: beneath a plate, and another that carries it
+
+
+def plate(mesh: Mesh) -> np.ndarray:
+    """A plate 10 cm wide that lies on the skirt, away from its hem."""
+    points, foot = disc_on(mesh, UNDER, SHARES[1], 0.05)
+    corners = mesh.points[mesh.faces[UNDER]]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    normal /= np.linalg.norm(normal)
+    height = (points - foot) @ normal
+    return points - 0.9 * height[:, None] * normal
+
+
+def test_how_deep_a_rider_enters_its_cloth_is_told_where_it_is_more_than_a_millimetre(hero, capsys):
+    lively("model.safetensors")
+    mesh, stage = skirt_of(), Usd.Stage.Open("worn.usda")
+    rest = plate(mesh)
+    add_rider(stage, "/Hero/Plate", rest, vertices=tuple(map(int, mesh.faces[TURNED_BY])))
+    stage.GetRootLayer().Save()
+    assert run("bake model.safetensors --stage worn.usda --motion clip.usda -o shot.usdc") == 0
+    told, shot = capsys.readouterr().err, Shot("shot.usdc")
+    (index,) = (number for number, each in enumerate(shot.meshes) if each.name == "Plate")
+    faces = shot.meshes[index].faces
+    depths = []
+    for time in shot.frame_times:
+        points = shot.points(time)[index]
+        samples = np.concatenate([points, points[faces].mean(axis=1)])
+        depths.append(depth_by_libigl(mesh, shot.garment_points(time), samples))
+    own = np.concatenate([rest, rest[faces].mean(axis=1)])
+    below = depth_by_libigl(mesh, mesh.points, own)
+    deeper = np.array([(depth - below.clip(min=0)).max() for depth in depths])
+    assert deeper.max() > 2e-3
+    said = read_provenance("shot.usdc")["riders_in_cloth"]
+    assert said["Plate"]["depth"] == pytest.approx(deeper.max(), rel=0.02)
+    assert said["Plate"]["frame"] == shot.frame_times[int(deeper.argmax())]
+    line = f"Plate enters the cloth by: {1000 * said['Plate']['depth']:.1f} mm, clip at time code"
+    assert line in told and "Button" not in "".join(said)
+    assert run("bake model.safetensors --stage worn.usda --motion clip.usda -o layers") == 0
+    assert "Plate enters the cloth by: " in capsys.readouterr().err
+    again = "bake model.safetensors --stage worn.usda --motion clip.usda -o layers"
+    assert run(again) == 0 and "current" in capsys.readouterr().err
+
+
+def depth_by_libigl(mesh: Mesh, cloth: np.ndarray, samples: np.ndarray) -> np.ndarray:
+    """How far samples lie beneath cloth that is wound to face outwards [m], by the normals of its nearest faces."""
+    squares, face, nearest = igl.point_mesh_squared_distance(samples, cloth, mesh.faces)
+    corners = cloth[mesh.faces[face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.sqrt(squares) * np.where(((samples - nearest) * normal).sum(axis=1) < 0, 1, -1)
 
 
 def test_verify_finds_a_rider_that_left_its_cloth(hero, capsys):

@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdSkel
 from ssilk_usd.reading.facts import read_provenance
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.shots.play import Shot
@@ -15,7 +18,7 @@ from ssilk_usd.shots.play import Shot
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
 from ssilk_core.delivery.bake.load import load_rollout
-from ssilk_core.delivery.bake.world import world_of
+from ssilk_core.delivery.bake.world import ShotSurroundings
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.parameters import seeing_more
 from ssilk_core.network.proximity import proximity
@@ -23,6 +26,7 @@ from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.sight import RestingPoints, seen_proximity
 from ssilk_core.scene.kinematics import hub_places, motion_transforms
 
+CLIPS = ("floored", "plain")
 FLOOR = 0.75  # [m], above the hem of the skirt at 0.6 m
 
 
@@ -98,8 +102,6 @@ def test_the_network_alone_says_that_it_does_not_see_the_floor(stage, capsys):
     clip = Usd.Stage.Open("floored.usda")
     clip.GetPrimAtPath("/Set/Floor").GetAttribute("faceVertexCounts").Set([4], 3)  # what the solver cannot meet
     clip.GetRootLayer().Save()
-    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
-    assert "cloth meets" not in (told := capsys.readouterr().err) and "does not see colliders:" in told
     assert main([*BAKE, "floored.usda", "-o", "refined.usdc", "--refine", "1"]) == 2
     assert "its faces change over time" in capsys.readouterr().err
     assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
@@ -143,6 +145,151 @@ def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says
     expected = np.stack([playback.vertices(frame) for frame in range(motion.frame_count)])
     np.testing.assert_allclose(points_of("floored.usdc"), expected, atol=1e-5)
     assert np.abs(points_of("plain.usdc") - expected).max() > 1e-3
+
+
+def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
+    clip = Usd.Stage.Open("floored.usda")
+    box = UsdGeom.Cube.Define(clip, "/Set/Box")  # around the body, above the floor
+    box.CreateSizeAttr(0.4)
+    box.AddTranslateOp().Set((0, 0.95, 0))
+    UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+    clip.GetRootLayer().Save()
+    baked = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion"]
+    for more in ([], ["--lbs"], ["--refine", "2", "--refined-output", "points"]):
+        assert main([*baked, "floored.usda", "-o", "shot.usdc", *more]) == 0
+        told, found = capsys.readouterr().err, points_of("shot.usdc")
+        depths = FLOOR - found[..., 1], 0.2 - np.abs(found - [0, 0.95, 0]).max(axis=-1)
+        under, boxed = (depth > 5e-3 for depth in depths)
+        share = (under | boxed).mean(axis=1)
+        said = read_provenance("shot.usdc")["sunk_cloth"]
+        assert said["frames"] == 5 and said["mean"] == pytest.approx(share.mean(), rel=1e-3)
+        assert said["worst"] == pytest.approx(share.max(), rel=1e-3) and said["frame"] == share.argmax()
+        together = under.sum() + boxed.sum()
+        assert boxed.any() and said["colliders"] == pytest.approx(
+            {"/Set/Floor": under.sum() / together, "/Set/Box": boxed.sum() / together}, abs=1e-4
+        )
+        assert said["deepest"] == pytest.approx(max(depth.max() for depth in depths), rel=1e-3)
+        assert f"cloth inside colliders: {share.mean():.3%}, in 5 frames" in told
+        assert f"{share.max():.2%}, floored at time code {share.argmax()}" in told and "/Set/Floor" in told
+    layers = [*baked, "floored.usda", "plain.usda", "-o", "layers"]
+    assert main(layers) == 0
+    records = [json.loads(next((stage / f"layers/shots/{shot}").glob("*/bake.json")).read_text()) for shot in CLIPS]
+    assert records[0]["detail"]["sunk"]["frames"] == 5 and "sunk" not in records[1]["detail"]
+    capsys.readouterr()
+    assert main(layers) == 0 and "current" in capsys.readouterr().err
+    for shot, page in ("shot.usdc", "file"), ("layers/shots/floored/shot.usda", "layers"):
+        assert main(["report", shot, "-o", f"{page}.html"]) == 0
+        assert ": cloth in colliders: " in capsys.readouterr().err
+        assert "it is inside colliders" in (text := (stage / f"{page}.html").read_text())
+        assert "of its vertices were more than 5 mm inside colliders on average" in text and "/Set/Floor" in text
+    assert main(["report", "layers/shots/plain/shot.usda", "-o", "plain.html"]) == 0
+    assert "colliders" not in capsys.readouterr().err and "inside colliders" not in (stage / "plain.html").read_text()
+    assert main([*baked, "plain.usda", "-o", "plain.usdc"]) == 0
+    assert "colliders" not in capsys.readouterr().err and "sunk_cloth" not in read_provenance("plain.usdc")
+    assert main(["verify", "shot.usdc"]) == 0
+
+
+def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys):
+    clip = Usd.Stage.Open("floored.usda")
+    box = UsdGeom.Cube.Define(clip, "/Set/Box")
+    box.CreateSizeAttr(0.6)
+    place = box.AddTranslateOp()
+    for code in range(5):
+        place.Set((-0.9 + 0.2 * code, 1.0, -0.6), code)
+    UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+    clip.GetRootLayer().Save()
+    baked = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "floored.usda", "plain.usda"]
+    assert main([*baked, "-o", "layers"]) == 0
+    assert main([*baked[:-1], "-o", "shot.usdc"]) == 0
+    with_box, found = prop_pixels("shot.usdc"), prop_pixels("layers/shots/floored/shot.usda")
+    np.testing.assert_array_equal(with_box, found)
+    assert with_box[0].sum() > 200 and prop_pixels("layers/shots/plain/shot.usda").sum() == 0
+    middles = [np.argwhere(each)[:, 1].mean() for each in with_box]
+    assert middles[0] + 10 < middles[1]  # it moves
+    capsys.readouterr()
+    Path("floored.usda").unlink()
+    assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
+    told = capsys.readouterr().err
+    assert "warning: shot.usdc: the colliders that it met are not drawn: the motion that it was baked" in told
+
+
+SHEET = ["--columns", "2", "--size", "200x200", "--azimuth", "0"]
+
+
+def prop_pixels(shot: str) -> np.ndarray:
+    """Which pixels of the first and the last frame of a shot have the colour of props, bluer than all else."""
+    assert main(["view", shot, "-o", "sheet.png", *SHEET]) == 0
+    picture = np.asarray(Image.open("sheet.png").convert("RGB")).astype(int)
+    panels = np.stack([picture[:, :200], picture[:, -200:]])
+    return (panels[..., 2] > panels[..., 0] + 12) & (panels.sum(axis=-1) < 3 * 175)
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_a_network_goes_on_without_a_collider_that_cannot_be_read(stage, capsys, sees):
+    if sees:
+        let_it_see("model.safetensors")
+    assert main([*BAKE, "floored.usda", "-o", "whole.usdc"]) == 0
+    clip = Usd.Stage.Open("floored.usda")
+    for path in "/Set/Bad", "/Set/Flat":
+        mesh = UsdGeom.Mesh.Define(clip, path)
+        mesh.CreatePointsAttr([(0, 0.9, 0), (1, 0.9, 0), (1, 0.9, 1) if path == "/Set/Bad" else (2, 0.9, 0)])
+        mesh.CreateFaceVertexCountsAttr([3])
+        mesh.CreateFaceVertexIndicesAttr([0, 1, 2])
+        UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    clip.GetPrimAtPath("/Set/Bad").GetAttribute("faceVertexCounts").Set([3], 3)
+    clip.GetRootLayer().Save()
+    capsys.readouterr()
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
+    told = capsys.readouterr().err
+    left_out = "warning: floored.usda:/Set/Bad: its faces change over time; the topology of a collider stays"
+    assert told.count(left_out) == 1 and "Cloth does not meet it." in told
+    assert told.count("floored.usda:/Set/Flat: no triangle of it has an area") == 1
+    assert ("the network sees /Set/Floor\n" in told) is sees
+    np.testing.assert_array_equal(points_of("network.usdc"), points_of("whole.usdc"))
+    assert main(["verify", "network.usdc"]) == 0
+    for command in ([*BAKE, "floored.usda", "--refine", "1"], [*SIMULATE, "floored.usda"]):
+        assert main([*command, "-o", "solved.usdc"]) == 2
+        assert "/Set/Bad: its faces change over time" in capsys.readouterr().err
+
+
+def test_a_wrong_name_is_answered_with_the_stages_that_were_searched_and_what_is_there(stage, capsys):
+    assert main([*BAKE, "floored.usda", "-o", "refused.usdc", "--collider", "Flor"]) == 2
+    told = capsys.readouterr().err
+    assert "--collider Flor: floored.usda and rigged.usda have no such prim; there are /Set/Floor in" in told
+    assert "did you mean '/Set/Floor'?" not in told and "did you mean 'Floor'?" in told
+
+
+def capsule_on(path: str, name: str, radius: float, height: float, at: tuple[float, float, float]) -> None:
+    """Add a capsule that collides and goes with the hips of the toy's clip, as a ragdoll's do."""
+    clip = Usd.Stage.Open(path)
+    shape = UsdGeom.Capsule.Define(clip, f"/Ragdoll/{name}")
+    for attribute, value in ((shape.CreateRadiusAttr(), radius), (shape.CreateHeightAttr(), height)):
+        attribute.Set(value)
+    shape.CreateAxisAttr("Y")
+    place, hips = shape.AddTranslateOp(), UsdSkel.Animation(clip.GetPrimAtPath("/Clip")).GetTranslationsAttr()
+    for code in hips.GetTimeSamples():
+        sway = hips.Get(code)[0][0]
+        place.Set(Gf.Vec3d(at[0] + sway, *at[1:]), code)
+    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
+    clip.GetRootLayer().Save()
+
+
+def test_shapes_inside_the_body_are_its_own_unless_they_are_asked_for(stage, capsys):
+    """The body is a pillar of a radius of 15 cm."""
+    capsule_on("floored.usda", "Trunk", 0.13, 0.5, (0, 1.0, 0))
+    capsule_on("floored.usda", "Beside", 0.13, 0.5, (0.3, 1.0, 0))
+    command = [*SIMULATE, "floored.usda", "-o"]
+    assert main([*command, "own.usdc"]) == 0
+    told = capsys.readouterr().err
+    own = "floored.usda: cloth does not meet /Ragdoll/Trunk, inside the character's body in each frame, as"
+    assert told.count(own) == 1 and "cloth meets /Set/Floor, /Ragdoll/Beside\n" in told
+    assert main([*command, "asked.usdc", "--collider", "Trunk"]) == 0
+    told = capsys.readouterr().err
+    assert own not in told and "cloth meets /Set/Floor, /Ragdoll/Trunk, /Ragdoll/Beside\n" in told
+    let_it_see("model.safetensors")
+    assert main([*BAKE, "floored.usda", "-o", "network.usdc"]) == 0
+    told = capsys.readouterr().err
+    assert told.count(own) == 1 and "the network sees /Set/Floor, /Ragdoll/Beside\n" in told
 
 
 def test_gusts_are_the_same_in_whatever_range_of_a_shot(toy, stage):
@@ -205,7 +352,7 @@ def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
     assert main(["verify", "seen.usdc"]) == 0
     player, motion = Player.load("seeing.safetensors"), read_motion("floored.usda", file.scene.character.skeleton)
     scene = player.file.scene
-    world = world_of("floored.usda", "rigged.usda", scene, motion, None)
+    world = ShotSurroundings("floored.usda", "rigged.usda", scene, motion, None).seen
     near = seen_proximity(world, motion, player)
     assert len(world.colliders) == 1 and np.abs(near).max() > 0.5
     for name, felt in ("seen.usdc", near), ("blind.usdc", None):

@@ -52,11 +52,13 @@ def codes() -> np.ndarray:
     return 2.0 * (FIRST + np.arange(FRAMES))
 
 
-def read(stage: Usd.Stage, *, garment: str | None = None, report=lambda event: None, **asked) -> ShotWorld | None:
+def read(
+    stage: Usd.Stage, *, garment: str | None = None, report=lambda event: None, lenient=None, **asked
+) -> ShotWorld | None:
     stage.GetRootLayer().Save()
     path = stage.GetRootLayer().realPath
     found = find_world(path, path, character(), motion(), AskedWorld(**asked), garment=garment, report=report)
-    return found.read(report)
+    return found.read(lenient=lenient)
 
 
 def quad(stage: Usd.Stage, path: str, size: float = 100.0) -> UsdGeom.Mesh:

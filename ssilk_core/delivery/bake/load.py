@@ -26,7 +26,7 @@ from .inputs import InputContents, InputHashes, model_contents, read_unchanged, 
 from .request import ALLOWED_FPS, BakeRequest
 from .riders import riders_of
 from .rollout import BakeRollout
-from .world import Sight, asked_world, world_of
+from .world import ShotSurroundings, Sight, asked_world
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -98,7 +98,10 @@ class LoadedGarment:
         """
         request = replace(self.request, motion=motion, range=range, handles=handles)
         read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
-        source = read.source if request.lbs else self._felt(request, read.source)
+        asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
+        around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
+        sight = Sight.of(self.file, solved=request.latent_iterations > 0)
+        source = read.source if request.lbs else self._felt(around, sight)
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
@@ -123,7 +126,8 @@ class LoadedGarment:
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
-            sight=Sight.of(self.file, solved=request.latent_iterations > 0),
+            sight=sight,
+            around=around,
             reduction=reduction,
             riders=self.riders,
             told=self.told,
@@ -158,20 +162,18 @@ class LoadedGarment:
         hidden = read_hidden(request.motion, sampled, root=root)
         return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
 
-    def _felt(self, request: BakeRequest, motion: Motion) -> Motion:
+    def _felt(self, around: ShotSurroundings, sight: Sight) -> Motion:
         """Return a motion with the gravity, the wind and the colliders of its shot that the network sees."""
-        sight, scene = Sight.of(self.file, solved=request.latent_iterations > 0), self.deformer.scene
+        motion, scene = around.motion, self.deformer.scene
         if not (sight.pull or sight.colliders):
             return motion
         from ...network.runtime.garment import NumpyGarment
         from ...network.runtime.sight import seen_proximity
         from ...physics.world.felt import felt_gravity
 
-        asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
-        world = world_of(request.motion, request.stage, scene, motion, asked, colliders=sight.colliders)
-        gravity = felt_gravity(world, motion, scene, self.file.fabric) if sight.pull else None
+        gravity = felt_gravity(around.pull, motion, scene, self.file.fabric) if sight.pull else None
         motion = motion if gravity is None else replace(motion, gravity=gravity)
-        near = seen_proximity(world, motion, NumpyGarment(self.file)) if sight.colliders else None
+        near = seen_proximity(around.seen, motion, NumpyGarment(self.file)) if sight.colliders else None
         return motion if near is None else replace(motion, proximity=near)
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:

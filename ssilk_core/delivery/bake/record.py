@@ -20,6 +20,7 @@ from .result import BakeResult
 from .task import OF_ASSET, BakeTask
 
 RECORD = "bake.json"
+OF_FEW = ("sunk", "entered")  # what records of shots without it do not name
 
 
 @dataclass(frozen=True)
@@ -106,8 +107,9 @@ def write_record(folder: Path, record: TaskRecord) -> None:
 
 
 def _portable(result: BakeResult) -> dict[str, object]:
-    """Return a result without its folder, which can move."""
-    return {**asdict(result), "path": result.path.name}
+    """Return a result without its folder, which can move, and without what it has no need of."""
+    told = {**asdict(result), "path": result.path.name}
+    return {name: value for name, value in told.items() if value or name not in OF_FEW}
 
 
 def read_record(folder: Path) -> TaskRecord | None:

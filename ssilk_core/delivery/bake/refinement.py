@@ -15,16 +15,14 @@ from ...errors import SsilkError, VerificationError, fail
 from ...events import Countdown, Message, Reporter, silent
 from ...network.settings import STRONGEST_PULL
 from ...physics.constants import GRAVITY
-from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.assets import Deformer, Floats, Motion
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
 from .direction import free_stretches
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
-from .world import asked_world, unseen, world_of
+from .world import tell_surrounded
 
 if TYPE_CHECKING:
-    from ssilk_usd.reading.world import AskedWorld
-
     from ...physics.refine import FrameChange, Refiner
     from ...scene.decomposition import Decomposition
 
@@ -50,8 +48,8 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         return rollout
     if not rollout.request.refine:
         if not rollout.request.lbs:
-            missed = unseen(*_surrounded(rollout), report, sight=rollout.sight, drag=rollout.fabric.drag)
-            for words in filter(None, (missed, _too_strong(rollout.source))):
+            tell_surrounded(rollout.around, rollout.sight, rollout.fabric.drag, report)
+            if words := _too_strong(rollout.source):
                 report(Message(f"{rollout.request.motion}: {words}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
@@ -131,10 +129,10 @@ def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Itera
 
 def _solved_frames(played: BakeRollout, first: int, stop: int, report: Reporter) -> Iterator[_Frame]:
     """Yield frames that the solver refines, from its start in the first of them on."""
-    source, stage, scene, motion, asked = _surrounded(played)
+    motion = played.motion
     # What is cut out is normalised again, which changes its last digits.
     part = motion if stop - first == motion.frame_count else motion.clip(first, stop)
-    world = world_of(source, stage, scene, part, asked, report)
+    world = played.around.over(part).read(report)
     network = islice(played.network_vertices(), first, stop)
     for frame in _refiner(played).frames(part, network, world):
         yield _Frame(frame.points, frame.change)
@@ -159,13 +157,6 @@ def _too_strong(motion: Motion) -> str:
     if strongest <= known:
         return ""
     return f"gravity and wind pull with up to {strongest:.1f} g; networks are trained up to {known:g} g"
-
-
-def _surrounded(rollout: BakeRollout) -> tuple[str, str, Scene, Motion, AskedWorld | None]:
-    """Return what says what surrounds the character from the first frame of a rollout's motion on."""
-    request = rollout.request
-    asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
-    return request.motion, request.stage, rollout.deformer.scene, rollout.motion, asked
 
 
 def _refiner(rollout: BakeRollout) -> Refiner:
@@ -200,7 +191,7 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """
     energies, (judged, measured) = [], tee(points)
     told = Countdown(rollout.motion.frame_count, report)
-    world = world_of(*_surrounded(rollout))
+    world = rollout.around.over(rollout.motion).read(silent)
     changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged, world)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()

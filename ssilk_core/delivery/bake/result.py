@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 from ...physics.intersections.figures import NOT_COUNTED, SHARE, SelfIntersections
 from ...physics.skin.figures import ShownSkin
+from ...physics.world.sunk import SunkCloth
 from ...quality.levels import SizeReduction
+from .entered import EnteredCloth
 
 if TYPE_CHECKING:
     from ...scene.decomposition import Decomposition
@@ -211,6 +213,8 @@ class BakeResult:
         recovered: frames at which the rollout was lost and the garment was put to rest.
         shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
         intersections: the share of triangles that intersect others of the garment; None where it was not counted.
+        sunk: the share of vertices inside colliders; None where there are no colliders.
+        entered: riders that enter their cloth.
         current: the file was there already and nothing was baked; the other figures are those of its bake.
     """
 
@@ -230,6 +234,8 @@ class BakeResult:
     recovered: tuple[FrameSpan, ...] = ()
     shown_skin: ShownSkin | None = None
     intersections: SelfIntersections | None = None
+    sunk: SunkCloth | None = None
+    entered: tuple[EnteredCloth, ...] = ()
     current: bool = False
 
     def figures(self, kind: str = "shot") -> dict[str, object]:
@@ -252,6 +258,8 @@ class BakeResult:
             **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary("time code") if self.shown_skin else {}),
             **(self.intersections.summary("time code") if self.intersections else {SHARE: NOT_COUNTED}),
+            **(self.sunk.summary("time code") if self.sunk else {}),
+            **{name: value for each in self.entered for name, value in each.summary("time code").items()},
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),

@@ -29,7 +29,7 @@ from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
 from .request import BakeRequest
 from .result import FrameSpan, LatentSummary, RefinementSummary
-from .world import Sight
+from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
@@ -83,6 +83,7 @@ class BakeRollout:
         info: of the garment as an asset.
         names: the joints as the shot's target finds them.
         sight: what the network knows of the world around the character.
+        around: this world, at the frames of `source`.
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
@@ -108,6 +109,7 @@ class BakeRollout:
     names: JointNames
     fabric: Fabric
     sight: Sight
+    around: ShotSurroundings
     lead: int = 0
     frames: FrameRange | None = None
     reduction: SizeReduction | None = None
@@ -217,6 +219,10 @@ class BakeRollout:
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
         return replace(self, motion=self.whole, lead=0, latents=None, recovered=[])
+
+    def seconds(self, sample: int) -> float:
+        """Return the time of a sample of the shot, from the first frame of `source` on [s]."""
+        return self._source_frame(sample) / self.source.fps
 
     def _source_frame(self, sample: int) -> float:
         """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ...scene.decomposition import Decomposition
 
 STATED = 2560  # bytes of what a shot says of its origin, its skin and its cloth, which an excerpt does not hold
+STATED_OF_COLLIDERS = 512  # likewise, where there are any
 EXCERPT = 64  # frames that are written to estimate the bytes of a whole shot
 
 
@@ -62,10 +63,11 @@ def load_sized(
     size = replace(size, influences=min(size.influences, most))
     if budget:
         at_fps = load_rollout(replace(request, latent_iterations=0))  # solved states take as many bytes
+        stated = STATED + (STATED_OF_COLLIDERS if at_fps.around.colliders else 0)
 
         def size_bytes(file: ModelFile) -> float:
             found = shot_bytes(with_model(at_fps, file), suffix, include_body=include_body)
-            return found.of(at_fps.motion.frame_count) + STATED
+            return found.of(at_fps.motion.frame_count) + stated
 
         size = spend(budget, reducer, size, rollout.source, size_bytes, report).size
     return load_rollout(replace(request, keep=None if size == reducer.whole else size))

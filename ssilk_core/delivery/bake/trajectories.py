@@ -142,7 +142,7 @@ def skin_trajectories(
             else:
                 summary = write_shot(layer, ridden.deformer, motion, poses, units=units, **common)
             name = Path(split_location(motion.path)[0]).stem
-            counts = state_counts(layer, found.deformer.scene, motion, name=name, device=device)
+            counts = state_counts(layer, found.deformer.scene, motion, name=name, device=device, riders=riders)
         if verify:
             need_valid(unverified, report)
             shot = open_shot(unverified)
@@ -157,7 +157,7 @@ def skin_trajectories(
         proxies=summary.proxy_count - len(ridden.names), blendshapes=summary.shape_count,
         size_bytes=path.stat().st_size,
         verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
-        intersections=counts.intersections,
+        intersections=counts.intersections, entered=counts.entered,
     )  # fmt: skip
 
 

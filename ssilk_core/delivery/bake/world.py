@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib.util import find_spec
 from math import inf, isfinite
 from typing import TYPE_CHECKING
 
 from ...errors import fail
-from ...events import Message, Reporter, silent
+from ...events import Event, Message, Reporter
 from ...files import split_location
-from ...scene.assets import Motion, Scene, ShotWorld
+from ...scene.assets import Collider, Motion, Scene, ShotWorld
 
 if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld, FoundWorld
@@ -56,37 +58,114 @@ def parse_world(
     return blown, None if gusts is None else _gusts(gusts), pull
 
 
-def world_of(
-    source: str,
-    stage: str,
-    scene: Scene,
-    motion: Motion,
-    asked: AskedWorld | None,
-    report: Reporter = silent,
-    *,
-    colliders: bool = True,
-) -> ShotWorld | None:
-    """Return what surrounds a character at each frame of its motion; None where nothing does."""
-    return _found(source, stage, scene, motion, asked, report, colliders=colliders).read(report)
+class ShotSurroundings:
+    """What surrounds the character of a garment in its shot, found and read where it is first asked for.
+
+    Args:
+        source: of the motion, "file[:/Prim/Path]".
+        stage: the character's file.
+        motion: at whose frames the character is surrounded.
+        asked: what is asked for in place of what stages say.
+    """
+
+    def __init__(self, source: str, stage: str, scene: Scene, motion: Motion, asked: AskedWorld | None) -> None:
+        self.source, self.motion = source, motion
+        self._stage, self._scene, self._asked = stage, scene, asked
+        self._events: list[Event] = []
+        self._told: set[str] = set()
+
+    def over(self, motion: Motion) -> ShotSurroundings:
+        """Return the same at the frames of another motion of the shot; what was told once is not told again."""
+        other = ShotSurroundings(self.source, self._stage, self._scene, motion, self._asked)
+        other._told = self._told
+        return other
+
+    @cached_property
+    def found(self) -> FoundWorld:
+        """What there is, of which no shape is read.
+
+        Raises:
+            SsilkError: as `ssilk_usd.reading.world.find_world`.
+        """
+        from ssilk_usd.reading.world import find_world
+
+        garment = split_location(self._scene.garment.mesh.path)[1]
+        return find_world(
+            self.source,
+            self._stage,
+            self._scene.character,
+            self.motion,
+            self._asked,
+            garment=garment,
+            report=self._keep,
+        )
+
+    def read(self, report: Reporter) -> ShotWorld | None:
+        """Return what a solver meets, and report it; None where nothing surrounds the character.
+
+        Raises:
+            SsilkError: as `found`, or a collider cannot be one.
+        """
+        world = self._without_own_shapes(self.found.read())
+        if world and world.colliders:
+            self._events.append(Message(f"{_file_of(world.colliders)}: cloth meets {listed(world.colliders)}"))
+        self.tell(report)
+        return world
+
+    @cached_property
+    def seen(self) -> ShotWorld | None:
+        """What can be met, without colliders that cannot be read; None where nothing surrounds the character.
+
+        Raises:
+            SsilkError: as `found`.
+        """
+        return self._without_own_shapes(self.found.read(lenient=self._keep))
+
+    @property
+    def colliders(self) -> tuple[Collider, ...]:
+        """Those of `seen`."""
+        return self.seen.colliders if self.seen else ()
+
+    @property
+    def pull(self) -> ShotWorld:
+        """Gravity and wind alone, for which no shape is read."""
+        return ShotWorld(self.found.fps, (), self.found.gravity, self.found.air)
+
+    def _keep(self, event: Event) -> None:
+        self._events.append(event)
+
+    def tell(self, report: Reporter) -> None:
+        """Report what was found out so far, each thing once."""
+        for event in self._events:
+            if str(event) not in self._told:
+                self._told.add(str(event))
+                report(event)
+        self._events.clear()
+
+    def _without_own_shapes(self, world: ShotWorld | None) -> ShotWorld | None:
+        """Return a world without the shapes that stand for the character's own body, unless they were asked for."""
+        if world is None or not (world.colliders and self._scene.character.bodies) or find_spec("igl") is None:
+            return world  # networks that see none are baked without libigl, too
+        from ...physics.world.own_shapes import OwnShapes
+
+        shapes, asked = OwnShapes(self._scene, self.motion), self.found.asked
+        own = [each for each in world.colliders if each.path not in asked and shapes.has(each)]
+        if not own:
+            return world
+        why = "inside the character's body in each frame, as shapes of its own physics are"
+        text = f"cloth does not meet {listed(own)}, {why}; --collider names what it shall meet nevertheless"
+        self._events.append(Message(f"{_file_of(own)}: {text}"))
+        return replace(world, colliders=tuple(each for each in world.colliders if each not in own))
 
 
-def _found(
-    source: str,
-    stage: str,
-    scene: Scene,
-    motion: Motion,
-    asked: AskedWorld | None,
-    report: Reporter,
-    *,
-    colliders: bool = True,
-) -> FoundWorld:
-    """Return what `ssilk_usd.reading.world.find_world` finds around the character of a scene."""
-    from ssilk_usd.reading.world import find_world
+def listed(colliders: Sequence[Collider]) -> str:
+    """Return the paths of colliders in their stage, the first few of many."""
+    paths = [each.name for each in colliders]
+    return f"{', '.join(paths[:4])}{f' and {len(paths) - 4} more' if len(paths) > 4 else ''}"
 
-    garment = split_location(scene.garment.mesh.path)[1]
-    return find_world(
-        source, stage, scene.character, motion, asked, garment=garment, colliders=colliders, report=report
-    )
+
+def _file_of(colliders: Sequence[Collider]) -> str:
+    return split_location(colliders[0].path)[0]
 
 
 @dataclass(frozen=True)
@@ -115,33 +194,27 @@ class Sight:
         return cls(who, file.config.descriptors == "relative", blown, sees)
 
 
-def unseen(
-    source: str,
-    stage: str,
-    scene: Scene,
-    motion: Motion,
-    asked: AskedWorld | None,
-    report: Reporter,
-    *,
-    sight: Sight,
-    drag: float,
-) -> str:
-    """Return what a network misses of the world around its character, in words; empty where that is nothing.
-
-    No shape of a collider is read for it. Colliders that the network sees are reported.
+def tell_surrounded(around: ShotSurroundings, sight: Sight, drag: float, report: Reporter) -> None:
+    """Report what a network sees of the colliders around its character, and warn of what it misses.
 
     Args:
         drag: of the garment's fabric, by which air moves it.
     """
-    found = _found(source, stage, scene, motion, asked, report)
+    world = around.seen
+    around.tell(report)
+    if world is None:
+        return
+    there = {"colliders": bool(world.colliders), "wind": bool(world.air), "its gravity": world.gravity is not None}
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}
-    missed = [part for part in found.parts if not sees.get(part, False)]
+    parts = [part for part, is_there in there.items() if is_there]
+    missed = [part for part in parts if not sees[part]]
+    if world.colliders and sight.colliders:
+        report(Message(f"{around.source}: the network sees {listed(world.colliders)}"))
     told = [UNSEEN.format(sight.who, " and ".join(missed))] if missed else []
-    if found.met and sight.colliders:
-        report(Message(f"{source}: the network sees {found.colliders}"))
-    if not sight.strength and {"wind", "its gravity"} & (set(found.parts) - set(missed)):
+    if not sight.strength and {"wind", "its gravity"} & (set(parts) - set(missed)):
         told.append(STILL)
-    return "; ".join(told)
+    if told:
+        report(Message(f"{around.source}: {'; '.join(told)}", "warning"))
 
 
 def _numbers(text: str) -> list[float]:

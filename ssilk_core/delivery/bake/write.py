@@ -103,6 +103,8 @@ def result_of(
         recovered=tuple(rollout.recovered),
         shown_skin=counts.shown_skin,
         intersections=counts.intersections,
+        sunk=counts.sunk,
+        entered=counts.entered,
     )
 
 

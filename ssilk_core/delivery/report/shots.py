@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ...events import Countdown, Reporter, silent
+from ...physics.world.sunk import SunkCloth
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
 from ...scene.fabrics import Fabric
@@ -40,7 +41,12 @@ class ShotGarment:
 
 
 def shot_sections(
-    player: ShotPlayer, garments: Sequence[ShotGarment], bodies: Mapping[int, Mesh], report: Reporter = silent
+    player: ShotPlayer,
+    garments: Sequence[ShotGarment],
+    bodies: Mapping[int, Mesh],
+    report: Reporter = silent,
+    *,
+    sunk: Mapping[int, SunkCloth] | None = None,
 ) -> list[Section]:
     """Return the sections about a shot.
 
@@ -48,6 +54,7 @@ def shot_sections(
         player: the shot.
         garments: those to measure.
         bodies: the meshes that garments collide with, at rest, by their index in the player.
+        sunk: what bakes counted inside colliders, of garments that had any, likewise.
     """
     whole = joined(list(bodies.values()))
     meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps) for each in garments]
@@ -61,13 +68,17 @@ def shot_sections(
             meter.add(points[each.index], body, time)
         layers.add(points, time)
         told()
-    first, *others = [part for each, meter in zip(garments, meters) for part in _sections(player, each, meter)]
+    first, *others = [
+        part
+        for each, meter in zip(garments, meters)
+        for part in _sections(player, each, meter, (sunk or {}).get(each.index))
+    ]
     over = layers.figures("the shot")
     between = [layers_section(over)] if over else []
     return [first, Section("The shot", played([player]), plays=True), *between, *others]
 
 
-def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> list[Section]:
+def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # a raised garment is no worse
     apart = max(1, round(APART * player.fps))
@@ -115,8 +126,9 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter) -> li
         charts += f'<p class="note">{said} Energies leave these frames out. {LOST}</p>'
     crossed = meter.intersections(name)
     figures = {**({"shown_skin": asdict(found)} if found else {}), "intersections": asdict(crossed)}
+    figures |= {"sunk_cloth": asdict(sunk)} if sunk else {}
     return [
-        verdict(name, values, found, crossed, player.frame_times, player.fps),
+        verdict(name, values, found, crossed, player.frame_times, player.fps, sunk),
         Section(f"{name}: its worst frames", f'<div class="pictures">{pictures}</div>'),
         Section(f"{name}: over time", charts, {name: {**figures, "non-finite frames": len(lost)}}),
     ]

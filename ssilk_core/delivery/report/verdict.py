@@ -10,6 +10,7 @@ import numpy as np
 
 from ...physics.intersections.figures import EVERY, SelfIntersections
 from ...physics.skin.figures import MOST_MEAN, MOST_WORST, ShownSkin
+from ...physics.world.sunk import DEPTH, MOST_SUNK, SunkCloth
 from ...scene.assets import Floats
 from .page import Section
 from .terms import SHARE, SHOWN, STRETCH
@@ -32,6 +33,7 @@ def verdict(
     intersections: SelfIntersections,
     frame_times: Sequence[float],
     fps: float,
+    sunk: SunkCloth | None = None,
 ) -> Section:
     """Return the section of a garment.
 
@@ -39,6 +41,7 @@ def verdict(
         values: of each frame, by the names of `terms.UNITS`.
         shown_skin: None where the garment covers nothing.
         intersections: of the same frames.
+        sunk: what its bake counted inside colliders; None where there were none.
     """
 
     def when(frame: int) -> str:
@@ -80,6 +83,12 @@ def verdict(
             share = values[SHARE][inside]
             most = f"{share:.1f}" if share >= LEAST else f"{share:.1g}"
             words.append(f"At most {most} % of its vertices are inside the body, {when(inside)}.")
+    if sunk:
+        if sunk.mean > MOST_SUNK:
+            faults.append("it is inside colliders")
+        most = f", {sunk.worst:.1%} at most, in frame {sunk.frame:g} ({sunk.where})" if sunk.worst else ""
+        share = f"{sunk.mean:.2%} of its vertices were more than {1000 * DEPTH:g} mm inside colliders"
+        words.append(f"{share} on average{most}, as its bake counted.".replace("%", " %"))
     first = (
         f"Look at {name}: {' and '.join(faults)}." if faults else f"{name} holds: nothing that the eye would find."
     )

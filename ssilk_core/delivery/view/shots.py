@@ -18,6 +18,7 @@ from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import add_captions, compare, contact_sheet
 from .player import PlayerMesh, ShotPlayer
+from .props import ShotProps
 from .render import Image, render
 from .surface import Surface
 
@@ -29,7 +30,8 @@ class Look:
     Attributes:
         width, height: of one panel [pixels].
         azimuth: where the camera stands, turned from +z towards +x [degrees].
-        ground: height of the floor [m]; None puts it where the skin is lowest in the median frame.
+        ground: height of the floor [m]; None puts it at a level floor among the props, or where the skin is lowest
+            in the median frame.
         samples: rays for each pixel on an edge, 1 or 4.
         workers: threads that draw; the pictures do not depend on it.
     """
@@ -69,6 +71,7 @@ def film_of_shots(
     labels: Sequence[str] = (),
     fps: float = 30.0,
     look: Look | None = None,
+    props: Sequence[ShotProps | None] = (),
     report: Reporter = silent,
 ) -> int:
     """Write an MP4 film of shots side by side, seen by one camera, and return its number of frames.
@@ -79,6 +82,7 @@ def film_of_shots(
         labels: a word for each shot, drawn on its panel.
         fps: at most so many frames per second; frames of faster shots are skipped evenly.
         look: size, view and effort.
+        props: of each shot, where its cloth met any.
         report: takes a `Progress` for each panel.
 
     Raises:
@@ -90,7 +94,7 @@ def film_of_shots(
     look = look or Look()
     step = int(np.ceil(players[0].fps / fps - 1e-6)) if players else 1
     frames = range(0, need_matching(players), step)
-    images = _drawn(_panels(players, frames, labels, look), look, len(frames) * len(players), report)
+    images = _drawn(_panels(players, frames, labels, look, props), look, len(frames) * len(players), report)
     return write_film(path, map(compare, zip(*[images] * len(players))), players[0].fps / step)
 
 
@@ -103,6 +107,7 @@ def sheet_of_shots(
     rows: int = 1,
     frames: Sequence[int] | None = None,
     look: Look | None = None,
+    props: Sequence[ShotProps | None] = (),
     report: Reporter = silent,
 ) -> int:
     """Write a PNG with up to `columns` x `rows` moments spread over the shots and return how many it shows.
@@ -122,7 +127,7 @@ def sheet_of_shots(
         columns = len(frames)
         if not frames or not all(0 <= frame < count for frame in frames):
             fail("contact sheet", f"frames {list(frames)}", f"one or more of 0 to {count - 1} are shown")
-    panels = _panels(players, frames, labels, look, label_every=columns)
+    panels = _panels(players, frames, labels, look, props, label_every=columns)
     images = list(_drawn(panels, look, len(frames) * len(players), report))
     strips = []
     for start in range(0, len(frames), columns):
@@ -153,29 +158,47 @@ def need_matching(players: Sequence[ShotPlayer]) -> int:
 
 
 def _panels(
-    players: Sequence[ShotPlayer], frames: Sequence[int], labels: Sequence[str], look: Look, label_every: int = 1
+    players: Sequence[ShotPlayer],
+    frames: Sequence[int],
+    labels: Sequence[str],
+    look: Look,
+    props: Sequence[ShotProps | None],
+    label_every: int = 1,
 ) -> Iterator[Picture]:
     """Yield the panels of each frame in turn, one for each player."""
-    cameras, ground = _survey(players, look)
+    cameras, ground = _survey(players, look, props)
     for number, frame in enumerate(frames):
         for shot, player in enumerate(players):
             label = labels[shot] if shot < len(labels) and number % label_every == 0 else ""
-            yield Picture(shot_surfaces(player, frame), cameras[frame], ground, label, f"{frame / player.fps:.2f} s")
+            surfaces, met = shot_surfaces(player, frame), props[shot] if shot < len(props) else None
+            if met:
+                figure = np.concatenate([surface.points for surface in surfaces])
+                surfaces += tuple(met.surfaces(frame, figure, cameras[frame], ground))
+            yield Picture(surfaces, cameras[frame], ground, label, f"{frame / player.fps:.2f} s")
 
 
-def _survey(players: Sequence[ShotPlayer], look: Look) -> tuple[list[Camera], float]:
+def _survey(
+    players: Sequence[ShotPlayer], look: Look, props: Sequence[ShotProps | None]
+) -> tuple[list[Camera], float]:
     """Return one camera for each frame, the same whichever frames are drawn, and the height of the floor."""
     lows: list[float] = []
+    sizes: list[float] = []
 
     def frames() -> Iterator[Floats]:
         for frame in range(len(players[0].frame_times)):
             surfaces = [surface for player in players for surface in shot_surfaces(player, frame)]
             skins = [surface for surface in surfaces if not surface.two_sided] or surfaces
             lows.append(min(surface.points[:, 1].min() for surface in skins))
-            yield np.concatenate([surface.points for surface in surfaces])
+            every = np.concatenate([surface.points for surface in surfaces])
+            sizes.append(float(np.ptp(every, axis=0).max()))
+            yield every
 
     cameras = follow_cameras(frames(), players[0].fps, look.width / look.height, azimuth=look.azimuth)
-    return cameras, float(np.median(lows)) if look.ground is None else look.ground
+    if look.ground is not None:
+        return cameras, look.ground
+    lowest, size = float(np.median(lows)), float(np.median(sizes))
+    floors = (met.ground(lowest, size) for met in props if met)
+    return cameras, next((floor for floor in floors if floor is not None), lowest)
 
 
 def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:

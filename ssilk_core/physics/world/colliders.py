@@ -7,9 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...scene.assets import Collider, Floats, Ints, ShotWorld
+from ...scene.assets import Collider, Floats, Ints, Motion, Scene, ShotWorld, SkinWeights
 from ...scene.assets.world import frame_at
-from ...scene.kinematics import matrix_from_quaternion, quaternion_from_matrix, rigid, slerp
+from ...scene.kinematics import (
+    matrix_from_quaternion,
+    motion_transforms,
+    quaternion_from_matrix,
+    rigid,
+    skin_points,
+    skinning_matrices,
+    slerp,
+)
 from .surface import CollisionSurface, PosedSurface, Search, SurfaceDistance, boxes
 
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
@@ -19,10 +27,12 @@ class PosedCollider:
     """A collider in one frame, relative to the character's root.
 
     Attributes:
+        name: as `Collider` has it.
         points: of its mesh, shape (P, 3).
     """
 
-    def __init__(self, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats) -> None:
+    def __init__(self, name: str, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats) -> None:
+        self.name = name
         self._surface, self._turn, self._place = surface, turn, place
         self._sides = surface.outside(self._inward(carried))
         self._known: tuple[Floats, Floats] | None = None
@@ -109,11 +119,10 @@ class ColliderPoser:
         near: Nearby | None,
     ) -> PosedCollider | None:
         """Return a collider at a time; None where cloth does not meet it then."""
-        frame = min(max(int(seconds * world.fps + 1e-6), 0), len(collider.present) - 1)
-        if not collider.present[frame]:
+        if not collider.is_there(world.fps, seconds):
             return None
         key = id(collider)
-        place = _placed(collider.placements, world, seconds)
+        place = placed_at(collider.placements, world, seconds)
         if near:
             if key not in self._balls:
                 low, high = collider.points.min(axis=(0, 1)), collider.points.max(axis=(0, 1))
@@ -129,10 +138,24 @@ class ColliderPoser:
             if key not in self._still:
                 self._still[key] = self._surfaces[key].at(collider.points[0], self._search)
             surface = self._still[key]
-        return PosedCollider(surface, place[:3, :3], place[:3, 3] - root, carried)
+        return PosedCollider(collider.name, surface, place[:3, :3], place[:3, 3] - root, carried)
 
 
-def _placed(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
+def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
+    """Return some vertices (P,) of a garment under linear blend skinning in the world [m], shape (F, P, 3)."""
+    skin, skeleton = scene.lbs_skin, scene.character.skeleton
+    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
+    own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])
+    return skin_points(scene.garment.mesh.points[rows], own, matrices)
+
+
+def voting_points(motion: Motion, scene: Scene) -> Floats:
+    """Return vertices of a garment by which floors have their outside, as `carried_points`, shape (F, P, 3)."""
+    count = scene.garment.mesh.vertex_count
+    return carried_points(motion, scene, np.linspace(0, count - 1, min(VOTERS, count)).astype(int))
+
+
+def placed_at(placements: Floats, world: ShotWorld, seconds: float) -> Floats:
     """Return the placement (4, 4) at a time; between frames it turns at a constant rate."""
     low, part = frame_at(seconds, world.fps, len(placements))
     if part == 0:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import fail
+from ...files import split_location
 from .arrays import Floats, Ints, assign, frozen, need_finite
 from .mesh import Mesh
 
@@ -51,6 +52,16 @@ class Collider:
         if not np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max() < RIGID_TOLERANCE:
             fail(self.path, "a placement that scales or shears", "placements are rigid")
         assign(self, faces=faces, points=points, placements=placements, present=present)
+
+    def is_there(self, fps: float, seconds: float) -> bool:
+        """Return whether cloth meets it at a time since the first frame."""
+        frame = min(max(int(seconds * fps + 1e-6), 0), len(self.present) - 1)
+        return bool(self.present[frame])
+
+    @property
+    def name(self) -> str:
+        """Its path in its stage, or what else its source is called."""
+        return split_location(self.path)[1] or self.path
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.settings import ModelConfig
@@ -23,6 +24,7 @@ from ssilk_core.training.memory import (
     free_memory,
     smoothed_vertices,
 )
+from ssilk_core.training.obstacles import Obstacles
 from ssilk_core.training.settings import TrainConfig
 
 MODEL, CONFIG = ModelConfig(), TrainConfig(batch=32, window=16, static_batch=32, pretraining_batch=700)
@@ -34,7 +36,7 @@ def test_more_of_anything_needs_more(scene):
     wider = replace(MODEL, widths=(256, 512, 513))
     assert step.needed(65) > base
     more = {"body_vertices": 1001}, {"samples": 201}, {"stitches": 1}, {"smoothed": 1}, {"contours": True}
-    for change in (*more, {"model": wider}):
+    for change in (*more, {"obstacles": True}, {"model": wider}):
         assert replace(step, **change).needed(64) > base
 
 
@@ -81,6 +83,39 @@ def test_what_a_step_keeps_of_its_stitches_is_counted(patched_scene):
         StepMemory(patched_scene, MODEL, 0, 0, count).needed(frames) for count in (0, len(energy.stitching))
     )
     assert some - none > sum(kept.values()) > 0
+
+
+class Held(TorchDispatchMode):
+    """Bytes of what the operations within have returned, and somebody still holds, at most."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.most, self._alive = 0, []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):  # type: ignore[no-untyped-def]
+        found = func(*args, **(kwargs or {}))
+        self._alive = [each for each in self._alive if each() is not None] + [
+            weakref.ref(each) for each in ([found] if isinstance(found, torch.Tensor) else ())
+        ]
+        storages = {each.untyped_storage().data_ptr(): each.untyped_storage().nbytes() for ref in self._alive
+                    if (each := ref()) is not None}  # fmt: skip
+        self.most = max(self.most, sum(storages.values()))
+        return found
+
+
+def test_what_the_distances_to_obstacles_take_is_counted_where_there_are_any(scene):
+    samples, frames = 500, 16
+    turn = torch.eye(3).expand(2, frames, 3, 3).contiguous()
+    obstacles = Obstacles(turn, torch.zeros(2, frames, 3), torch.ones(2, frames, 3), torch.zeros(2, frames))
+    points = torch.randn(samples, 3, frames)
+    with torch.no_grad(), Held() as held:
+        obstacles.nearest(points)
+    blind = StepMemory(scene, MODEL, 100, samples)
+    counted = replace(blind, obstacles=True).needed(frames) - blind.needed(frames)
+    assert counted >= held.most > 4 * 12 * samples * frames
+    for share, points_seen, there in ((0.25, 24, True), (0.0, 24, False), (0.25, 0, False)):
+        model, config = replace(MODEL, proximity_points=points_seen), replace(CONFIG, collider_fraction=share)
+        assert StepMemory.of(scene, model, config, FABRICS["silk"], 100).obstacles is there
 
 
 def test_what_the_search_for_contours_takes_is_counted_where_cloth_is_loose(scene, monkeypatch):

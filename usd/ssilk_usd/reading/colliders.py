@@ -8,18 +8,20 @@ one is visible, or a guide, does not matter where the API says that it collides:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdPhysics, UsdSkel
 
-from ssilk_core.errors import fail
+from ssilk_core.errors import SsilkError, did_you_mean, fail
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Character, Collider, Floats, Ints
 
-from ..opening.stage import PRIMS, apply, column_matrix, listed, location, named, stage_name, value
+from ..opening.stage import PRIMS, apply, column_matrix, location, named, stage_name, value
 from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
 from .mesh import is_drawn, is_garment, kept_faces, polygons, rendered
@@ -30,60 +32,147 @@ from .solids import SIZES, solid
 
 ENABLED = "physics:collisionEnabled"
 RIGID = 1e-6  # what the columns of a rotation may differ from unit length and right angles
+LISTED = 12  # prims in a message
 MOST_POINTS = 100_000_000  # of all colliders that deform, over all frames: 2.4 GB
 
 
-def colliding_prims(
-    stage: Usd.Stage,
-    names: Sequence[str],
-    own: Character,
-    placed: Usd.Prim | None,
-    garment: str | None,
-    *,
-    at_home: bool,
-) -> list[Usd.Prim]:
-    """Return the prims of a stage that collide, by the API and by name; some of the API may be none cloth can meet.
+@dataclass(frozen=True)
+class Wearer:
+    """Who wears the garment.
 
-    Args:
-        names: paths or names of prims; each must be in the stage.
-        own: the character, whose body cloth meets anyway.
+    Attributes:
+        character: whose body cloth meets anyway.
         placed: its Skeleton in the shot, or None.
         garment: path or name of the garment that is not marked as one.
+    """
+
+    character: Character
+    placed: Usd.Prim | None
+    garment: str | None
+
+
+class _Prims:
+    """The prims of a stage, and which of them are cloth, or the body of who wears it: these are no colliders.
+
+    Args:
         at_home: whether the stage is the character's own, in which its bodies have their paths.
+    """
+
+    def __init__(self, stage: Usd.Stage, wearer: Wearer, *, at_home: bool) -> None:
+        self.every = list(Usd.PrimRange(stage.GetPseudoRoot(), PRIMS))
+        self.solid = [prim for prim in self.every if prim.IsA(UsdGeom.Gprim)]
+        self._placed, self._at_home = wearer.placed, at_home
+        bodies = (*wearer.character.bodies, *wearer.character.stand_ins)
+        self._bodies = {split_location(each.mesh.path)[1] for each in bodies}
+        self._leaves = {str(path).rsplit("/", 1)[-1] for path in self._bodies}
+        meshes = [prim for prim in self.every if prim.IsA(UsdGeom.Mesh)]
+        self._cloth = named(meshes, wearer.garment) if wearer.garment else []
+
+    def is_cloth(self, prim: Usd.Prim) -> bool:
+        return is_garment(prim) or prim in self._cloth
+
+    def is_body(self, prim: Usd.Prim) -> bool:
+        rig, placed = bound_skeleton(prim), self._placed
+        if not self._at_home and placed and rig and _character(rig) != _character(placed):
+            return False  # another of a crowd, which may have the path that this one has at home
+        by_name = placed is not None and rig == placed and prim.GetName() in self._leaves
+        return str(prim.GetPath()) in self._bodies or by_name
+
+    def named(self, name: str) -> list[Usd.Prim]:
+        """Return the prims that a path or a name is of; none where it is of none."""
+        return [prim for prim in self.every if str(prim.GetPath()) == name] or named(self.solid, name)
+
+
+@dataclass(frozen=True)
+class CollidingPrims:
+    """Prims of a stage that collide, and those among them that were asked for by name."""
+
+    stage: Usd.Stage
+    prims: tuple[Usd.Prim, ...] = ()
+    asked: frozenset[Usd.Prim] = frozenset()
+
+
+def find_colliding(stages: Sequence[Usd.Stage], names: Sequence[str], wearer: Wearer) -> CollidingPrims:
+    """Return the prims that collide, by the API and by name; some of the API may be none that cloth can meet.
+
+    They are those of the first stage that has any, and all that are named.
+
+    Args:
+        stages: the shot's where it is another, and the character's own last.
+        names: paths or names of prims.
 
     Raises:
-        SsilkError: a named prim is the garment, the character's body, or cloth cannot meet it.
+        SsilkError: no stage has all named prims, or one is the garment, the character's body, or nothing that cloth
+            can meet.
     """
-    every = list(Usd.PrimRange(stage.GetPseudoRoot(), PRIMS))
-    bodies = {split_location(each.mesh.path)[1] for each in (*own.bodies, *own.stand_ins)}
-    leaves = {str(path).rsplit("/", 1)[-1] for path in bodies}
+    searched = {stage: _Prims(stage, wearer, at_home=stage == stages[-1]) for stage in stages}
+    having = {stage: prims for stage, prims in searched.items() if all(prims.named(name) for name in names)}
+    if not having:
+        _fail_unknown(searched, names)
+    found = CollidingPrims(stages[-1])
+    for stage, prims in having.items():
+        found = _colliding(stage, prims, names)
+        if found.prims:
+            break
+    return found
 
-    def is_body(prim: Usd.Prim) -> bool:
-        rig = bound_skeleton(prim)
-        if not at_home and placed and rig and _character(rig) != _character(placed):
-            return False  # another of a crowd, which may have the path that this one has at home
-        return str(prim.GetPath()) in bodies or (placed is not None and rig == placed and prim.GetName() in leaves)
 
-    cloth = named([prim for prim in every if prim.IsA(UsdGeom.Mesh)], garment) if garment else []
-    found = []
-    for top in every:
+def _colliding(stage: Usd.Stage, prims: _Prims, names: Sequence[str]) -> CollidingPrims:
+    found: list[Usd.Prim] = []
+    for top in prims.every:
         if not top.HasAPI(UsdPhysics.CollisionAPI):
             continue
         beneath = [prim for prim in Usd.PrimRange(top, PRIMS) if prim.IsA(UsdGeom.Gprim)]
-        found += [prim for prim in beneath if not (_is_cloth(prim, cloth) or is_body(prim))]
+        found += [prim for prim in beneath if not (prims.is_cloth(prim) or prims.is_body(prim))]
+    asked: list[Usd.Prim] = []
     for name in names:
-        chosen = _named_prims(stage, every, name)
+        chosen = _shown_beneath(prims.named(name), name)
         for prim in chosen:
-            if _is_cloth(prim, cloth):
+            if prims.is_cloth(prim):
                 fail(f"--collider {name}", f"{prim.GetPath()} is a garment", "garments meet props, floors and bodies")
-            if is_body(prim):
+            if prims.is_body(prim):
                 what = f"{prim.GetPath()} is the character's own body"
                 fail(f"--collider {name}", what, "the garment meets that anyway", "leave it out")
             if why := unmet(prim):
                 allowed = f"colliders are of the types Mesh, {', '.join(SIZES)}, each at a place of its own"
                 fail(f"--collider {name}", f"{prim.GetPath()} is {why}", allowed)
-        found += chosen
-    return list(dict.fromkeys(found))
+        asked += chosen
+    return CollidingPrims(stage, tuple(dict.fromkeys([*found, *asked])), frozenset(asked))
+
+
+def _shown_beneath(tops: Sequence[Usd.Prim], name: str) -> list[Usd.Prim]:
+    """Return what is rendered of prims of a name and beneath them, or all that has a surface where nothing is."""
+    beneath = [prim for top in tops for prim in Usd.PrimRange(top, PRIMS) if prim.IsA(UsdGeom.Gprim)]
+    if not beneath:
+        fail(f"--collider {name}", "nothing with a surface lies there", "name a mesh, or a prim above meshes")
+    return beneath if len(beneath) == 1 else rendered([prim for prim in beneath if is_drawn(prim)]) or beneath
+
+
+def _fail_unknown(searched: Mapping[Usd.Stage, _Prims], names: Sequence[str]) -> NoReturn:
+    """Raise `SsilkError` for names that no stage has all of: which were searched, and what there is."""
+    files = {stage_name(stage): prims for stage, prims in searched.items()}
+    where = {name: [file for file, prims in files.items() if prims.named(name)] for name in names}
+    name = next((name for name, own in where.items() if not own), None)
+    if name is None:
+        one, other = (next(name for name, own in where.items() if own == [file]) for file in files)
+        found = f"{where[one][0]} alone has it, and {where[other][0]} alone has '{other}'"
+        fail(f"--collider {one}", found, "the colliders of a shot are of one stage", "name those of one of the two")
+    could = {
+        str(prim.GetPath()): file
+        for file, prims in files.items()
+        for prim in prims.solid
+        if not (prims.is_cloth(prim) or prims.is_body(prim))
+    }
+    few = [f"{path} in {file}" if len(files) > 1 else path for path, file in list(could.items())[:LISTED]]
+    more = f", and {len(could) - LISTED} more meshes and solids" if len(could) > LISTED else ""
+    found = "has no such prim" if len(files) == 1 else "have no such prim"
+    paths = {path.rsplit("/", 1)[-1]: path for path in could} | {path: path for path in could}
+    fail(
+        f"--collider {name}",
+        f"{' and '.join(files)} {found}",
+        f"there are {', '.join(few) or 'none'}{more}",
+        did_you_mean(name, paths) or "name one by its path",
+    )
 
 
 def unmet(prim: Usd.Prim) -> str:
@@ -109,8 +198,13 @@ def met_prims(prims: Sequence[Usd.Prim], codes: Floats, report: Reporter) -> lis
     return found
 
 
-def read_colliders(met: Sequence[tuple[Usd.Prim, NDArray[np.bool_]]], codes: Floats) -> list[Collider]:
+def read_colliders(
+    met: Sequence[tuple[Usd.Prim, NDArray[np.bool_]]], codes: Floats, lenient: Reporter | None = None
+) -> list[Collider]:
     """Return prims of one stage that `met_prims` found as colliders, in the core's world [m], at its time codes (F,).
+
+    Args:
+        lenient: is told of colliders that cannot be read, and these are left out.
 
     Raises:
         SsilkError: the topology of a mesh changes, its data is malformed, or too many points move.
@@ -119,7 +213,12 @@ def read_colliders(met: Sequence[tuple[Usd.Prim, NDArray[np.bool_]]], codes: Flo
     found: list[Collider] = []
     for prim, present in met:
         left = MOST_POINTS - sum(each.points[..., 0].size for each in found if len(each.points) > 1)
-        found.append(_read(prim, codes, present, skinned, left))
+        try:
+            found.append(_with_area(_read(prim, codes, present, skinned, left)))
+        except SsilkError as error:
+            if lenient is None:
+                raise
+            lenient(Message(f"{error} Cloth does not meet it.", "warning"))
     return found
 
 
@@ -146,6 +245,13 @@ def _read(prim: Usd.Prim, codes: Floats, present: NDArray[np.bool_], skinned: Sk
         _need_room(where, points, world, left)
         return Collider(where, faces, np.stack([apply(each, points) for each in world]), np.eye(4)[None], present)
     return Collider(where, faces, apply(world[0], points)[None], moves, present)
+
+
+def _with_area(collider: Collider) -> Collider:
+    corners = collider.points[0][collider.faces]
+    if not np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any():
+        fail(collider.path, "no triangle of it has an area", "cloth meets surfaces", "leave it out of the colliders")
+    return collider
 
 
 def _need_room(where: str, points: Floats, frames: Floats, left: int) -> None:
@@ -206,25 +312,9 @@ def _present(prim: Usd.Prim, codes: Floats) -> NDArray[np.bool_]:
     return np.array([attribute.Get(float(code)) is not False for code in codes])
 
 
-def _named_prims(stage: Usd.Stage, every: list[Usd.Prim], name: str) -> list[Usd.Prim]:
-    gprims = [prim for prim in every if prim.IsA(UsdGeom.Gprim)]
-    tops = [prim for prim in every if str(prim.GetPath()) == name] or named(gprims, name)
-    if not tops:
-        allowed = f"there are {listed(gprims)}" if len(gprims) < 20 else f"there are {len(gprims)} meshes and solids"
-        fail(f"--collider {name}", f"{stage_name(stage)} has no such prim", allowed, "name one by its path")
-    beneath = [prim for top in tops for prim in Usd.PrimRange(top, PRIMS) if prim.IsA(UsdGeom.Gprim)]
-    if not beneath:
-        fail(f"--collider {name}", "nothing with a surface lies there", "name a mesh, or a prim above meshes")
-    return beneath if len(beneath) == 1 else rendered([prim for prim in beneath if is_drawn(prim)]) or beneath
-
-
 def _character(rig: Usd.Prim) -> Usd.Prim:
     """Return the SkelRoot that a Skeleton is of."""
     return UsdSkel.Root.Find(rig).GetPrim()
-
-
-def _is_cloth(prim: Usd.Prim, named_cloth: list[Usd.Prim]) -> bool:
-    return is_garment(prim) or prim in named_cloth
 
 
 def _world(prim: Usd.Prim, code: float) -> Floats:

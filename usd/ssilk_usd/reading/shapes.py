@@ -7,7 +7,7 @@ of the character's stage throughout, and `animated_shapes` says which ones a mot
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,24 +76,12 @@ class AnimatedShape:
         return f"'{self.name}' of {self.mesh}, {course} where the character's stage has {self.weight:.3g}"
 
 
-def tell_animated_shapes(
-    source: StageLike,
-    motions: Iterable[str],
-    report: Reporter,
-    *,
-    root: str | None = None,
-    garment: str | None = None,
-) -> None:
-    """Report which blendshapes of the character's meshes motions change, in which cloth does not meet them.
-
-    Args are those of `animated_shapes`, for each of several motions.
-    """
-    for motion in motions:
-        found = animated_shapes(source, motion, root=root, garment=garment)
-        if found:
-            text = f"{motion}: it weighs blendshapes that are not followed: {found[0]}"
-            more = f", and {len(found) - 1} more" if len(found) > 1 else ""
-            report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
+def tell_animated_shapes(motion: str, found: Sequence[AnimatedShape], report: Reporter) -> None:
+    """Report the blendshapes that a motion changes, in which cloth does not meet the character's meshes."""
+    if found:
+        text = f"{motion}: it weighs blendshapes that are not followed: {found[0]}"
+        more = f", and {len(found) - 1} more" if len(found) > 1 else ""
+        report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
 
 
 @needs_whole_files

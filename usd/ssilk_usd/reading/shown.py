@@ -49,11 +49,11 @@ def tell_shown_otherwise(
     Raises:
         SsilkError: as `animated_shapes`.
     """
-    paths = [*motions]
-    tell_animated_shapes(source, paths, report, root=root, garment=garment)
-    for motion in paths:
-        weighed = {found.mesh for found in animated_shapes(source, motion, root=root, garment=garment)}
-        for text in shown_otherwise(source, motion, root=root, garment=garment, bodies=bodies, known=weighed):
+    for motion in motions:
+        weighed = animated_shapes(source, motion, root=root, garment=garment)
+        tell_animated_shapes(motion, weighed, report)
+        known = {found.mesh for found in weighed}
+        for text in shown_otherwise(source, motion, root=root, garment=garment, bodies=bodies, known=known):
             report(Message(f"{motion}: {text}", "warning"))
 
 

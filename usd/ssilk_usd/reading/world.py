@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdPhysics
 
 from ssilk_core.errors import fail
-from ssilk_core.events import Message, Reporter, silent
+from ssilk_core.events import Reporter, silent
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import UP, Air, Character, Floats, Motion, ShotWorld
 
 from ..names import GUST_LENGTH, GUST_SEED, GUSTS, WIND
-from ..opening.stage import PRIMS, explains_damage, has_value, listed, open_stage, stage_name, value
+from ..opening.stage import PRIMS, explains_damage, has_value, listed, location, open_stage, stage_name, value
 from ..opening.times import change_times
 from ..units import StageUnits
-from .colliders import colliding_prims, met_prims, read_colliders
+from .colliders import CollidingPrims, Wearer, find_colliding, met_prims, read_colliders
 from .motion import find_animation
 
 EARTH = 9.81  # [m/s2]
@@ -58,6 +58,7 @@ class FoundWorld:
         met: prims that collide, and when; codes: time codes of the motion's frames in their stage, shape (F,).
         fps: of the motion [1/s].
         gravity, air: as in `ShotWorld`.
+        asked: paths of the colliders that were asked for by name.
     """
 
     stage: Usd.Stage
@@ -66,6 +67,7 @@ class FoundWorld:
     fps: float
     gravity: Floats | None
     air: Air | None
+    asked: frozenset[str] = frozenset()
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -73,19 +75,16 @@ class FoundWorld:
         parts = ("colliders", self.met), ("wind", self.air), ("its gravity", self.gravity is not None)
         return tuple(name for name, there in parts if there)
 
-    @property
-    def colliders(self) -> str:
-        """Their paths, the first few of many."""
-        prims = [prim for prim, _ in self.met]
-        return f"{listed(prims[:4])}{f' and {len(prims) - 4} more' if len(prims) > 4 else ''}"
-
-    def read(self, report: Reporter = silent) -> ShotWorld | None:
+    def read(self, *, lenient: Reporter | None = None) -> ShotWorld | None:
         """Return it with its shapes; None where nothing surrounds the character.
+
+        Args:
+            lenient: is told of colliders that cannot be read, and these are left out.
 
         Raises:
             SsilkError: a collider cannot be one.
         """
-        return _with_shapes(self.stage, self, report) if self.parts else None
+        return _with_shapes(self, lenient) if self.parts else None
 
 
 @explains_damage
@@ -120,10 +119,10 @@ def find_world(
     _, placed = find_animation(shot, prim, None)
     stages = [shot] if shot.GetRootLayer() == home.GetRootLayer() else [shot, home]
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
-    own = character, placed, garment
-    there, prims = _colliding(stages, asked.colliders, own) if colliders else (home, [])
-    codes = seconds * there.GetTimeCodesPerSecond()
-    met = met_prims(prims, codes, report)
+    wearer = Wearer(character, placed, garment)
+    there = find_colliding(stages, asked.colliders, wearer) if colliders else CollidingPrims(home)
+    codes = seconds * there.stage.GetTimeCodesPerSecond()
+    met = met_prims(there.prims, codes, report)
     scene = next((found for found in map(_scene, stages) if found), None)
     units = StageUnits.of(shot)
     if asked.gravity is not None:
@@ -133,31 +132,14 @@ def find_world(
     if gravity is not None and np.abs(gravity + EARTH * UP).max() <= SAME * EARTH:
         gravity = None
     air = _air(scene, seconds, asked, units)
-    return FoundWorld(there, tuple(met), codes, motion.fps, gravity, air)
+    by_name = frozenset(map(location, there.asked))
+    return FoundWorld(there.stage, tuple(met), codes, motion.fps, gravity, air, by_name)
 
 
 @explains_damage
-def _with_shapes(stage: Usd.Stage, found: FoundWorld, report: Reporter) -> ShotWorld:
-    """Return what was found in a stage with its shapes."""
-    if found.met:
-        report(Message(f"{stage_name(stage)}: cloth meets {found.colliders}"))
-    return ShotWorld(found.fps, tuple(read_colliders(found.met, found.codes)), found.gravity, found.air)
-
-
-def _colliding(
-    stages: Sequence[Usd.Stage], names: tuple[str, ...], own: tuple[Character, Usd.Prim | None, str | None]
-) -> tuple[Usd.Stage, list[Usd.Prim]]:
-    """Return the stage that has the colliders, and these; none in the last where there are none."""
-    *shot, home = stages
-    for stage in shot:
-        if all(_has(stage, name) for name in names) and (prims := colliding_prims(stage, names, *own, at_home=False)):
-            return stage, prims
-    return home, colliding_prims(home, names, *own, at_home=True)
-
-
-def _has(stage: Usd.Stage, name: str) -> bool:
-    prims = Usd.PrimRange(stage.GetPseudoRoot(), PRIMS)
-    return any(name in (str(prim.GetPath()), prim.GetName()) for prim in prims)
+def _with_shapes(found: FoundWorld, lenient: Reporter | None) -> ShotWorld:
+    """Return what was found with its shapes."""
+    return ShotWorld(found.fps, tuple(read_colliders(found.met, found.codes, lenient)), found.gravity, found.air)
 
 
 def _scene(stage: Usd.Stage) -> Usd.Prim | None:
