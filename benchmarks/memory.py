@@ -113,7 +113,7 @@ def stepper(whole: Scene, config: TrainConfig, device: torch.device) -> Stepper:
     generator = torch.Generator(device).manual_seed(0)
     drawer = None
     if config.collider_fraction:
-        drawer = ObstacleDrawer(whole, model, bank, 0, config.collider_fraction, generator)
+        drawer = ObstacleDrawer(network, bank, 0, config.collider_fraction, generator)
     sampler = WindowSampler(bank, config, model.latent, generator, drawer)
     objective = Objective(network, energy, body, bank, config.closest_point == "triangles", drawer=drawer)
     return Stepper(network, objective, sampler, config, smoothing=ShapeSmoothing.of(network, config.shape_smoothing))
