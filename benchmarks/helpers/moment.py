@@ -36,7 +36,7 @@ class Moment:
         steps, given = torch.arange(self.window, device=self.sampler.first.device)[:, None], 2 * self.batch
         self.times = (self.sampler.first + steps).reshape(-1)
         self.down = self.sampler.direction.repeat(self.window, 1)
-        self.single, self.single_down = self.sampler.poses(self.static_batch)
+        self.single, self.single_down, _ = self.sampler.poses(self.static_batch)
         self.static, self.pose, self.quiet = self.descriptors()
         self.frames = torch.cat([self.times[given:], self.single])
         self.direction = torch.cat([self.down[given:], self.single_down])

@@ -93,28 +93,29 @@ class Stepper:
 
     def static_step(self) -> None:
         """Do a step of static training: P and D on single random poses."""
-        frames, direction = self.sampler.poses(self.config.pretraining_batch)
+        frames, pull, direction = self.sampler.poses(self.config.pretraining_batch)
         inner = self.objective.inner
-        beneath = inner.poses(frames, direction, self.sampler.generator) if inner else None
+        beneath = inner.poses(frames, pull, self.sampler.generator) if inner else None
         obstacles = self.sampler.obstacles_at(frames, direction)
-        terms = self.objective.static(frames, direction, beneath, obstacles)
+        terms = self.objective.static(frames, pull, beneath, obstacles)
         means = {name: value.mean() for name, value in terms.items()}
-        self._descend(total(terms, self._half), means, {"frames": frames, "directions": direction})
+        self._descend(total(terms, self._half), means, {"frames": frames, "directions": pull})
 
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
         if self.config.initial_loss:
             poses = self.sampler.with_initial(*poses)
-        obstacles = self.sampler.obstacles_at(*poses)
+        frames, pull, direction = poses
+        obstacles = self.sampler.obstacles_at(frames, direction)
         inner = {name: value.clone() for name, value in self.sampler.inner.items()}  # the window changes them
-        dynamic, static, latents = self.objective.window(self.sampler, noise, *poses, obstacles)
+        dynamic, static, latents = self.objective.window(self.sampler, noise, frames, pull, obstacles)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
         loss = (total(dynamic, self._half) * moving + total(static, self._half) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
         beside = {f"static {name}": value.mean() for name, value in static.items()}
-        drawn = {"noise": noise, "static frames": poses[0], "static directions": poses[1]}
+        drawn = {"noise": noise, "static frames": frames, "static directions": pull}
         self._descend(loss, means, {**self.sampler.window(), **inner, **drawn}, beside)
         self.sampler.advance(latents)
 

@@ -101,9 +101,9 @@ class WindowSampler:
         """Return the frames of the windows, shape (window, batch)."""
         return self.first + torch.arange(self.config.window, device=self.first.device)[:, None]
 
-    def obstacles_at(self, frames: Tensor, gravity: Tensor) -> Obstacles | None:
-        """Draw obstacles for single poses (M,) under gravity and wind (M, 3); None where none are drawn."""
-        return self.drawer.draw(frames[None], gravity) if self.drawer else None
+    def obstacles_at(self, frames: Tensor, direction: Tensor) -> Obstacles | None:
+        """Draw obstacles for single poses (M,) under gravity (M, 3), without wind; None where none are drawn."""
+        return self.drawer.draw(frames[None], direction) if self.drawer else None
 
     def gravity(self) -> Tensor:
         """Return gravity and wind in each frame of the windows [g], shape (window, batch, 3)."""
@@ -113,20 +113,21 @@ class WindowSampler:
         part = torch.linspace(0, 1, length, device=self.pull.device)[:, None, None]
         return self.direction + torch.lerp(self.pull[0], self.pull[1], part)
 
-    def poses(self, count: int) -> tuple[Tensor, Tensor]:
-        """Draw single poses from all frames: frames (count,), and gravity and wind [g], shape (count, 3)."""
+    def poses(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw single poses from all frames: frames (count,), gravity and wind [g], and gravity alone, (count, 3)."""
         bank, device = self.bank, self.candidates.device
         draw = torch.rand(count, generator=self.generator, device=device)
         frames = (draw * bank.frame_count).long().clamp_max(bank.frame_count - 1)
-        gravity = random_directions(count, self.config.rotated_fraction, self.generator, device)
+        gravity = direction = random_directions(count, self.config.rotated_fraction, self.generator, device)
         if self.config.wind_fraction:
-            gravity = gravity + random_pulls(count, self.config.wind_fraction, self.generator, device)
-        return frames, gravity
+            gravity = direction + random_pulls(count, self.config.wind_fraction, self.generator, device)
+        return frames, gravity, direction
 
-    def with_initial(self, frames: Tensor, gravity: Tensor) -> tuple[Tensor, Tensor]:
-        """Return single poses (M,), (M, 3) followed by the first two of each window."""
+    def with_initial(self, frames: Tensor, gravity: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return single poses (M,), (M, 3), (M, 3) followed by the first two of each window."""
         own = torch.cat([self.first, self.first + 1])
-        return torch.cat([frames, own]), torch.cat([gravity, self.gravity()[:2].flatten(0, 1)])
+        pulled = torch.cat([gravity, self.gravity()[:2].flatten(0, 1)])
+        return torch.cat([frames, own]), pulled, torch.cat([direction, self.direction.repeat(2, 1)])
 
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).

@@ -124,7 +124,7 @@ def test_the_body_is_reached_by_what_is_free_alone(scene, toy_motion):
 def initialiser_learns_from_windows(job: TrainJob) -> bool:
     parts = build_parts(job, CPU)
     stepper = parts.stepper(job.train, 0)
-    frames, direction = stepper.sampler.poses(2)
+    frames, direction, _ = stepper.sampler.poses(2)
     dynamic, *_ = stepper.objective.window(stepper.sampler, stepper.sampler.noise(), frames, direction)
     dynamic["stretch"].sum().backward()
     gradient = parts.model.initialiser[0].weight.grad

@@ -17,12 +17,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld, SkinWeights
+from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
-from ...scene.kinematics import hub_places, motion_transforms, skin_points, skinning_matrices, split_at_cuts
+from ...scene.kinematics import hub_places, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
-from .colliders import VOTERS, ColliderPoser, Nearby
+from .colliders import ColliderPoser, Nearby, carried_points, voting_points
 from .surface import Search, boxes
 
 PLACES = 32  # vertices at which the air is averaged
@@ -43,7 +43,7 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     if world.gravity is not None:
         found = np.stack([world.between(world.gravity, float(each)) for each in seconds])
     if world.air and fabric.drag:
-        air, places = MovingAir(world.air, world.fps), _carried(motion, scene, _loose(scene))
+        air, places = MovingAir(world.air, world.fps), carried_points(motion, scene, _loose(scene))
         blown = np.stack([air.velocity(points, float(each)).mean(axis=0) for points, each in zip(places, seconds)])
         found += fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
     return found
@@ -66,13 +66,12 @@ class ColliderSight:
         self, world: ShotWorld, scene: Scene, places: Places, within: float, see: Proximity, search: Search = boxes
     ) -> None:
         self._world, self._scene, self._places, self._within, self._see = world, scene, places, within, see
-        self._voters = _spread(np.arange(scene.garment.mesh.vertex_count), VOTERS)
         self._poser = ColliderPoser(search)
 
     def near(self, motion: Motion, frames: Ints) -> Floats:
         """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
-        points, voters = self._places(own), _carried(own, self._scene, self._voters)
+        points, voters = self._places(own), voting_points(own, self._scene)
         roots, found = hub_places(self._scene.character.skeleton, own.rotations, own.translations), []
         for frame, here, votes, root in zip(frames.tolist(), points, voters, roots):
             distance, normal = np.full(len(here), np.inf), np.zeros((len(here), 3))
@@ -94,14 +93,6 @@ def _loose(scene: Scene) -> Ints:
 def _spread(rows: Ints, count: int) -> Ints:
     """Return so many of some vertices, or all."""
     return rows[np.linspace(0, len(rows) - 1, min(count, len(rows))).astype(int)]
-
-
-def _carried(motion: Motion, scene: Scene, rows: Ints) -> Floats:
-    """Return vertices of the cloth under linear blend skinning [m], shape (F, P, 3)."""
-    skin, skeleton = scene.lbs_skin, scene.character.skeleton
-    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-    own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])
-    return skin_points(scene.garment.mesh.points[rows], own, matrices)
 
 
 def _root_velocity(motion: Motion, scene: Scene) -> Floats:

@@ -196,7 +196,7 @@ def test_a_step_weighs_every_frame_the_same(objective):
     expected = gradients(objective, frames)
     length = torch.cat([value.flatten() for value in expected.values()]).norm()  # only directions count
     stepper = Stepper(objective.model, objective, sampler, sampler.config)
-    sampler.poses = lambda count: POSES
+    sampler.poses = lambda count: (*POSES, POSES[1])
     stepper.dynamic_step()
     for name, value in objective.model.named_parameters():
         assert value.grad is not None

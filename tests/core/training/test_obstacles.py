@@ -268,6 +268,17 @@ def test_obstacles_go_on_with_their_windows_and_are_restored(scene, seeing, bank
     assert all(torch.equal(a, b) for a, b in zip(one.state().values(), other.state().values()))
 
 
+def test_floors_of_single_poses_are_level_in_wind(scene, seeing, bank) -> None:
+    draws = drawer(scene, seeing, bank)
+    config = TrainConfig(batch=4, window=5, wind_fraction=1.0, rotated_fraction=0.0, collider_fraction=1.0)
+    sampler = WindowSampler(bank, config, 3, draws.generator, draws)
+    frames, pulled, direction = sampler.poses(400)
+    assert (pulled - direction).norm(dim=1).min() > 0  # it blows in all of them
+    found = sampler.obstacles_at(frames, direction)
+    up = found.turn[0, found.radius[0] > -LARGE, :, 0]
+    assert 0.5 < (up[:, 1] > 1 - 1e-6).float().mean() < 0.7
+
+
 def test_cloth_meets_obstacles(scene, seeing, toy_motion, toy_objective, bank) -> None:
     """A wall through the cloth pushes what is behind it, and nothing else."""
     objective = toy_objective(scene, seeing, toy_motion(scene, 20))

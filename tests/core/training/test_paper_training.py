@@ -120,7 +120,7 @@ def test_the_first_two_poses_alone_train_the_initialiser(stepper):
     stepper, _ = stepper
     without = replace(STEP, initial_loss=False, static_batch=1)
     assert stepper.config.static_batch == 0
-    frames, direction = stepper.sampler.with_initial(torch.tensor([7]), DOWN)
+    frames, direction, _ = stepper.sampler.with_initial(torch.tensor([7]), DOWN, DOWN)
     first = stepper.sampler.first
     assert frames.tolist() == [7, *first.tolist(), *(first + 1).tolist()]
     assert torch.equal(direction, torch.cat([DOWN, stepper.sampler.direction, stepper.sampler.direction]))

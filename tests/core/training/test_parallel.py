@@ -63,7 +63,7 @@ class Recorder:
 def poses(run: TrainingRun, first: int, count: int) -> None:
     """Let a run look at certain single poses instead of drawing them."""
     down = torch.tensor([0.0, -1.0, 0.0]).expand(count, 3)
-    run.stepper.sampler.poses = lambda _: (torch.arange(first, first + count), down)
+    run.stepper.sampler.poses = lambda _: (torch.arange(first, first + count), down, down)
 
 
 def shared_gradient(job: TrainJob, group: ProcessGroup) -> dict[str, object]:

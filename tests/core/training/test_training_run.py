@@ -552,7 +552,7 @@ def test_nothing_that_was_learned_is_lost_with_half_the_batch(job, monkeypatch):
     limited(monkeypatch, windows=2, poses=2)
 
     def looked_at(self: Stepper) -> None:
-        self.objective.window(self.sampler, self.sampler.noise(), *self.sampler.poses(2))
+        self.objective.window(self.sampler, self.sampler.noise(), *self.sampler.poses(2)[:2])
 
     monkeypatch.setattr(Stepper, "dynamic_step", looked_at)
     run.step()
