@@ -3,12 +3,15 @@
 
 One call computes one frame of any number of characters. Inputs are the states of the two previous frames, the
 descriptors of the pose (static ones and rates, see ssilk_core/network/descriptors.py) and a flag for the first two
-frames of a shot. Where the network sees colliders, static ones begin with their proximity to some vertices, which are
-told with the distance from which on it is zero (see ssilk_core/network/proximity.py). Where the stepper sees points
-of the cloth, the skinning matrices of the character's joints about its root follow, and the root's position less
-twice the last one plus the one before. Outputs are the new state, the weights of the blendshapes and the local
-rotations of the proxy joints, as in a shot. Where proxies move, their local translations follow. Blendshapes and
-skinning weights are those of any baked shot.
+frames of a shot. Where the stepper sees points of the cloth, or the network colliders, the skinning matrices of the
+character's joints about its root follow, and the root's position less twice the last one plus the one before. Outputs
+are the new state, the weights of the blendshapes and the local rotations of the proxy joints, as in a shot. Where
+proxies move, their local translations follow. Blendshapes and skinning weights are those of any baked shot.
+
+Where the network sees colliders, the last input is their proximity (see ssilk_core/network/proximity.py), and the
+last output the points to look for them from, about the root. These are of the frame itself: call with the proximity
+of nothing, (0, 0, 0, 1, -1) at each point, look from the points that come out, and call again with what was found.
+Without colliders the first call is all. How far to look is told, and the vertices that the points are.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "network": str(output),
                 "latents": file.config.latent,
                 "numbers in a state": FrameNetwork(model).state_size,
-                "static descriptors": static,
+                "static descriptors": static - model.proximity,
                 "dynamic descriptors": rates,
                 **near,
                 "weights": file.config.shapes + model.decoder.has_constant,

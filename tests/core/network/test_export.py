@@ -127,6 +127,7 @@ def test_a_network_that_sees_colliders_is_exported_and_where_it_sees_them_told(
     assert told["sees colliders at vertices"] == proximity_vertices(scene, seeing.config).tolist()
     assert told["and up to [m]"] == pytest.approx(proximity_reach(scene))
     session = onnxruntime.InferenceSession(tmp_path / "toy.onnx", providers=["CPUExecutionProvider"])
+    assert next(each.shape[1] for each in session.get_inputs() if each.name == "static") == told["static descriptors"]
     plain = toy_motion(scene, FRAMES)
     dice = np.random.default_rng(4)
     away = dice.normal(size=(FRAMES, 5, 3))
