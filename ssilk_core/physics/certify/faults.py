@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is wrong in one frame of a garment: triangles that intersect others, and covered skin that shows.
+
+Skin is looked at where its share is measured (`skin.covered_skin`), and at four times as many points between, along
+smooth normals. Points inside another part of the body are not seen, whatever lies over them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ...scene.assets import Floats, Ints, Scene
+from ...scene.mesh import topology
+from ..collision.winding_number import ENCLOSED, winding_number
+from ..intersections.cloth import ClothIntersections
+from ..skin.covered_points import CoveredPoints, LastingRays
+from ..skin.figures import COVER_REACH, SHOW_DEPTH
+
+DENSE = 30_001  # points between those at which skin is measured, 7 mm apart on a person
+LIFTED = 5e-4  # [m] above a point at which it is asked whether other parts of the body enclose it
+
+
+@dataclass(frozen=True, eq=False)
+class SkinPoints:
+    """M points of the skin with the cloth that lies next to them along their normals.
+
+    Attributes:
+        index: among all points that are looked at, shape (M,).
+        face: triangle of the cloth (M,); weights: barycentric coordinates on it (M, 3).
+        normal: of the skin (M, 3).
+        height: of the cloth above the point [m], negative beneath it, shape (M,).
+    """
+
+    index: Ints
+    face: Ints
+    weights: Floats
+    normal: Floats
+    height: Floats
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def chosen(self, kept: Ints | np.ndarray) -> SkinPoints:
+        """Return some of the points."""
+        return SkinPoints(*(getattr(self, name)[kept] for name in ("index", "face", "weights", "normal", "height")))
+
+
+@dataclass(frozen=True, eq=False)
+class FrameFaults:
+    """What is wrong in a frame: pairs of triangles that intersect (P, 2), and skin that shows."""
+
+    pairs: Ints
+    skin: SkinPoints
+
+    @property
+    def count(self) -> int:
+        """Number of pairs and points together; 0 where the frame is free."""
+        return len(self.pairs) + len(self.skin)
+
+
+class FaultFinder:
+    """Finds what is wrong in frames of one garment on one character.
+
+    Args:
+        scene: with the character's body, if it has one.
+
+    Attributes:
+        cloth: which triangles intersect.
+        joints: of each point of the skin that is looked at, the joint with the largest weight, shape (S,).
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.cloth, self.faces = ClothIntersections.of(scene), scene.garment.mesh.faces
+        self._sets: list[tuple[CoveredPoints, bool]] = []
+        self.joints = np.zeros(0, dtype=np.int64)
+        if not scene.character.bodies:
+            return
+        merged, mesh = scene.character.merged_body(), scene.garment.mesh
+        self._body = merged.mesh
+        cpu = torch.device("cpu")
+        found = [(CoveredPoints(merged.mesh, mesh, device=cpu), False)]
+        found.append((CoveredPoints(merged.mesh, mesh, count=DENSE, seed=None, smooth=True, device=cpu), True))
+        self._sets = [each for each in found if len(each[0])]
+        heaviest = merged.skin.dense(len(scene.character.skeleton.joint_names)).argmax(axis=1)
+        if self._sets:
+            self.joints = np.concatenate([
+                heaviest[merged.mesh.faces[points.faces, points.weights.argmax(axis=1)]] for points, _ in self._sets
+            ])  # fmt: skip
+            self._rays = LastingRays(mesh, len(self.joints))
+
+    def place(self, body: Floats | None) -> PosedSkin | None:
+        """Return the points of the skin on a posed body (B, 3) [m]; None where none is covered."""
+        if body is None or not self._sets:
+            return None
+        smooth_normals = topology.vertex_normals(body, self._body.faces)
+        starts, normals = [], []
+        for points, smooth in self._sets:
+            corners, share = self._body.faces[points.faces], points.weights[..., None]
+            at = body[corners]
+            starts.append((at * share).sum(axis=1))
+            flat = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
+            normal = (smooth_normals[corners] * share).sum(axis=1) if smooth else flat
+            normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12))
+        return PosedSkin(body, np.concatenate(starts), np.concatenate(normals))
+
+    def find(self, points: Floats, skin: PosedSkin | None) -> FrameFaults:
+        """Return what is wrong with the cloth at these positions [m], shape (V, 3)."""
+        return FrameFaults(self.cloth.pairs(points), self.showing(points, skin))
+
+    def showing(self, points: Floats, skin: PosedSkin | None) -> SkinPoints:
+        """Return the points of the skin that show, with the cloth beneath them."""
+        if skin is None:
+            return _no_points()
+        origin = skin.starts.mean(axis=0)
+        asked = (np.ascontiguousarray(each, dtype=np.float32) for each in (points - origin, skin.starts - origin))
+        covered, near = self._rays.look(*asked, skin.normals.astype(np.float32))
+        shows = np.flatnonzero(near & ~covered)
+        shows = shows[~self._enclosed(skin, shows)]
+        return self._nearest(points, skin, shows, -SHOW_DEPTH, 0.0)
+
+    def resting(
+        self, points: Floats, skin: PosedSkin, chosen: Ints, faces: Ints, above: float
+    ) -> SkinPoints:
+        """Return the points, of those with indices (M,), over which some triangles (T,) lie less than `above` [m].
+
+        Where other cloth lies over them, nothing shows, and they are left out.
+        """
+        found = self._nearest(points, skin, chosen, -SHOW_DEPTH, COVER_REACH, faces, above)
+        return found.chosen(found.height < above)
+
+    def _enclosed(self, skin: PosedSkin, chosen: Ints) -> np.ndarray:
+        """Tell which points lie inside a part of the body, bool (M,)."""
+        starts = skin.starts[chosen] + LIFTED * skin.normals[chosen]
+        corners = skin.body[self._body.faces]
+        found = [
+            winding_number(torch.from_numpy(corners[None] - start)[:, :, :, :])[0] > ENCLOSED for start in starts
+        ]
+        return np.array([bool(each) for each in found], dtype=bool)
+
+    def _nearest(
+        self,
+        points: Floats,
+        skin: PosedSkin,
+        chosen: Ints,
+        low: float,
+        high: float,
+        faces: Ints | None = None,
+        above: float = np.inf,
+    ) -> SkinPoints:
+        """Return the outermost cloth that lies between two heights over some of the points [m].
+
+        Args:
+            faces: triangles (T,) of which one has to lie less than `above` them [m]; None for no such need.
+        """
+        rows, found, weights, heights = [], [], [], []
+        some = self.faces if faces is None else self.faces[faces]
+        corners = points[some]
+        centre = (corners.max(axis=1) + corners.min(axis=1)) / 2
+        radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+        for index in chosen.tolist():
+            start, normal = skin.starts[index], skin.normals[index]
+            away = centre - start
+            along = away @ normal
+            near = np.flatnonzero(np.linalg.norm(away - along[:, None] * normal, axis=1) <= radius)
+            share, height = _meet(corners[near], start, normal)
+            within = (height >= low - 1e-5) & (height <= min(high, above))
+            hit = np.flatnonzero((share.min(axis=1) >= -1e-5) & within)
+            if len(hit):
+                best = hit[height[hit].argmax()]
+                rows.append(index)
+                found.append(near[best])
+                weights.append(share[best].clip(0, 1))
+                heights.append(height[best])
+        if not rows:
+            return _no_points()
+        at, triangles = np.array(rows), np.array(found) if faces is None else faces[np.array(found)]
+        return SkinPoints(at, triangles, np.array(weights), skin.normals[at], np.array(heights))
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSkin:
+    """Points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body (B, 3) [m]."""
+
+    body: Floats
+    starts: Floats
+    normals: Floats
+
+
+def _no_points() -> SkinPoints:
+    none = np.zeros(0, dtype=np.int64)
+    return SkinPoints(none, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+def _meet(corners: Floats, start: Floats, direction: Floats) -> tuple[Floats, Floats]:
+    """Return where a line meets the planes of triangles (F, 3, 3): barycentric coordinates (F, 3), distances (F,)."""
+    first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], start - corners[:, 0]
+    across = np.cross(direction, second)
+    volume = (first * across).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = (away * across).sum(axis=1) / volume
+        turned = np.cross(away, first)
+        v = turned @ direction / volume
+        height = (second * turned).sum(axis=1) / volume
+    weights = np.stack([1 - u - v, u, v], axis=1)
+    return np.nan_to_num(weights, nan=-1.0, posinf=-1.0, neginf=-1.0), np.nan_to_num(height, nan=np.inf)
