@@ -133,6 +133,32 @@ class Certifier:
         still = {frame: each for frame, each in points.items() if not np.array_equal(each, frames.points(frame))}
         return Certified(tuple(sorted(faults)), still, left)
 
+    def again(
+        self, frames: Frames, frame: int, points: Floats | None, thickness: float
+    ) -> tuple[Floats, FrameFaults]:
+        """Return where one frame is free with more room than before, or best, and what is left.
+
+        Args:
+            points: where it was moved to, shape (V, 3); None for its own place.
+            thickness: at which cloth is kept from cloth [m].
+        """
+        own, skin = frames.points(frame), self._skin(frames, frame)
+        start = own if points is None else points
+        freed = self.untangler.free(start, skin)
+        if not freed.is_free:
+            return freed.points, freed.faults
+        moves = freed.moved | (start != own).any(axis=1)
+        settled = self.settler.settle(freed.points, start, self._widened(moves), skin, thickness)
+        left = self.finder.find(settled, skin)
+        return (freed.points, freed.faults) if left.count else (settled, left)
+
+    def _widened(self, moves: np.ndarray) -> np.ndarray:
+        """Return the vertices that move (V,), with their neighbours."""
+        faces = self.untangler.mesh.faces
+        found = moves.copy()
+        found[faces[moves[faces].any(axis=1)].reshape(-1)] = True
+        return found
+
     def _skin(self, frames: Frames, frame: int) -> PosedSkin | None:
         return self.finder.place(frames.body(frame))
 
