@@ -148,9 +148,8 @@ class Certifier:
         if not freed.is_free:
             return freed.points, freed.faults
         moves = freed.moved | (start != own).any(axis=1)
-        settled = self.settler.settle(freed.points, start, self._widened(moves), skin, thickness)
-        left = self.finder.find(settled, skin)
-        return (freed.points, freed.faults) if left.count else (settled, left)
+        settled = self._settled(freed.points, start, self._widened(moves), skin, thickness)
+        return (freed.points, freed.faults) if settled is None else (settled.points, settled.left)
 
     def _widened(self, moves: np.ndarray) -> np.ndarray:
         """Return the vertices that move (V,), with their neighbours."""
@@ -180,9 +179,8 @@ class Certifier:
                 break
         assert best is not None
         if not best.left.count:
-            settled = self.settler.settle(best.points, own, best.moves, skin, thickness)
-            if not self.finder.find(settled, skin).count:
-                best.points = settled
+            settled = self._settled(best.points, own, best.moves, skin, thickness)
+            best = best if settled is None else settled
         best.offsets = _unturned(turns, best.points - own)
         return best
 
@@ -225,9 +223,15 @@ class Certifier:
         if own is not None and own.left.count:  # nothing is free to start from
             left = self.finder.find(target, skin)
             return _Moved(target, left, moves) if left.count <= own.left.count else None
+        return self._settled(start, target, moves, skin, thickness)
+
+    def _settled(
+        self, start: Floats, target: Floats, moves: np.ndarray, skin: PosedSkin | None, thickness: float
+    ) -> _Moved | None:
+        """Return a free frame near a target, lifted once more where that uncovered skin; None where it stays bare."""
         settled = self.settler.settle(start, target, moves, skin, thickness)
-        left = self.finder.find(settled, skin)
-        return None if left.count else _Moved(settled, left, moves)
+        found = self.untangler.free(settled, skin, lifts=True)
+        return None if found.faults.count else _Moved(found.points, found.faults, moves | found.moved)
 
 
 def runs(frames: Iterable[int], cuts: Iterable[int] = ()) -> list[tuple[int, int]]:

@@ -16,6 +16,7 @@ from ...scene.assets import Floats, Ints, Scene
 from ...scene.mesh import topology
 from ..collision.winding_number import ENCLOSED, winding_number
 from ..intersections.cloth import ClothIntersections
+from ..skin.blocked_rays import NO_TRIANGLE, BlockedRays
 from ..skin.covered_points import CoveredPoints, LastingRays
 from ..skin.figures import COVER_REACH, SHOW_DEPTH
 
@@ -90,6 +91,8 @@ class FaultFinder:
                 heaviest[merged.mesh.faces[points.faces, points.weights.argmax(axis=1)]] for points, _ in self._sets
             ])  # fmt: skip
             self._rays = LastingRays(mesh, len(self.joints))
+            self._search = BlockedRays(mesh.points, mesh.faces)
+            self._last = np.full(len(self.joints), NO_TRIANGLE)
 
     def place(self, body: Floats | None) -> PosedSkin | None:
         """Return the points of the skin on a posed body (B, 3) [m]; None where none is covered."""
@@ -121,15 +124,25 @@ class FaultFinder:
         shows = shows[~self._enclosed(skin, shows)]
         return self._nearest(points, skin, shows, -SHOW_DEPTH, 0.0)
 
-    def resting(
-        self, points: Floats, skin: PosedSkin, chosen: Ints, faces: Ints, above: float
-    ) -> SkinPoints:
-        """Return the points, of those with indices (M,), over which some triangles (T,) lie less than `above` [m].
+    def resting(self, points: Floats, skin: PosedSkin, chosen: Ints, above: float) -> SkinPoints:
+        """Return the points, of those with indices (M,), over which cloth lies less than `above` [m], and none over it.
 
-        Where other cloth lies over them, nothing shows, and they are left out.
+        Beneath the skin it is looked for as deep as it is seen.
         """
-        found = self._nearest(points, skin, chosen, -SHOW_DEPTH, COVER_REACH, faces, above)
-        return found.chosen(found.height < above)
+        origin = skin.starts.mean(axis=0)
+        x, starts = ((each - origin).astype(np.float32) for each in (points, skin.starts[chosen]))
+        normals = skin.normals[chosen].astype(np.float32)
+        low, middle, high = (np.full(len(chosen), reach, np.float32) for reach in (-SHOW_DEPTH, above, COVER_REACH))
+        face, height = self._search.find(x, starts, normals, low, middle, self._last[chosen])
+        self._last[chosen] = face
+        rows = np.flatnonzero(face != NO_TRIANGLE)
+        unknown = np.full(len(rows), NO_TRIANGLE)
+        over, _ = self._search.find(x, starts[rows], normals[rows], middle[rows], high[rows], unknown)
+        rows = rows[over == NO_TRIANGLE]
+        corners = points[self.faces[face[rows]]]
+        places = skin.starts[chosen[rows]] + height[rows, None] * skin.normals[chosen[rows]]
+        weights = barycentric(places, corners)
+        return SkinPoints(chosen[rows], face[rows], weights, skin.normals[chosen[rows]], height[rows].astype(float))
 
     def _enclosed(self, skin: PosedSkin, chosen: Ints) -> np.ndarray:
         """Tell which points lie inside a part of the body, bool (M,)."""
@@ -147,17 +160,10 @@ class FaultFinder:
         chosen: Ints,
         low: float,
         high: float,
-        faces: Ints | None = None,
-        above: float = np.inf,
     ) -> SkinPoints:
-        """Return the outermost cloth that lies between two heights over some of the points [m].
-
-        Args:
-            faces: triangles (T,) of which one has to lie less than `above` them [m]; None for no such need.
-        """
+        """Return the outermost cloth that lies between two heights over some of the points [m]."""
         rows, found, weights, heights = [], [], [], []
-        some = self.faces if faces is None else self.faces[faces]
-        corners = points[some]
+        corners = points[self.faces]
         centre = (corners.max(axis=1) + corners.min(axis=1)) / 2
         radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
         for index in chosen.tolist():
@@ -166,7 +172,7 @@ class FaultFinder:
             along = away @ normal
             near = np.flatnonzero(np.linalg.norm(away - along[:, None] * normal, axis=1) <= radius)
             share, height = _meet(corners[near], start, normal)
-            within = (height >= low - 1e-5) & (height <= min(high, above))
+            within = (height >= low - 1e-5) & (height <= high)
             hit = np.flatnonzero((share.min(axis=1) >= -1e-5) & within)
             if len(hit):
                 best = hit[height[hit].argmax()]
@@ -176,8 +182,8 @@ class FaultFinder:
                 heights.append(height[best])
         if not rows:
             return _no_points()
-        at, triangles = np.array(rows), np.array(found) if faces is None else faces[np.array(found)]
-        return SkinPoints(at, triangles, np.array(weights), skin.normals[at], np.array(heights))
+        at = np.array(rows)
+        return SkinPoints(at, np.array(found), np.array(weights), skin.normals[at], np.array(heights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +198,16 @@ class PosedSkin:
 def _no_points() -> SkinPoints:
     none = np.zeros(0, dtype=np.int64)
     return SkinPoints(none, none, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+
+def barycentric(places: Floats, corners: Floats) -> Floats:
+    """Return the barycentric coordinates (M, 3) of places (M, 3) on triangles (M, 3, 3)."""
+    first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], places - corners[:, 0]
+    normal = np.cross(first, second)
+    square = (normal * normal).sum(axis=1).clip(np.finfo(float).tiny)
+    u = (np.cross(away, second) * normal).sum(axis=1) / square
+    v = (np.cross(first, away) * normal).sum(axis=1) / square
+    return np.stack([1 - u - v, u, v], axis=1).clip(0, 1)
 
 
 def _meet(corners: Floats, start: Floats, direction: Floats) -> tuple[Floats, Floats]:

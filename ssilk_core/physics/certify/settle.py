@@ -21,10 +21,11 @@ from .metric import DisplacementMetric
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix
 
-BARRIER = 1e9  # of the barrier's stiffness, in the metric's units, at which cloth keeps most of its thickness
+# Stiffness of the barrier in the metric's units: soft while cloth comes near, stiff so that it keeps its thickness.
+BARRIERS = (1e6, 3e7, 1e9)
 THICKNESS = 4e-4  # [m] from which on the barrier pushes
 MARGIN = 0.02  # [m] around the vertices that move, within which the rest of the garment is met
-STEPS = 25
+STEPS = 12  # with each barrier, at most
 ENOUGH = 2e-5  # [m] of a step, after which none follows
 SHORTEST = 1e-3  # of a step in the search along it
 SPRING = 20.0  # under cloth on skin, relative to the metric's diagonal
@@ -62,28 +63,32 @@ class Settler:
         if not len(rows):
             return start
         potential = _Potential(self, start, target, rows, thickness)
-        x, held = start[rows], self._held(start, target, moves, skin)
-        for _ in range(STEPS):
-            supports = _Supports.of(held, self.mesh.faces, moves, skin, self.metric)
-            energy, gradient, hessian = potential.at(x, supports)
-            step = _solve(hessian, -gradient).reshape(-1, 3)
-            share = potential.free_share(x, step)
-            slope = float(gradient @ step.reshape(-1))
-            while share > SHORTEST and potential.energy(x + share * step, supports) > energy + 1e-4 * share * slope:
-                share /= 2
-            if share <= SHORTEST:
-                break
-            x = x + share * step
-            if share * np.linalg.norm(step, axis=1).max() < ENOUGH:
-                break
-            whole = target.copy()
-            whole[rows] = x
-            held = self._held(whole, target, moves, skin)
-        found = target.copy()
+        x, whole = start[rows], np.array(start)
+        for stiffness in BARRIERS:
+            potential.stiffen(stiffness)
+            for _ in range(STEPS):
+                whole[rows] = x
+                held = self._held(whole, moves, skin)
+                step = self._step(potential, x, _Supports.of(held, self.mesh.faces, moves, self.metric))
+                if step is None:
+                    break
+                x = x + step
+                if np.linalg.norm(step, axis=1).max() < ENOUGH:
+                    break
+        found = np.array(target)
         found[rows] = x
         return found
 
-    def _held(self, points: Floats, target: Floats, moves: np.ndarray, skin: PosedSkin | None) -> SkinPoints | None:
+    def _step(self, potential: _Potential, x: Floats, supports: _Supports | None) -> Floats | None:
+        """Return a step (R, 3) that lowers the energy; None where only a tiny one does."""
+        energy, gradient, hessian = potential.at(x, supports)
+        step = _solve(hessian, -gradient).reshape(-1, 3)
+        share, slope = potential.free_share(x, step), float(gradient @ step.reshape(-1))
+        while share > SHORTEST and potential.energy(x + share * step, supports) > energy + 1e-4 * share * slope:
+            share /= 2
+        return share * step if share > SHORTEST else None
+
+    def _held(self, points: Floats, moves: np.ndarray, skin: PosedSkin | None) -> SkinPoints | None:
         """Return the points of the skin that moving cloth lies on."""
         if skin is None:
             return None
@@ -91,8 +96,8 @@ class Settler:
         near = np.flatnonzero(((skin.starts >= lows) & (skin.starts <= highs)).all(axis=1))
         if not len(near):
             return None
-        faces = np.flatnonzero(moves[self.mesh.faces].any(axis=1))
-        return self.finder.resting(points, skin, near, faces, RESTING)
+        found = self.finder.resting(points, skin, near, RESTING)
+        return found.chosen(moves[self.mesh.faces[found.face]].any(axis=1))
 
 
 class _Supports:
@@ -107,13 +112,12 @@ class _Supports:
         held: SkinPoints | None,
         faces: Ints,
         moves: np.ndarray,
-        skin: PosedSkin | None,
         metric: DisplacementMetric,
     ) -> _Supports | None:
         """Return springs under what is held; heights are those that fixed vertices and the skin leave."""
         import scipy.sparse as sparse
 
-        if held is None or skin is None or not len(held):
+        if held is None or not len(held):
             return None
         place = np.where(moves, np.cumsum(moves) - 1, -1)
         corner = faces[held.face]
@@ -160,9 +164,15 @@ class _Potential:
             self.mesh.can_collide = ipctk.make_sparse_filter(apart, True)
         self.places = place[rows]
         self.whole = np.asfortranarray(start[vertices])
-        self.barrier = ipctk.BarrierPotential(thickness, BARRIER)
+        self.stiffen(BARRIERS[0])
         degrees = np.arange(3 * len(vertices)).reshape(-1, 3)[self.places].reshape(-1)
         self.degrees = degrees
+
+    def stiffen(self, stiffness: float) -> None:
+        """Take a barrier of this stiffness."""
+        import ipctk
+
+        self.barrier = ipctk.BarrierPotential(self.thickness, stiffness)
 
     def _placed(self, x: Floats) -> Floats:
         placed = self.whole.copy(order="F")
@@ -216,7 +226,9 @@ class _Potential:
         import ipctk
 
         start, end = self._placed(x), self._placed(x + step)
-        return float(ipctk.compute_collision_free_stepsize(self.mesh, start, end))
+        # The default test subdivides intervals, and sheets that move in parallel keep it for minutes.
+        test = ipctk.AdditiveCCD()
+        return float(ipctk.compute_collision_free_stepsize(self.mesh, start, end, narrow_phase_ccd=test))
 
 
 def _solve(matrix: csc_matrix, right: Floats) -> Floats:

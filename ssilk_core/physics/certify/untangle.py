@@ -23,8 +23,9 @@ LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a
 REACH = 4.0  # lengths around what is wrong, within which vertices move
 STEP = 8e-4  # [m] of the vertex that moves most
 PATIENCE = 10  # steps without fewer faults, after which pushes spread less
-STEPS = 120  # at most
+STEPS, FEW = 120, 8  # at most; and where cloth that is free is only lifted
 HEIGHT = 1e-3  # [m] over points of the skin that showed
+MOST = 200  # points of the skin that one step asks at, of each triangle the deepest
 AGAIN = 1e-8  # of the largest response, so that points beside each other do not fight
 
 
@@ -53,17 +54,20 @@ class Untangler:
         self.mesh, self.finder = mesh, finder
         self.metrics = [DisplacementMetric(mesh, length) for length in LENGTHS]
 
-    def free(self, start: Floats, skin: PosedSkin | None, faults: FrameFaults | None = None) -> Untangled:
+    def free(
+        self, start: Floats, skin: PosedSkin | None, faults: FrameFaults | None = None, *, lifts: bool = False
+    ) -> Untangled:
         """Return positions from a start (V, 3) [m] at which less is wrong, and nothing where that was found.
 
         Args:
             faults: what is wrong at the start, where that is known.
+            lifts: only a little is left to lift, and few steps are made.
         """
         faults = faults or self.finder.find(start, skin)
         best = Untangled(start, faults, np.zeros(len(start), dtype=bool))
         points, level, waited, tried = start, 0, 0, 0
         region, solver = np.zeros(len(start), dtype=bool), None
-        while faults.count and tried < STEPS:
+        while faults.count and tried < (FEW if lifts else STEPS):
             wanted = region | self._around(faults, LENGTHS[level] * REACH)
             if solver is None or (wanted & ~region).any():
                 region, solver = wanted, self.metrics[level].within(np.flatnonzero(wanted))
@@ -112,6 +116,7 @@ def lift(
     """
     from scipy.optimize import nnls
 
+    skin = _deepest(skin)
     place = np.cumsum(region) - 1
     count = int(region.sum())
     rows = np.zeros((len(skin), count, 3))
@@ -126,3 +131,10 @@ def lift(
     lower = np.linalg.cholesky(compliance)
     pushes, _ = nnls(lower.T, np.linalg.solve(lower, gaps))
     return np.einsum("rnc,n->rc", answers, pushes)
+
+
+def _deepest(skin: SkinPoints) -> SkinPoints:
+    """Return of the points over each triangle the one with the deepest cloth, and of these the deepest `MOST`."""
+    order = np.argsort(skin.height, kind="stable")
+    first = order[np.sort(np.unique(skin.face[order], return_index=True)[1])]
+    return skin.chosen(first[:MOST])
