@@ -15,15 +15,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import VerificationError, fail
 from ...events import Countdown, Message, Reporter, silent
 from ...physics.intersections.pairs import need_predicates
-from ...scene.assets import Deformer, Floats, GarmentPose
-from ...scene.kinematics import deform, motion_transforms, skin_points, skinning_matrices, split_at_cuts
+from ...scene.assets import Floats, GarmentPose
+from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from .opened import add_provenance, open_shot, provenance_of
 from .result import CertificateSummary, FrameSpan
 from .rollout import BakeRollout, Certificate
@@ -87,7 +87,7 @@ def certified(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     work.faulty = tuple(faults)
     if faults:
         report(Message(f"{len(faults)} of {work.frames.count} frames are moved"))
-        found = work.certifier.certify(work.frames, faults, Countdown(len(faults), report))
+        found = work.certifier.certify(work.frames, faults, Countdown(2 * len(faults), report))
         work.points.update(found.points)
         work.caught.update(found.left)
     return _with_shapes(work, poses)

@@ -112,7 +112,7 @@ class Certifier:
 
         Args:
             faults: by frame.
-            told: called after each of them.
+            told: called twice for each of them.
             thickness: at which cloth is kept from cloth [m].
         """
         moved: dict[int, _Moved] = {}
@@ -126,7 +126,7 @@ class Certifier:
                 again = self._freed(frames, frame, faults[frame], after, thickness)
                 if again.left.count < moved[frame].left.count:
                     moved[frame] = again
-        eased = self._eased(frames, moved, thickness)
+        eased = self._eased(frames, moved, thickness, told)
         together = dict(sorted({**moved, **eased}.items()))
         left = {frame: each.left for frame, each in together.items() if each.left.count}
         points = {frame: each.points for frame, each in together.items()}
@@ -184,7 +184,9 @@ class Certifier:
         best.offsets = _unturned(turns, best.points - own)
         return best
 
-    def _eased(self, frames: Frames, moved: Mapping[int, _Moved], thickness: float) -> dict[int, _Moved]:
+    def _eased(
+        self, frames: Frames, moved: Mapping[int, _Moved], thickness: float, told: Callable[[], object]
+    ) -> dict[int, _Moved]:
         """Return the frames around those that moved, and what changes of these, for the sake of the course."""
         found: dict[int, _Moved] = {}
         free = {frame: each.offsets for frame, each in moved.items() if not each.left.count}
@@ -208,11 +210,11 @@ class Certifier:
                 eased = self._at(frames, frame, wanted, moved.get(frame), thickness)
                 if eased is not None:
                     found[frame] = eased
+                if frame in moved:
+                    told()
         return found
 
-    def _at(
-        self, frames: Frames, frame: int, offsets: Floats, own: _Moved | None, thickness: float
-    ) -> _Moved | None:
+    def _at(self, frames: Frames, frame: int, offsets: Floats, own: _Moved | None, thickness: float) -> _Moved | None:
         """Return a free frame near displacements in the rest pose; None where there is none but its own place."""
         place, skin = frames.points(frame), self._skin(frames, frame)
         moves = np.linalg.norm(offsets, axis=1) > SMALLEST

@@ -23,7 +23,7 @@ def contour_forces(points: Floats, faces: Ints, pairs: Ints) -> Floats:
     if not len(pairs):
         return forces
     both = faces[pairs]  # (P, 2, 3)
-    shared = (both[:, 0, :, None] == both[:, 1, None, :])  # (P, 3, 3)
+    shared = both[:, 0, :, None] == both[:, 1, None, :]  # (P, 3, 3)
     common = shared.any(axis=2).argmax(axis=1)
     is_joined = shared.any(axis=(1, 2))
     ends = np.stack([_crossing(points, *each) for each in _edges_and_faces(both)], axis=1)  # (P, 6, 4)
@@ -48,7 +48,8 @@ def contour_forces(points: Floats, faces: Ints, pairs: Ints) -> Floats:
 def _farthest(places: list[Floats]) -> tuple[int, int]:
     """Return the two places that are farthest apart."""
     count = len(places)
-    return max(((i, j) for i in range(count) for j in range(i)), key=lambda ij: float(np.linalg.norm(places[ij[0]] - places[ij[1]])))
+    pairs = [(i, j) for i in range(count) for j in range(i)]
+    return max(pairs, key=lambda pair: float(np.linalg.norm(places[pair[0]] - places[pair[1]])))
 
 
 def _edges_and_faces(both: Ints) -> list[tuple[Ints, Ints, Ints]]:

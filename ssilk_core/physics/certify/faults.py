@@ -21,6 +21,7 @@ from ..skin.covered_points import CoveredPoints, LastingRays
 from ..skin.figures import COVER_REACH, SHOW_DEPTH
 
 DENSE = 30_001  # points between those at which skin is measured, 7 mm apart on a person
+PAIRS_AT_ONCE = 1 << 20  # of a point and a triangle of the body
 LIFTED = 5e-4  # [m] above a point at which it is asked whether other parts of the body enclose it
 
 
@@ -107,7 +108,8 @@ class FaultFinder:
             flat = np.cross(at[:, 1] - at[:, 0], at[:, 2] - at[:, 0])
             normal = (smooth_normals[corners] * share).sum(axis=1) if smooth else flat
             normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12))
-        return PosedSkin(body, np.concatenate(starts), np.concatenate(normals))
+        unknown = np.full(len(self.joints), -1, dtype=np.int8)
+        return PosedSkin(body, np.concatenate(starts), np.concatenate(normals), unknown)
 
     def find(self, points: Floats, skin: PosedSkin | None) -> FrameFaults:
         """Return what is wrong with the cloth at these positions [m], shape (V, 3)."""
@@ -122,77 +124,60 @@ class FaultFinder:
         covered, near = self._rays.look(*asked, skin.normals.astype(np.float32))
         shows = np.flatnonzero(near & ~covered)
         shows = shows[~self._enclosed(skin, shows)]
-        return self._nearest(points, skin, shows, -SHOW_DEPTH, 0.0)
+        return self._beside(points, skin, shows, -SHOW_DEPTH, 0.0)
 
     def resting(self, points: Floats, skin: PosedSkin, chosen: Ints, above: float) -> SkinPoints:
         """Return the points, of those with indices (M,), over which cloth lies less than `above` [m], and none over it.
 
         Beneath the skin it is looked for as deep as it is seen.
         """
+        found = self._beside(points, skin, chosen, -SHOW_DEPTH, above)
+        low, high = (np.full(len(found), reach, np.float32) for reach in (above, COVER_REACH))
+        unknown = np.full(len(found), NO_TRIANGLE)
+        over, _ = self._search.find(*self._asked(points, skin, found.index), low, high, unknown)
+        return found.chosen(over == NO_TRIANGLE)
+
+    def _beside(self, points: Floats, skin: PosedSkin, chosen: Ints, low: float, high: float) -> SkinPoints:
+        """Return the points, of those with indices (M,), with any cloth between two heights over them [m]."""
+        ends = (np.full(len(chosen), reach, np.float32) for reach in (low, high))
+        asked = self._asked(points, skin, chosen)
+        face, height = self._search.find(*asked, *ends, self._last[chosen])
+        self._last[chosen] = face
+        kept = face != NO_TRIANGLE
+        index, face, height = chosen[kept], face[kept], height[kept].astype(np.float64)
+        normal = skin.normals[index]
+        weights = barycentric(skin.starts[index] + height[:, None] * normal, points[self.faces[face]])
+        return SkinPoints(index, face, weights, normal, height)
+
+    @staticmethod
+    def _asked(points: Floats, skin: PosedSkin, chosen: Ints) -> tuple[Floats, Floats, Floats]:
+        """Return vertices, and starts and directions of rays, around an origin that float32 is exact near."""
         origin = skin.starts.mean(axis=0)
         x, starts = ((each - origin).astype(np.float32) for each in (points, skin.starts[chosen]))
-        normals = skin.normals[chosen].astype(np.float32)
-        low, middle, high = (np.full(len(chosen), reach, np.float32) for reach in (-SHOW_DEPTH, above, COVER_REACH))
-        face, height = self._search.find(x, starts, normals, low, middle, self._last[chosen])
-        self._last[chosen] = face
-        rows = np.flatnonzero(face != NO_TRIANGLE)
-        unknown = np.full(len(rows), NO_TRIANGLE)
-        over, _ = self._search.find(x, starts[rows], normals[rows], middle[rows], high[rows], unknown)
-        rows = rows[over == NO_TRIANGLE]
-        corners = points[self.faces[face[rows]]]
-        places = skin.starts[chosen[rows]] + height[rows, None] * skin.normals[chosen[rows]]
-        weights = barycentric(places, corners)
-        return SkinPoints(chosen[rows], face[rows], weights, skin.normals[chosen[rows]], height[rows].astype(float))
+        return np.ascontiguousarray(x), starts, skin.normals[chosen].astype(np.float32)
 
     def _enclosed(self, skin: PosedSkin, chosen: Ints) -> np.ndarray:
-        """Tell which points lie inside a part of the body, bool (M,)."""
-        starts = skin.starts[chosen] + LIFTED * skin.normals[chosen]
-        corners = skin.body[self._body.faces]
-        found = [
-            winding_number(torch.from_numpy(corners[None] - start)[:, :, :, :])[0] > ENCLOSED for start in starts
-        ]
-        return np.array([bool(each) for each in found], dtype=bool)
-
-    def _nearest(
-        self,
-        points: Floats,
-        skin: PosedSkin,
-        chosen: Ints,
-        low: float,
-        high: float,
-    ) -> SkinPoints:
-        """Return the outermost cloth that lies between two heights over some of the points [m]."""
-        rows, found, weights, heights = [], [], [], []
-        corners = points[self.faces]
-        centre = (corners.max(axis=1) + corners.min(axis=1)) / 2
-        radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
-        for index in chosen.tolist():
-            start, normal = skin.starts[index], skin.normals[index]
-            away = centre - start
-            along = away @ normal
-            near = np.flatnonzero(np.linalg.norm(away - along[:, None] * normal, axis=1) <= radius)
-            share, height = _meet(corners[near], start, normal)
-            within = (height >= low - 1e-5) & (height <= high)
-            hit = np.flatnonzero((share.min(axis=1) >= -1e-5) & within)
-            if len(hit):
-                best = hit[height[hit].argmax()]
-                rows.append(index)
-                found.append(near[best])
-                weights.append(share[best].clip(0, 1))
-                heights.append(height[best])
-        if not rows:
-            return _no_points()
-        at = np.array(rows)
-        return SkinPoints(at, np.array(found), np.array(weights), skin.normals[at], np.array(heights))
+        """Tell which points lie inside a part of the body, bool (M,); it is looked for once in each pose."""
+        asked = chosen[skin.enclosed[chosen] < 0]
+        starts = skin.starts[asked] + LIFTED * skin.normals[asked]
+        corners = torch.from_numpy(np.ascontiguousarray(skin.body[self._body.faces]))
+        for some in np.array_split(np.arange(len(asked)), 1 + len(asked) * len(corners) // PAIRS_AT_ONCE):
+            away = corners[None] - torch.from_numpy(starts[some])[:, None, None]
+            skin.enclosed[asked[some]] = (winding_number(away) > ENCLOSED).numpy()
+        return skin.enclosed[chosen] > 0
 
 
 @dataclass(frozen=True, eq=False)
 class PosedSkin:
-    """Points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body (B, 3) [m]."""
+    """Points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body (B, 3) [m].
+
+    `enclosed` (S,) tells which lie inside another part of it, 1 or 0, and -1 where nobody has asked yet.
+    """
 
     body: Floats
     starts: Floats
     normals: Floats
+    enclosed: Ints
 
 
 def _no_points() -> SkinPoints:
@@ -208,17 +193,3 @@ def barycentric(places: Floats, corners: Floats) -> Floats:
     u = (np.cross(away, second) * normal).sum(axis=1) / square
     v = (np.cross(first, away) * normal).sum(axis=1) / square
     return np.stack([1 - u - v, u, v], axis=1).clip(0, 1)
-
-
-def _meet(corners: Floats, start: Floats, direction: Floats) -> tuple[Floats, Floats]:
-    """Return where a line meets the planes of triangles (F, 3, 3): barycentric coordinates (F, 3), distances (F,)."""
-    first, second, away = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], start - corners[:, 0]
-    across = np.cross(direction, second)
-    volume = (first * across).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        u = (away * across).sum(axis=1) / volume
-        turned = np.cross(away, first)
-        v = turned @ direction / volume
-        height = (second * turned).sum(axis=1) / volume
-    weights = np.stack([1 - u - v, u, v], axis=1)
-    return np.nan_to_num(weights, nan=-1.0, posinf=-1.0, neginf=-1.0), np.nan_to_num(height, nan=np.inf)

@@ -3,8 +3,9 @@
 
 Each step shortens the contours along which the garment intersects itself (`crossings`), and lifts it above the skin
 that shows. Displacements spread as `metric` says, over the neighbourhood of what is wrong alone. Where contours do
-not get shorter, the spread halves: folds as small as it need vertices that move against their neighbours. A contour
-says which way out is short, not how far it is. So a step has the size of what moves most.
+not get shorter, pushes spread less: small folds need vertices that move against their neighbours. A contour
+says which way out is short, not how far it is, so a step has the size of what moves most. A border that came through
+other cloth all along has a contour that cannot shorten; it is freed from a neighbouring frame, if at all.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from .crossings import contour_forces
 from .faults import FaultFinder, FrameFaults, PosedSkin, SkinPoints
 from .metric import DisplacementMetric, DisplacementSolver
 
-LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a frame gets no better
+LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a frame gets little better
 REACH = 4.0  # lengths around what is wrong, within which vertices move
 STEP = 8e-4  # [m] of the vertex that moves most
-PATIENCE = 10  # steps without fewer faults, after which pushes spread less
+PATIENCE = 10  # steps, after which pushes spread less where faults are no fewer
+FEWER = 0.75  # of the faults, for that
 STEPS, FEW = 120, 8  # at most; and where cloth that is free is only lifted
 HEIGHT = 1e-3  # [m] over points of the skin that showed
 MOST = 200  # points of the skin that one step asks at, of each triangle the deepest
@@ -65,21 +67,23 @@ class Untangler:
         """
         faults = faults or self.finder.find(start, skin)
         best = Untangled(start, faults, np.zeros(len(start), dtype=bool))
-        points, level, waited, tried = start, 0, 0, 0
+        points, level, waited, tried, goal = start, 0, 0, 0, FEWER * faults.count
         region, solver = np.zeros(len(start), dtype=bool), None
         while faults.count and tried < (FEW if lifts else STEPS):
             wanted = region | self._around(faults, LENGTHS[level] * REACH)
             if solver is None or (wanted & ~region).any():
                 region, solver = wanted, self.metrics[level].within(np.flatnonzero(wanted))
-            points = points + self._step(points, faults, region, solver, LENGTHS[level])
+            points = points + self._step(points, faults, region, solver)
             faults = self.finder.find(points, skin)
             tried, waited = tried + 1, waited + 1
             if faults.count < best.faults.count:
-                best, waited = Untangled(points, faults, region.copy()), 0
+                best = Untangled(points, faults, region.copy())
+            if best.faults.count <= goal:
+                waited, goal = 0, FEWER * best.faults.count
             elif waited >= PATIENCE:
                 if level + 1 == len(LENGTHS):
                     break
-                level, waited = level + 1, 0
+                level, waited, goal = level + 1, 0, FEWER * best.faults.count
                 points, faults, solver = best.points, best.faults, None
         return best
 
@@ -90,9 +94,7 @@ class Untangler:
         found = geodesic.within(self.mesh.points, self.mesh.faces, vertices, reach)
         return np.asarray(found)
 
-    def _step(
-        self, points: Floats, faults: FrameFaults, region: np.ndarray, solver: DisplacementSolver, length: float
-    ) -> Floats:
+    def _step(self, points: Floats, faults: FrameFaults, region: np.ndarray, solver: DisplacementSolver) -> Floats:
         """Return a displacement (V, 3) [m]."""
         rows = np.flatnonzero(region)
         moved = np.zeros_like(points)
@@ -106,9 +108,7 @@ class Untangler:
         return moved
 
 
-def lift(
-    solver: DisplacementSolver, skin: SkinPoints, faces: Ints, region: np.ndarray, moved: Floats
-) -> Floats:
+def lift(solver: DisplacementSolver, skin: SkinPoints, faces: Ints, region: np.ndarray, moved: Floats) -> Floats:
     """Return the least displacement (R, 3) of the vertices of a region that lifts cloth off points of the skin.
 
     Args:

@@ -129,6 +129,7 @@ def test_a_fold_through_itself_opens(scene):
     turn = np.clip(x / 0.02, 0, np.pi)
     start = points.copy()
     start[:, 0] = np.where(x > 0, 0.02 * np.sin(turn) - np.maximum(x - 0.02 * np.pi, 0), x)
+    start[:, 1] *= np.interp(x, [0, SIDE / 2], [1, 0.85])
     start[:, 2] = np.where(x > 0, 0.012 * (1 - np.cos(turn)) + 6.5 * height, 0)
     finder = FaultFinder(one)
     assert len(finder.find(start, None).pairs) > 10
@@ -138,9 +139,9 @@ def test_a_fold_through_itself_opens(scene):
 
 
 def test_cloth_that_a_limb_came_through_is_lifted_off_it(scene):
-    limb = trimesh.creation.capsule(height=0.3, radius=0.05, count=[32, 32])
-    tube = trimesh.creation.cylinder(radius=0.06, height=0.2, sections=48)
-    tube = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(tube.vertices, tube.faces, 0.015))
+    limb = trimesh.creation.capsule(height=0.3, radius=0.05, count=[24, 24])
+    tube = trimesh.creation.cylinder(radius=0.06, height=0.2, sections=32)
+    tube = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(tube.vertices, tube.faces, 0.02))
     tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)
     tube.remove_unreferenced_vertices()
     tube.merge_vertices()
@@ -160,14 +161,14 @@ def test_cloth_that_a_limb_came_through_is_lifted_off_it(scene):
     radius = np.linalg.norm(found.points[0][dent, :2], axis=1)
     assert radius.max() < 0.05 + 4 * HEIGHT  # as far as it must, no farther
     far = np.abs(points[:, 0]) < 0.01
-    assert np.abs(found.points[0][far] - sunk[far]).max() < 1e-3
+    assert np.abs(found.points[0][far] - sunk[far]).max() < 3e-3
 
 
 def test_cloth_between_plates_without_room_is_told_and_kept(scene):
     points, faces = sheet()
-    near = points * [0.7, 0.7, 1] - [0, 0, 0.01]
-    plates = np.concatenate([near, near + [0, 0, 0.02]])
-    body = Mesh("/plates", plates, np.concatenate([faces, faces[:, ::-1] + len(near)]))  # both face the cloth
+    near = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.35 * SIDE - [0, 0, 0.01]
+    plates, square = np.concatenate([near, near + [0, 0, 0.02]]), np.array([[0, 1, 2], [0, 2, 3]])
+    body = Mesh("/plates", plates, np.concatenate([square, square[:, ::-1] + len(near)]))  # both face the cloth
     worn = wearing(scene, points, faces, body)
     pinched = plates.copy()
     pinched[: len(near), 2] += 0.014  # each passes the other by 8 mm
