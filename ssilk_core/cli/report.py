@@ -9,8 +9,10 @@ training; with --stage and --motion it is also baked and shown as a shot. --figu
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 import tempfile
 from dataclasses import asdict, fields
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,7 +121,10 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
     sections = shot_sections(shot, garments, bodies, report)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
-    return [*sections, Section("Provenance", facts({**read_provenance(path), **records}))]
+    said = read_provenance(path)
+    if isinstance(certificate := said.get("certificate"), Mapping):
+        sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))
+    return [*sections, Section("Provenance", facts({**said, **records}))]
 
 
 def _fabric(record: GarmentRecord | None) -> Fabric:

@@ -29,9 +29,11 @@ from .result import CertificateSummary, FrameSpan
 from .rollout import BakeRollout, Certificate
 
 if TYPE_CHECKING:
+    from ssilk_usd.shots.play import Shot
+
     from ...physics.certify.certifier import Certifier, Frames
     from ...physics.certify.faults import FrameFaults
-    from ..view.player import ShotPlayer
+    from ..gltf.play import GlbShot
 
 CERTIFICATE = "certificate"  # what a shot says of it, under this name
 NEEDED = ("ipctk", "scipy")
@@ -178,7 +180,7 @@ def _with_shapes(work: Work, poses: tuple[GarmentPose, ...]) -> BakeRollout:
     """Return the rollout with blendshapes that move its frames, each within a run of these."""
     from ...physics.certify.certifier import runs
 
-    deformer, motion, count = work.base.deformer, work.base.motion, work.frames.count
+    deformer, count = work.base.deformer, work.frames.count
     vertices = deformer.scene.garment.mesh.vertex_count
     shapes, weights = [np.zeros((0, vertices, 3), np.float32)], [np.zeros((count, 0), np.float32)]
     for first, last in _parts(runs(work.points), work.exact):
@@ -265,7 +267,7 @@ def _move_again(work: Work, found: Mapping[int, FrameFaults], report: Reporter) 
 
 
 def _faults_in(
-    shot: ShotPlayer, certifier: Certifier, rollout: BakeRollout, samples: int, report: Reporter
+    shot: Shot | GlbShot, certifier: Certifier, rollout: BakeRollout, samples: int, report: Reporter
 ) -> Iterator[tuple[int, FrameFaults]]:
     """Yield the frames of a file in which something is wrong, as its own joints and blendshapes pose it."""
     from .counted import body_in

@@ -18,7 +18,7 @@ STEEPEST = 0.2  # sine of the angle between an edge and a face, from which on an
 
 
 def contour_forces(points: Floats, faces: Ints, pairs: Ints) -> Floats:
-    """Return forces on vertices (V, 3) that shorten the segments of pairs of triangles (P, 2), each with unit pull."""
+    """Return forces on vertices (V, 3) that shorten what pairs of triangles (P, 2) have in common, by unit pulls."""
     forces = np.zeros_like(points)
     if not len(pairs):
         return forces

@@ -120,28 +120,29 @@ class FaultFinder:
         if skin is None:
             return _no_points()
         origin = skin.starts.mean(axis=0)
-        asked = (np.ascontiguousarray(each, dtype=np.float32) for each in (points - origin, skin.starts - origin))
-        covered, near = self._rays.look(*asked, skin.normals.astype(np.float32))
+        x, starts = (np.ascontiguousarray(each, dtype=np.float32) for each in (points - origin, skin.starts - origin))
+        covered, near = self._rays.look(x, starts, skin.normals.astype(np.float32))
         shows = np.flatnonzero(near & ~covered)
         shows = shows[~self._enclosed(skin, shows)]
         return self._beside(points, skin, shows, -SHOW_DEPTH, 0.0)
 
     def resting(self, points: Floats, skin: PosedSkin, chosen: Ints, above: float) -> SkinPoints:
-        """Return the points, of those with indices (M,), over which cloth lies less than `above` [m], and none over it.
+        """Return the points, of those with indices (M,), whose outermost cloth lies less than `above` them [m].
 
         Beneath the skin it is looked for as deep as it is seen.
         """
         found = self._beside(points, skin, chosen, -SHOW_DEPTH, above)
         low, high = (np.full(len(found), reach, np.float32) for reach in (above, COVER_REACH))
         unknown = np.full(len(found), NO_TRIANGLE)
-        over, _ = self._search.find(*self._asked(points, skin, found.index), low, high, unknown)
+        x, starts, directions = self._asked(points, skin, found.index)
+        over, _ = self._search.find(x, starts, directions, low, high, unknown)
         return found.chosen(over == NO_TRIANGLE)
 
     def _beside(self, points: Floats, skin: PosedSkin, chosen: Ints, low: float, high: float) -> SkinPoints:
         """Return the points, of those with indices (M,), with any cloth between two heights over them [m]."""
-        ends = (np.full(len(chosen), reach, np.float32) for reach in (low, high))
-        asked = self._asked(points, skin, chosen)
-        face, height = self._search.find(*asked, *ends, self._last[chosen])
+        least, most = (np.full(len(chosen), reach, np.float32) for reach in (low, high))
+        x, starts, directions = self._asked(points, skin, chosen)
+        face, height = self._search.find(x, starts, directions, least, most, self._last[chosen])
         self._last[chosen] = face
         kept = face != NO_TRIANGLE
         index, face, height = chosen[kept], face[kept], height[kept].astype(np.float64)

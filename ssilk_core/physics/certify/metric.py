@@ -63,7 +63,7 @@ class DisplacementSolver:
         self.matrix = matrix
 
     @cached_property
-    def _factors(self):  # type: ignore[no-untyped-def]
+    def _factors(self):
         from scipy.sparse.linalg import splu
 
         return splu(self.matrix)
