@@ -9,8 +9,8 @@ training; with --stage and --motion it is also baked and shown as a shot. --figu
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, fields
 from html import escape
 from pathlib import Path

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ssilk bake --certify` on the toy world: what UsdSkel re-skins from the file, what stays, and what verifying finds."""
+"""`ssilk bake --certify` on the toy world: what UsdSkel re-skins from the file, what stays, what verifying finds."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "bow.
 
 
 def write_bow(path) -> None:
-    """A clip in which the spine bends, farther than cloth can in its middle."""
+    """A clip in which the spine bends, until its skirt folds through itself."""
     stage = Usd.Stage.Open(str(path))
     rotations = UsdSkel.Animation(stage.GetPrimAtPath("/Clip")).GetRotationsAttr()
     for frame in range(FRAMES):
-        angle = 1.9 * np.sin(np.pi * frame / (FRAMES - 1)) ** 2
+        angle = 0.75 * np.sin(np.pi * frame / (FRAMES - 1)) ** 2
         bent = Gf.Quatf(float(np.cos(angle / 2)), Gf.Vec3f(float(np.sin(angle / 2)), 0, 0))
         rotations.Set([Gf.Quatf(1), bent, Gf.Quatf(1)], frame)
     stage.GetRootLayer().Save()
@@ -100,8 +100,6 @@ def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
             weights = prim.GetAttribute("blendShapeWeights")
             for time in weights.GetTimeSamples():
                 weights.Set(Vt.FloatArray(len(weights.Get(time))), time)
-        if prim.IsA(UsdSkel.Root):
-            stage.GetAttributeAtPath(f"{prim.GetPath()}.extent").Clear()
     stage.Export("bent.usda")
     assert main(["verify", "bent.usda"]) == 3
     assert "where its certificate says that none does" in capsys.readouterr().err

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ...physics.certify.certifier import Certifier, Frames
     from ...physics.certify.faults import FrameFaults
     from ..gltf.play import GlbShot
+    from ..view.player import ShotPlayer
 
 CERTIFICATE = "certificate"  # what a shot says of it, under this name
 NEEDED = ("ipctk", "scipy")
@@ -57,7 +58,7 @@ def need_certifier() -> None:
 
 
 @dataclass(eq=False)
-class Work:
+class CertificateWork:
     """What a certificate is made with, kept from one attempt to the next."""
 
     base: BakeRollout
@@ -83,7 +84,7 @@ def certified(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     need_certifier()
     poses = tuple(rollout.poses())
     points = [vertices for pose in poses for vertices in rollout.decode(pose)]
-    work = Work(rollout, Certifier(rollout.deformer.scene), _frames(rollout, poses, points))
+    work = CertificateWork(rollout, Certifier(rollout.deformer.scene), _frames(rollout, poses, points))
     report(Message("looking for cloth that passes through cloth, and for covered skin that shows"))
     faults = work.certifier.faults(work.frames, Countdown(work.frames.count, report))
     work.faulty = tuple(faults)
@@ -104,7 +105,7 @@ def proven(rollout: BakeRollout, path: Path, report: Reporter = silent) -> BakeR
     certificate = rollout.certificate
     if certificate is None:
         return None
-    work: Work = certificate.work
+    work: CertificateWork = certificate.work
     work.attempts += 1
     shot, samples = open_shot(path), rollout.request.samples_per_frame
     found = dict(_faults_in(shot, work.certifier, rollout, samples, report))
@@ -176,7 +177,7 @@ def _frames(rollout: BakeRollout, poses: Sequence[GarmentPose], points: Sequence
     return Frames(motion.frame_count, motion.fps, points.__getitem__, body_at, turns_at, frozenset(cuts.tolist()))
 
 
-def _with_shapes(work: Work, poses: tuple[GarmentPose, ...]) -> BakeRollout:
+def _with_shapes(work: CertificateWork, poses: tuple[GarmentPose, ...]) -> BakeRollout:
     """Return the rollout with blendshapes that move its frames, each within a run of these."""
     from ...physics.certify.certifier import runs
 
@@ -210,7 +211,7 @@ def _parts(spans: Sequence[tuple[int, int]], exact: set[int]) -> Iterator[tuple[
                 begin = frame
 
 
-def _rest_offsets(work: Work, poses: Sequence[GarmentPose], first: int, last: int) -> Floats:
+def _rest_offsets(work: CertificateWork, poses: Sequence[GarmentPose], first: int, last: int) -> Floats:
     """Return displacements in the rest pose [m], shape (F, V, 3), of frames from a first to a last."""
     from ...scene.decomposition.rest import rest_residuals
 
@@ -234,7 +235,8 @@ def _shapes_of(offsets: Floats, *, exact: bool) -> tuple[Floats, Floats]:
     Args:
         exact: one shape for each frame, which misses nothing.
     """
-    from ...scene.decomposition.shapes import FitTolerance, OffsetShapes
+    from ...scene.decomposition import FitTolerance
+    from ...scene.decomposition.shapes import OffsetShapes
 
     frames, vertices = offsets.shape[:2]
     each = offsets.astype(np.float32), np.eye(frames, dtype=np.float32)
@@ -253,7 +255,7 @@ def _bytes(shapes: Floats, frames: int) -> int:
     return len(shapes) * (SHAPE_BYTES + WEIGHT_BYTES * frames) + VERTEX_BYTES * int(shapes.any(axis=2).sum())
 
 
-def _move_again(work: Work, found: Mapping[int, FrameFaults], report: Reporter) -> None:
+def _move_again(work: CertificateWork, found: Mapping[int, FrameFaults], report: Reporter) -> None:
     """Move frames that are wrong in the file, from where they are there, with more room between cloth and cloth."""
     from ...physics.certify.settle import THICKNESS
 
@@ -274,7 +276,8 @@ def _faults_in(
 
     scene, motion = rollout.deformer.scene, rollout.motion
     skeleton = scene.character.skeleton
-    garment = next(number for number, mesh in enumerate(shot.meshes) if mesh.is_garment)
+    player: ShotPlayer = shot
+    garment = next(number for number, mesh in enumerate(player.meshes) if mesh.is_garment)
     bodies = body_in(shot, scene) if scene.character.bodies else None
     merged = scene.character.merged_body() if scene.character.bodies else None
     joints = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
@@ -293,7 +296,7 @@ def _faults_in(
         told()
 
 
-def _summary(work: Work, found: Mapping[int, FrameFaults], times: Sequence[float]) -> CertificateSummary:
+def _summary(work: CertificateWork, found: Mapping[int, FrameFaults], times: Sequence[float]) -> CertificateSummary:
     """Return what the certificate says."""
     from ...physics.certify.certifier import runs
 
@@ -317,7 +320,7 @@ def _summary(work: Work, found: Mapping[int, FrameFaults], times: Sequence[float
     )
 
 
-def _reason(work: Work, faults: Sequence[FrameFaults]) -> str:
+def _reason(work: CertificateWork, faults: Sequence[FrameFaults]) -> str:
     """Return what is wrong in consecutive frames, and where."""
     scene = work.base.deformer.scene
     cloth, names = work.certifier.finder.cloth, scene.character.skeleton.joint_names
