@@ -26,6 +26,7 @@ STEP = 8e-4  # [m] of the vertex that moves most
 PATIENCE = 10  # steps, after which pushes spread less where faults are no fewer
 FEWER = 0.75  # of the faults, for that
 STEPS, FEW = 120, 8  # at most; and where cloth that is free is only lifted
+FARTHEST = 0.04  # [m] from the start: what would go farther is not freed, since a spike would be seen more
 HEIGHT = 1e-3  # [m] over points of the skin that showed
 MOST = 200  # points of the skin that one step asks at, of each triangle the deepest
 AGAIN = 1e-8  # of the largest response, so that points beside each other do not fight
@@ -74,6 +75,8 @@ class Untangler:
             if solver is None or (wanted & ~region).any():
                 region, solver = wanted, self.metrics[level].within(np.flatnonzero(wanted))
             points = points + self._step(points, faults, region, solver)
+            if np.linalg.norm(points - start, axis=1).max() > FARTHEST:
+                break
             faults = self.finder.find(points, skin)
             tried, waited = tried + 1, waited + 1
             if faults.count < best.faults.count:
