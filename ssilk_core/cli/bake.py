@@ -20,6 +20,10 @@ the simulator. A refined shot gets blendshapes of its own, as many as it takes t
 replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes
 time-sampled points instead, bound to no skeleton; in a folder of layers, they are the variant "points" of
 "deformation", beside the network's joints.
+
+--certify moves the frames in which triangles of the garment intersect, or covered skin shows, as little as it takes
+until none does in the written file, and says which frames have no free position. It adds blendshapes for these frames
+alone; all others stay as they are.
 """
 
 from __future__ import annotations

@@ -259,6 +259,12 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         default=REFINED_OUTPUTS[0],
         help="refined garments as joints and blendshapes of the shot's own (default), or as time-sampled points",
     )
+    verb.add_argument(
+        "--certify",
+        action="store_true",
+        help="move frames as little as it takes until, in the written file, no triangle of the garment intersects "
+        "another and no covered skin shows; say which have no free position",
+    )
     verb.add_argument("--no-body", action="store_true", help="leave the body meshes out")
     verb.add_argument(
         "--hide-covered",
@@ -311,6 +317,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             latent_iterations=options.latent_iterations,
             latent_elements=options.latent_elements,
             refined_output=options.refined_output,
+            certify=options.certify,
             hide_covered=options.hide_covered,
             hold=options.hold or 0,
             colliders=tuple(options.collider),

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, fields
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -124,7 +126,10 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
     sections = shot_sections(shot, garments, bodies, report, sunk=sunk)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
-    return [*sections, Section("Provenance", facts({**read_provenance(path), **records}))]
+    said = read_provenance(path)
+    if isinstance(certificate := said.get("certificate"), Mapping):
+        sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))
+    return [*sections, Section("Provenance", facts({**said, **records}))]
 
 
 def _fabric(record: GarmentRecord | None) -> Fabric:

@@ -120,7 +120,7 @@ def state_counts(
     skin = _covered_skin(scene, select_device(device)) if scene.character.bodies else None
     cloth = _cloth(scene) if can_find() else None
     shot = _opened(path, points)
-    times, body = shot.frame_times, _body_in(shot, scene) if skin else None
+    times, body = shot.frame_times, body_in(shot, scene) if skin else None
     garment = next(number for number, mesh in enumerate(shot.meshes) if mesh.is_garment)
     shown: list[ShownCounts] = []
     crossed: list[IntersectionCounts] = []
@@ -195,7 +195,7 @@ def _opened(path: Path, points: bool) -> ShotPlayer:
     return with_points(path)
 
 
-def _body_in(shot: ShotPlayer, scene: Scene) -> list[int] | None:
+def body_in(shot: ShotPlayer, scene: Scene) -> list[int] | None:
     """Return the meshes of a shot that are the bodies of a scene, in their order; None where some are missing."""
     found = [number for number, mesh in enumerate(shot.meshes) if not (mesh.is_garment or mesh.is_rider)]
     counts = [len(points) for points in shot.points(shot.frame_times[0])]

@@ -15,6 +15,7 @@ from ...files import FileHashes, remove_unfinished_in, replacing, sha256
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
+from .certificate import certified, need_certifier, proven
 from .counted import state_rollout_counts
 from .hiding import covered_polygons
 from .inputs import InputFiles, InputHashes, need_pinned
@@ -75,6 +76,8 @@ def bake_layers(
         requests, include_body=include_body, points=points, verify=verify, replace_names=replace_names
     )
     layers, results = LayerFolder(folder), []
+    if any(task.request.certify for task in tasks):
+        need_certifier()
     layers.need_names(tasks)
     report(Started("bake", len(tasks), {"output": str(folder)}))
     try:
@@ -297,7 +300,7 @@ def _write_layer(
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
     from ssilk_usd.shots import layers_animation
 
-    rollout = refined(solved(rollout, report), report, add_shapes=True)
+    rollout = certified(refined(solved(rollout, report), report, add_shapes=True), report)
     hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
     riders = rollout.rider_joints()
     if riders and rollout.request.writes_points:
@@ -315,20 +318,25 @@ def _write_layer(
             layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
         )
     with replacing(layout.animation) as unverified:
-        summary = layers_animation.write_animation(
-            layout,
-            asset,
-            riders.deformer,
-            rollout.motion,
-            riders.poses(rollout.motion, rollout.poses()),
-            **common,
-            riders=riders,
-            hidden=rollout.hidden,
-            hidden_polygons=hidden,
-            provenance=shot_metadata(rollout, layout.animation),
-            path=unverified,
-            points=task.points,
-        )
+        while True:
+            summary = layers_animation.write_animation(
+                layout,
+                asset,
+                riders.deformer,
+                rollout.motion,
+                riders.poses(rollout.motion, rollout.poses()),
+                **common,
+                riders=riders,
+                hidden=rollout.hidden,
+                hidden_polygons=hidden,
+                provenance=shot_metadata(rollout, layout.animation),
+                path=unverified,
+                points=task.points,
+            )
+            again = proven(rollout, unverified, report)
+            if again is None:
+                break
+            rollout, riders = again, again.rider_joints()
         counts = state_rollout_counts(unverified, rollout)
         verification = verify_file(rollout, unverified, report) if task.verify else None
         digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file

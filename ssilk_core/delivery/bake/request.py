@@ -56,6 +56,8 @@ class BakeRequest:
         latent_elements: "all" sums that solver's energy over the whole garment, "few" over a sample of its elements.
         refined_output: "joints" writes refined frames as joints and as many blendshapes as they need (see
             `decomposition`), "points" as points.
+        certify: move frames in which cloth passes through cloth, or covered skin shows, until none does
+            (`delivery.bake.certificate`).
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
             numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
@@ -87,6 +89,7 @@ class BakeRequest:
     latent_iterations: int = 0
     latent_elements: str = ALL_ELEMENTS
     refined_output: str = "joints"
+    certify: bool = False
     hide_covered: bool = False
     colliders: tuple[str, ...] = ()
     wind: str | None = None
@@ -134,6 +137,9 @@ class BakeRequest:
             fail("--feedback", found, allowed, "add --refine N, or leave it out: --quality hero has both")
         if self.refined_output not in REFINED_OUTPUTS:
             fail_unknown("--refined-output", f"'{self.refined_output}'", self.refined_output, REFINED_OUTPUTS)
+        if self.certify and self.writes_points:
+            found, allowed = "refined points", "what a certificate moves is put on joints and blendshapes"
+            fail("--certify", found, allowed, "leave --refined-output out")
         parse_world(self.wind, self.gusts, self.gravity)
         for name, text in (("--asset-version", self.asset_version), ("--asset-identifier", self.asset_identifier)):
             if text is not None and not (text.isprintable() and 0 < len(text) <= LONGEST_TEXT):

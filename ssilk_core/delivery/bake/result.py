@@ -194,6 +194,67 @@ class LatentSummary:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CertificateSummary:
+    """What was found in each frame of a written file whose frames were moved until nothing is wrong in them.
+
+    Attributes:
+        frames: of the shot, or its samples.
+        faulty: those of them in which triangles intersected others, or covered skin showed.
+        moved: frames that were moved; those around faulty ones are taken along.
+        intersecting, showing: frames in which triangles still intersect others, and covered skin still shows.
+        left: frames of either kind, from the first of the shot on, which is 0.
+        codes: first and last time code of each of these spans.
+        reasons: what is wrong in each of them, and where.
+        mean_mm, largest_mm: displacement of the vertices that were moved, in these frames [mm].
+    """
+
+    frames: int
+    faulty: int
+    moved: tuple[FrameSpan, ...]
+    intersecting: int
+    showing: int
+    left: tuple[FrameSpan, ...]
+    codes: tuple[tuple[float, float], ...]
+    reasons: tuple[str, ...]
+    mean_mm: float
+    largest_mm: float
+
+    @property
+    def unfree(self) -> str:
+        """The frames that have no free position in words; empty where there are none."""
+        if not self.left:
+            return ""
+        count = sum(span.last - span.first + 1 for span in self.left)
+        spans = [f"{first:g} to {last:g}, {why}" for (first, last), why in zip(self.codes, self.reasons)]
+        return f"{count} frames have no free position: {'; '.join(spans)}"
+
+    def __str__(self) -> str:
+        said = f"{self.intersecting:,} of {self.frames:,} frames intersect, {self.showing:,} show covered skin"
+        return f"{said}; {self.unfree}" if self.left else said
+
+    def figures(self) -> dict[str, object]:
+        """Return figures for people."""
+        moved = sum(span.last - span.first + 1 for span in self.moved)
+        return {
+            "certificate": str(self),
+            "frames that were wrong": self.faulty,
+            "frames that were moved": moved,
+            "moved by, mean and most [mm]": f"{self.mean_mm:.2g}, {self.largest_mm:.3g}",
+        }
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return what a shot says of itself."""
+        return {
+            "found": str(self),
+            "frames wrong before": self.faulty,
+            "moved frames": [str(span) for span in self.moved],
+            "frames left": [str(span) for span in self.left],
+            "mean [mm]": float(f"{self.mean_mm:.4g}"),
+            "largest [mm]": float(f"{self.largest_mm:.4g}"),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
 class BakeResult:
     """A written shot, or a layer of one.
 
@@ -215,6 +276,7 @@ class BakeResult:
         intersections: the share of triangles that intersect others of the garment; None where it was not counted.
         sunk: the share of vertices inside colliders; None where there are no colliders.
         entered: riders that enter their cloth.
+        certificate: how free of intersections and of skin that shows each frame is; None where that was not asked.
         current: the file was there already and nothing was baked; the other figures are those of its bake.
     """
 
@@ -236,6 +298,7 @@ class BakeResult:
     intersections: SelfIntersections | None = None
     sunk: SunkCloth | None = None
     entered: tuple[EnteredCloth, ...] = ()
+    certificate: CertificateSummary | None = None
     current: bool = False
 
     def figures(self, kind: str = "shot") -> dict[str, object]:
@@ -260,6 +323,7 @@ class BakeResult:
             **(self.intersections.summary("time code") if self.intersections else {SHARE: NOT_COUNTED}),
             **(self.sunk.summary("time code") if self.sunk else {}),
             **{name: value for each in self.entered for name, value in each.summary("time code").items()},
+            **(self.certificate.figures() if self.certificate else {}),
             **(self.verification.figures() if self.verification else {}),
             **({} if self.hidden_faces is None else {"hidden faces of the body": self.hidden_faces}),
             **({"put to rest": [str(span) for span in self.recovered]} if self.recovered else {}),

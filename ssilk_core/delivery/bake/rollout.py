@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
 from .request import BakeRequest
-from .result import FrameSpan, LatentSummary, RefinementSummary
+from .result import CertificateSummary, FrameSpan, LatentSummary, RefinementSummary
 from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
@@ -64,6 +64,27 @@ class SolvedLatents:
     summary: LatentSummary
 
 
+@dataclass(eq=False)
+class Certificate:
+    """Frames that were moved until nothing in them intersects or shows, as blendshapes of the shot's own.
+
+    Attributes:
+        poses: of all frames, with weights of these blendshapes.
+        poses_before: the same without them.
+        moved: frames in which they weigh something.
+        deformer: the garment without them.
+        work: what it was made with (`delivery.bake.certificate`).
+        summary: what was found in the written file; None before.
+    """
+
+    poses: tuple[GarmentPose, ...]
+    poses_before: tuple[GarmentPose, ...]
+    moved: frozenset[int]
+    deformer: Deformer
+    work: Any
+    summary: CertificateSummary | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class BakeRollout:
     """A garment over a motion at the rate of the shot's samples.
@@ -87,6 +108,7 @@ class BakeRollout:
         reduction: what was kept of the model, where less than all.
         refinement: the refined frames, once `refined` has computed them.
         latents: the network's poses, once `solved` has found them in latents.
+        certificate: the frames that `certified` has moved, once it has.
         riders: what rides on the garment; `told` is what was found about them, to be reported.
         direction: where the garment is held; None where it moves freely throughout.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
@@ -115,6 +137,7 @@ class BakeRollout:
     reduction: SizeReduction | None = None
     refinement: Refinement | None = None
     latents: SolvedLatents | None = None
+    certificate: Certificate | None = None
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
     direction: Direction | None = None
@@ -133,7 +156,9 @@ class BakeRollout:
 
     def poses(self) -> Iterator[GarmentPose]:
         """Yield the shot's poses, some frames at a time: the network's, or those fitted to refined vertices."""
-        if self.refinement is None or self.request.writes_points:
+        if self.certificate is not None:
+            yield from self.certificate.poses
+        elif self.refinement is None or self.request.writes_points:
             yield from self.network_poses()
         else:
             yield from self.refinement.poses
@@ -255,9 +280,20 @@ class BakeRollout:
 
     def decode(self, pose: GarmentPose) -> Floats:
         """Return the vertices in the world [m], shape (F, V, 3), of consecutive poses of `poses`."""
+        if self.certificate is not None:
+            return self._certified(self.certificate, pose)
         if self.refinement is not None and not self.request.writes_points:
             return deform(self.deformer, self.motion, pose)
         return self._network_decoded(pose)
+
+    def _certified(self, certificate: Certificate, pose: GarmentPose) -> Floats:
+        """Return the vertices of poses with a certificate; those of frames that were not moved are as without one."""
+        before = replace(self, deformer=certificate.deformer, certificate=None)
+        found = before.decode(replace(pose, weights=pose.weights[:, : certificate.deformer.shape_count]))
+        for frame in range(pose.frame_count):
+            if pose.start + frame in certificate.moved:
+                found[frame] = deform(self.deformer, self.motion, pose.part(slice(frame, frame + 1)))[0]
+        return found
 
     def _network_decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:

@@ -13,6 +13,7 @@ from ...files import need_not_input, need_writable, replacing, split_location
 from ...scene.kinematics import lbs_deformer, lbs_poses
 from ...scene.riders import RiderJoints
 from ..targets import GLB
+from .certificate import certified, need_certifier, proven
 from .counted import ShotCounts, state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import covered_polygons
@@ -58,6 +59,8 @@ def bake(
     path = Path(output)
     _check_output(request, path)
     need_body(request, include_body)
+    if request.certify:
+        need_certifier()
     rollout = load_sized(
         request, quality=quality, budget=budget, suffix=path.suffix, include_body=include_body, report=report
     )
@@ -65,11 +68,11 @@ def bake(
         need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
-    rollout = refined(solved(rollout, report), report)
+    rollout = certified(refined(solved(rollout, report), report), report)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
     hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    summary, counts, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
+    rollout, summary, counts, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
     result = result_of(rollout, path, summary, counts, verification, hidden)
@@ -105,6 +108,7 @@ def result_of(
         intersections=counts.intersections,
         sunk=counts.sunk,
         entered=counts.entered,
+        certificate=rollout.certificate.summary if rollout.certificate else None,
     )
 
 
@@ -126,17 +130,20 @@ def _write_verified(
     hidden: HiddenPolygons | None,
     verify: bool,
     report: Reporter,
-) -> tuple[ShotSummary, ShotCounts, Verification | None]:
-    """Write a file that appears once it is verified; return what it holds."""
+) -> tuple[BakeRollout, ShotSummary, ShotCounts, Verification | None]:
+    """Write a file that appears once it is verified; return the rollout that it holds, and what was found in it."""
     from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified, report, name=output) as layer:
             summary = _write(layer, rollout, output, include_body, hidden)
+            while again := proven(rollout, layer, report):
+                rollout = again
+                summary = _write(layer, rollout, output, include_body, hidden)
             counts = state_rollout_counts(layer, rollout)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return summary, counts, verify_file(rollout, unverified, report) if verify else None
+        return rollout, summary, counts, verify_file(rollout, unverified, report) if verify else None
 
 
 def _write(

@@ -115,11 +115,11 @@ class CoveredPoints:
         return RayCaster(self.cloth, device=self.device)
 
     @cached_property
-    def _rays(self) -> _LastingRays:
-        return _LastingRays(self.cloth, len(self))
+    def _rays(self) -> LastingRays:
+        return LastingRays(self.cloth, len(self))
 
 
-class _LastingRays:
+class LastingRays:
     """Rays of points that meet mostly the same cloth from frame to frame, by `BlockedRays`.
 
     A processor takes half of the time that products of matrices take it.

@@ -52,6 +52,13 @@ def rest_residuals(
         yield part, _unposed(linear, wanted - posed)
 
 
+def turns(deformer: Deformer, motion: Motion, pose: GarmentPose) -> Floats:
+    """Return the linear part of the blended skinning of each vertex in the frames of a pose, shape (F, V, 3, 3)."""
+    world = combined_transforms(deformer, motion, pose)
+    matrices = skinning_matrices(world, deformer.scene.bind_transforms)[:, :, :3]
+    return _blended(deformer.skin, matrices)[..., :3]
+
+
 def _blended(skin: SkinWeights, matrices: Floats) -> Floats:
     """Return skinning matrices (F, J, 3, 4), blended for each vertex, shape (F, V, 3, 4)."""
     dense = skin.dense(matrices.shape[1])

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ssilk bake --certify` on the toy world: what UsdSkel re-skins from the file, what stays, what verifying finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdSkel, Vt
+from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.shots.play import Shot
+
+from ssilk_core.cli import main
+from ssilk_core.physics.intersections.pairs import self_intersections
+
+FRAMES = 21
+BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "bow.usda", "--lbs"]
+
+
+def write_bow(path) -> None:
+    """A clip in which the spine bends, until its skirt folds through itself."""
+    stage = Usd.Stage.Open(str(path))
+    rotations = UsdSkel.Animation(stage.GetPrimAtPath("/Clip")).GetRotationsAttr()
+    for frame in range(FRAMES):
+        angle = 0.75 * np.sin(np.pi * frame / (FRAMES - 1)) ** 2
+        bent = Gf.Quatf(float(np.cos(angle / 2)), Gf.Vec3f(float(np.sin(angle / 2)), 0, 0))
+        rotations.Set([Gf.Quatf(1), bent, Gf.Quatf(1)], frame)
+    stage.GetRootLayer().Save()
+
+
+@pytest.fixture(scope="module")
+def folder(toy, tmp_path_factory):
+    folder = toy.copy(tmp_path_factory.mktemp("certified"))
+    write_bow(toy.write_clip(folder / "bow.usda", frames=FRAMES))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main([*BAKE, "-o", "plain.usda"]) == 0
+        assert main([*BAKE, "-o", "certified.usda", "--certify"]) == 0
+    return folder
+
+
+@pytest.fixture
+def there(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def skinned(path) -> tuple[np.ndarray, np.ndarray]:
+    """The garment's points (F, V, 3), float32, as UsdSkel alone has them, and its faces."""
+    stage = Usd.Stage.Open(str(path))
+    root = UsdSkel.Root(next(prim for prim in stage.Traverse() if prim.IsA(UsdSkel.Root)))
+    cache = UsdSkel.Cache()
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+    query = cache.GetSkelQuery(binding.GetSkeleton())
+    target = next(each for each in binding.GetSkinningTargets() if each.GetPrim().GetName() == "Skirt")
+    mesh, found = UsdSkel.BindingAPI(target.GetPrim()), []
+    shapes = UsdSkel.BlendShapeQuery(mesh)
+    rest = target.GetPrim().GetAttribute("points").Get()
+    for time in range(FRAMES):
+        points = Vt.Vec3fArray(rest)
+        weights = query.GetAnimQuery().ComputeBlendShapeWeights(time)
+        if weights and target.GetBlendShapeMapper():
+            weights = target.GetBlendShapeMapper().Remap(weights)
+            sub, which, shape = shapes.ComputeSubShapeWeights(weights)
+            shapes.ComputeDeformedPoints(sub, which, shape, shapes.ComputeBlendShapePointIndices(),
+                                         shapes.ComputeSubShapePointOffsets(), points)  # fmt: skip
+        transforms = query.ComputeSkinningTransforms(time)
+        target.ComputeSkinnedPoints(transforms, points, time)
+        found.append(np.array(points))
+    return np.stack(found), np.array(target.GetPrim().GetAttribute("faceVertexIndices").Get()).reshape(-1, 3)
+
+
+def crossing(path) -> list[int]:
+    points, faces = skinned(path)
+    return [frame for frame, each in enumerate(points) if len(self_intersections(each.astype(float), faces))]
+
+
+def test_the_written_file_has_no_intersecting_triangle(there):
+    before = crossing("plain.usda")
+    assert before and crossing("certified.usda") == []
+    said = read_provenance("certified.usda")["certificate"]
+    assert said["found"] == f"0 of {FRAMES} frames intersect, 0 show covered skin"
+    assert said["frames wrong before"] >= len(before) and not said.get("frames left")
+
+
+def test_other_frames_are_those_of_the_bake_without(there):
+    plain, certified = skinned("plain.usda")[0], skinned("certified.usda")[0]
+    said = read_provenance("certified.usda")["certificate"]["moved frames"]
+    moved = {frame for span in said for frame in range(*map(sum, zip(map(int, span.split(" to ")), (0, 1))))}
+    assert 0 < len(moved) < FRAMES
+    for frame in range(FRAMES):
+        assert (plain[frame] == certified[frame]).all() == (frame not in moved)
+
+
+def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
+    assert main(["verify", "certified.usda"]) == 0
+    stage = Usd.Stage.Open("certified.usda")
+    for prim in stage.Traverse():
+        if prim.IsA(UsdSkel.Animation):
+            weights = prim.GetAttribute("blendShapeWeights")
+            for time in weights.GetTimeSamples():
+                weights.Set(Vt.FloatArray(len(weights.Get(time))), time)
+    stage.Export("bent.usda")
+    assert main(["verify", "bent.usda"]) == 3
+    assert "where its certificate says that none does" in capsys.readouterr().err
+
+
+def test_layers_hold_it_too(there):
+    assert main([*BAKE, "-o", "layers/", "--certify"]) == 0
+    (path,) = there.glob("layers/shots/*/*/anim.usdc")
+    faces, shot = skinned("plain.usda")[1], Shot(path)
+    assert not any(len(self_intersections(shot.garment_points(time), faces)) for time in shot.frame_times)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (
+            ["--refine", "1", "--refined-output", "points"],
+            "what a certificate moves is put on joints and blendshapes",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(there, capsys, more, said):
+    assert main([*BAKE[:-1], "-o", "none.usda", "--certify", *more]) == 2
+    assert said in capsys.readouterr().err and not (there / "none.usda").exists()
+
+
+def test_a_missing_library_is_told_before_work(there, capsys, monkeypatch):
+    monkeypatch.setattr("ssilk_core.delivery.bake.certificate.NEEDED", ("no_such_library",))
+    assert main([*BAKE, "-o", "none.usda", "--certify"]) == 2
+    assert "pip install 'ssilk[certify]'" in capsys.readouterr().err and not (there / "none.usda").exists()
