@@ -97,7 +97,9 @@ def test_free_flight_comes_no_deeper_into_colliders_than_points_were(scene, toy_
     more = UNIT * LIMIT * (torch.atanh(seen / LIMIT) - torch.atanh(free / LIMIT)).reshape(-1, 3).numpy()
     np.testing.assert_allclose(more[:stopped], (pushed[:, None] * away) @ turn, atol=2e-5)
     assert not more[stopped:].any()
-    still = replace(toy_motion(scene, 3).picked(np.zeros(3, dtype=int)), proximity=met.proximity[:1].repeat(3, axis=0))
+    still = replace(
+        toy_motion(scene, 3).picked(np.zeros(3, dtype=int)), proximity=met.proximity[:1].repeat(3, axis=0)
+    )
     frames = model.body_frames(still, motion_transforms(still, skeleton.parents))
     assert model.seen_from(z[0], z[0], frames).abs().max() < 1e-9  # nothing moves, deep in walls or not
 
