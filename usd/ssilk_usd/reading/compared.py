@@ -38,8 +38,9 @@ class Off:
     def __str__(self) -> str:
         if self.metres is None:
             return "with other points"
+        size = f"{1000 * self.metres:.3g}" if self.metres < 1 else f"{1000 * self.metres:.0f}"
         at = "" if self.code is None else f" at time code {self.code:g}"
-        return f"by up to {1000 * self.metres:.3g} mm{at}"
+        return f"by up to {size} mm{at}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ class Compared:
                 away = _nearest(points, seen)  # the same points may stand in another order
                 if away > unseen and not paired:
                     return Off(None, code)
-            if away > (found.metres or 0.0):
+            if away > (found.metres or 0.0) * (1 + 1e-6):  # the first of several that are the same
                 found = Off(away, code)
         return found if (found.metres or 0.0) > unseen else None
 

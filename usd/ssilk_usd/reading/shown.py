@@ -95,16 +95,21 @@ def shown_otherwise(
     if there.prim == skel.prim:
         return [*filter(None, found)]
     character = read_character(stage, root=root, bodies=bodies, garment=garment)
-    cloth = _read_cloth(stage, character.skeleton, garment, root)
+    cloth = None
+    try:
+        cloth = _read_cloth(stage, character.skeleton, garment, root)
+    except SsilkError as error:  # a model has its own, whatever the stage holds
+        found.append(f"its garment is not compared with the character's: {error}")
     if cloth is not None and cloth.prim not in own:
         own.append(cloth.prim)
     same = _same_meshes(there, skel, own, cloth)
     read = read_motion(of_motion, character.skeleton, prim=prim, root=root)
     compared = Compared(character, cloth.garment if cloth else None, cloth.rig if cloth else None, read, there)
-    is_baked = any(map(_is_baked, same))  # cloth that was simulated, over bodies whose faces may be hidden
+    # Cloth that was simulated, in place of the character's, over bodies whose faces may be hidden.
+    is_baked = any(_is_baked(mesh) for mesh in Usd.PrimRange.Stage(of_motion, PRIMS) if mesh.IsA(UsdGeom.Mesh))
     for mesh, original in same.items():
         if cloth is not None and original == cloth.prim:
-            found += () if is_baked else _garment_otherwise(mesh, original, compared, known)
+            found += _garment_otherwise(mesh, original, compared, known)
         elif not is_garment(original) and compared.meets(original):
             found += _body_otherwise(mesh, original, compared, known, is_baked)
         found.append(_hidden(mesh, there))
@@ -202,10 +207,10 @@ def _body_otherwise(
         return
     off = compared.off(own, mesh)
     if off and _is_cache(mesh, compared.there):
-        yield f"{name} is a point cache, which is not followed; cloth meets it as its joints move it, off {off}"
+        yield f"{name} is a point cache, which is not followed; cloth meets it as its joints move it, elsewhere {off}"
     elif off and to and to != compared.there.prim:
-        text = f"{name} follows another Skeleton, {to.GetPath()}, off {off}"
-        yield f"{text}; cloth meets it as the character's own moves it"
+        text = f"{name} follows another Skeleton, {to.GetPath()}"
+        yield f"{text}; cloth meets it as the character's own moves it, elsewhere {off}"
     elif off:
         yield f"it shapes {name} otherwise, {off}; cloth meets the shape of the character's stage throughout"
     elif not is_baked and (text := _faces(mesh, own)):
@@ -216,7 +221,7 @@ def _garment_otherwise(mesh: Usd.Prim, own: Usd.Prim, compared: Compared, known:
     """Yield in words that a shot has a garment of another shape as its joints move it, or with other faces."""
     name, to = mesh.GetName(), bound_skeleton(mesh)
     is_still = to and to != compared.there.prim and animation_source(to).prim is None  # nothing moves it in the shot
-    if own.GetName() in known or is_still or _is_cache(mesh, compared.there):
+    if own.GetName() in known or is_still or _is_baked(mesh) or _is_cache(mesh, compared.there):
         return
     if off := compared.off(own, mesh) if compared.meets(own) else rest_off(own, mesh):
         yield f"it shapes the garment {name} otherwise, {off}; {KEPT}"
