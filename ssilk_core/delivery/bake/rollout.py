@@ -329,7 +329,9 @@ class BakeRollout:
             code = (shown.start + found.indices[0]) * self.motion.fps / shown.fps / self.request.samples_per_frame
             text = f"{found.found.partition(' (first to frame')[0]} (first to time code {code:.9g})"
             report(Message(f"{found.prim}: {text}; {found.why}; {found.fix}", "warning"))
-        tell_shown_otherwise(self.request.stage, [self.source.path], report, root=self.request.root)
+        garment = self.deformer.scene.garment.mesh.path.rpartition("/")[2]
+        stage, root = self.request.stage, self.request.root
+        tell_shown_otherwise(stage, [self.source.path], report, root=root, garment=garment)
         if self.held_off:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"

@@ -45,6 +45,25 @@ class SkinnedMesh:
     def _has_shapes(self) -> bool:
         return bool(self.skinning.HasBlendShapes() and self.skeleton.GetAnimQuery())
 
+    def weights_attribute(self) -> Usd.Attribute | None:
+        """Return what weighs the mesh's blendshapes; None where it has none, or nothing weighs them."""
+        return (
+            UsdSkel.Animation(self.skeleton.GetAnimQuery().GetPrim()).GetBlendShapeWeightsAttr()
+            if self.shapes
+            else None
+        )
+
+    def weights(self, time: Usd.TimeCode) -> Floats:
+        """Return the weight of each of the mesh's own blendshapes, shape (K,)."""
+        found = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
+        return np.array(self.skinning.GetBlendShapeMapper().Remap(found), dtype=np.float64)
+
+    def reach(self) -> Floats:
+        """Return how far each blendshape moves a point at most, weighing one, in the mesh's space, shape (K,)."""
+        shapes = (self.shapes.GetBlendShape(index) for index in range(self.shapes.GetNumBlendShapes()))
+        offsets = (np.array(shape.GetOffsetsAttr().Get() or [], dtype=np.float64).reshape(-1, 3) for shape in shapes)
+        return np.array([np.linalg.norm(each, axis=1).max(initial=0) for each in offsets])
+
     def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
         """Return the posed points in stage units, shape (V, 3)."""
         points = self.rest.Get(EARLIEST)  # where UsdSkel begins, whatever later ones are

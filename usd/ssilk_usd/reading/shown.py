@@ -6,31 +6,33 @@ Blendshapes that it weighs otherwise or alone has, points that it has moved, poi
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
-from ssilk_core.scene import kinematics
-from ssilk_core.scene.assets import Character, Floats, Motion
+from ssilk_core.scene.assets import Garment, ProxyRig, Skeleton
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage
+from ..opening.garment_api import read_garment_record
+from ..opening.stage import PRIMS, USD_SUFFIXES, StageLike, named, needs_whole_files, open_stage, value
 from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
 from .character import is_skinned, read_character
-from .clips import spread
-from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in
+from .compared import Compared, faces_of, rest_off
+from .garment import find_garment, read_garment
+from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in, kept_faces
 from .motion import find_animation, read_motion
-from .posed import posed_mesh, skinning_of
+from .rig import read_proxy_rig
 from .shapes import animated_shapes, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource
 
-SAME = 1e-3  # of a mesh's size, by which its points may differ unseen
-LOOKED_AT = 32  # times at which points are compared
+KEPT = "what is written has the garment of the character's stage"
 
 
 def tell_shown_otherwise(
@@ -81,8 +83,8 @@ def shown_otherwise(
     """
     stage, (file, prim) = open_stage(source), split_location(motion)
     skel = find_skeleton(stage, root=root, garment=garment)
-    own = {mesh.GetName(): mesh for mesh in _meshes(skel) if is_drawn(mesh)}
-    found = [_hidden(mesh, skel, " of its own stage") for mesh in own.values()]
+    own = [mesh for mesh in _meshes(skel) if is_drawn(mesh)]
+    found = [_hidden(mesh, skel, " of its own stage") for mesh in own]
     _, placed = find_animation(of_motion := open_stage(file), prim, root)
     if placed is None:
         return [*filter(None, found)]
@@ -92,20 +94,56 @@ def shown_otherwise(
         return [*filter(None, found)]
     if there.prim == skel.prim:
         return [*filter(None, found)]
-    same = _same_meshes(there, own)
     character = read_character(stage, root=root, bodies=bodies, garment=garment)
-    compared = _Compared(character, read_motion(of_motion, character.skeleton, prim=prim, root=root), there)
+    cloth = None
+    try:
+        cloth = _read_cloth(stage, character.skeleton, garment, root)
+    except SsilkError as error:  # a model has its own, whatever the stage holds
+        found.append(f"its garment is not compared with the character's: {error}")
+    if cloth is not None and cloth.prim not in own:
+        own.append(cloth.prim)
+    same = _same_meshes(there, skel, own, cloth)
+    read = read_motion(of_motion, character.skeleton, prim=prim, root=root)
+    compared = Compared(character, cloth.garment if cloth else None, cloth.rig if cloth else None, read, there)
+    # Cloth that was simulated, in place of the character's, over bodies whose faces may be hidden.
+    is_baked = any(_is_baked(mesh) for mesh in Usd.PrimRange.Stage(of_motion, PRIMS) if mesh.IsA(UsdGeom.Mesh))
     for mesh, original in same.items():
-        name, body = mesh.GetName(), not is_garment(original)
-        if body and _is_cache(mesh, there):
-            text = f"{name} is a point cache, which is not followed"
-            found.append(f"{text}; cloth meets it as its joints move it")
-        elif body and original.GetName() not in known and (away := compared.away(original, mesh)) != 0:
-            found.append(_otherwise(name, away))
+        if cloth is not None and original == cloth.prim:
+            found += _garment_otherwise(mesh, original, compared, known)
+        elif not is_garment(original) and compared.meets(original):
+            found += _body_otherwise(mesh, original, compared, known, is_baked)
         found.append(_hidden(mesh, there))
-    shown = [mesh for mesh in own.values() if str(mesh.GetPath()) in compared.bodies and not is_stand_in(mesh)]
-    found += _other_bodies(shown, same, skel, there)
+    if cloth is not None and cloth.prim not in same.values() and not is_baked:
+        found.append(_deactivated(cloth.prim, skel, there))
+    met = [mesh for mesh in own if compared.meets(mesh) and not is_stand_in(mesh)]
+    found += _other_bodies([mesh for mesh in met if cloth is None or mesh != cloth.prim], same, skel, there)
     return [*filter(None, found)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Cloth:
+    """The garment of a character, as its own stage or file has it."""
+
+    prim: Usd.Prim
+    garment: Garment
+    rig: ProxyRig | None
+
+
+def _read_cloth(stage: Usd.Stage, skeleton: Skeleton, garment: str | None, root: str | None) -> _Cloth | None:
+    """Return the garment that is meant; None where there is none, or several of which none is named.
+
+    Args:
+        garment: as for `read_scene`.
+    """
+    file, prim = split_location(garment) if garment else (None, None)
+    if file and Path(file).suffix in USD_SUFFIXES:
+        stage, garment, root = open_stage(file), prim, None
+    meshes = [mesh for mesh in Usd.PrimRange.Stage(stage, PRIMS) if mesh.IsA(UsdGeom.Mesh)]
+    if len(named(meshes, garment) if garment else [*filter(is_garment, meshes)]) != 1:
+        return None
+    read = read_garment(stage, skeleton, garment=garment, root=root)
+    rig = read_proxy_rig(stage, skeleton, garment=garment, root=root)
+    return _Cloth(find_garment(stage, garment), read, rig)
 
 
 def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
@@ -115,38 +153,80 @@ def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
             yield prim
 
 
-def _same_meshes(there: SkelSource, own: Mapping[str, Usd.Prim]) -> dict[Usd.Prim, Usd.Prim]:
+def _same_meshes(
+    there: SkelSource, skel: SkelSource, own: Sequence[Usd.Prim], cloth: _Cloth | None
+) -> dict[Usd.Prim, Usd.Prim]:
     """Return for meshes of a shot which of a character's own meshes they are.
 
-    They have its name, or its faces alone: programs add a namespace to names, or a number.
+    They have its path beneath the SkelRoot, its name, or its faces alone: programs add a namespace to names, or a
+    number. Those that follow another Skeleton are meant where no others are, and a garment beside the SkelRoot.
     """
-    every = [prim for prim in Usd.PrimRange(there.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
-    bound = {prim.GetName() for prim in every if bound_skeleton(prim) == there.prim}
-    meshes = [
-        prim for prim in every if (to := bound_skeleton(prim)) == there.prim or not (to or prim.GetName() in bound)
-    ]
-    found = {mesh: own[mesh.GetName()] for mesh in meshes if mesh.GetName() in own}
-    others = [mesh for mesh in meshes if mesh not in found]
-    missing = [mesh for mesh in own.values() if others and mesh not in found.values()]
-    for faces in dict.fromkeys(map(_faces, missing)):
-        pairs = [[mesh for mesh in each if _faces(mesh) == faces] for each in (others, missing)]
-        if len(pairs[0]) == len(pairs[1]):  # such as two shoes, in the order of their stages
-            found.update(zip(*pairs))
+
+    def path(mesh: Usd.Prim) -> str:
+        root = skel.root if mesh in own else there.root
+        return str(mesh.GetPath().MakeRelativePath(root.GetPath()))
+
+    every = [prim for prim in Usd.PrimRange.Stage(there.stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+    within = [prim for prim in every if prim.GetPath().HasPrefix(there.root.GetPath())]
+    bound = [prim for prim in within if bound_skeleton(prim) == there.prim]
+    free = [prim for prim in within if not bound_skeleton(prim)]
+    found: dict[Usd.Prim, Usd.Prim] = {}
+    for meshes in (bound, free):
+        for key in (path, Usd.Prim.GetName):
+            _pair(meshes, own, key, found)
+    others = [prim for prim in within if prim not in bound and prim not in free]
+    _pair([prim for prim in within if prim not in others], own, faces_of, found)
+    for key in (path, Usd.Prim.GetName):
+        _pair(others, own, key, found)
+    if cloth is not None:
+        _pair([prim for prim in every if prim not in within], [cloth.prim], Usd.Prim.GetName, found)
     return found
 
 
-def _faces(mesh: Usd.Prim) -> tuple[bytes, bytes]:
-    """Return the faces of a mesh, to be compared."""
-    described = UsdGeom.Mesh(mesh)
-    values = (described.GetFaceVertexCountsAttr().Get(EARLIEST), described.GetFaceVertexIndicesAttr().Get(EARLIEST))
-    counts, indices = (np.array(each or [], dtype=np.int32).tobytes() for each in values)
-    return counts, indices
+def _pair(
+    meshes: Sequence[Usd.Prim],
+    own: Sequence[Usd.Prim],
+    key: Callable[[Usd.Prim], Hashable],
+    found: dict[Usd.Prim, Usd.Prim],
+) -> None:
+    """Add to `found` the meshes of a key that as many of a character's own have, in the order of their stages."""
+    missing = [mesh for mesh in own if mesh not in found.values()]
+    left = [mesh for mesh in meshes if missing and mesh not in found]
+    for each in dict.fromkeys(map(key, missing if left else [])):
+        pairs = [[mesh for mesh in some if key(mesh) == each] for some in (left, missing)]
+        if len(pairs[0]) == len(pairs[1]):  # such as two shoes
+            found.update(zip(*pairs))
 
 
-def _otherwise(name: str, away: float | None) -> str:
-    """Return in words that a shot has a body of another shape, by so much [m], or of other points if None."""
-    how = "with other points" if away is None else f"by up to {1000 * away:.3g} mm"
-    return f"it shapes {name} otherwise, {how}; cloth meets the shape of the character's stage throughout"
+def _body_otherwise(
+    mesh: Usd.Prim, own: Usd.Prim, compared: Compared, known: Iterable[str], is_baked: bool
+) -> Iterator[str]:
+    """Yield in words that a shot has a body of another shape, or with other faces."""
+    name, to = mesh.GetName(), bound_skeleton(mesh)
+    if own.GetName() in known and not _is_cache(mesh, compared.there):
+        return
+    off = compared.off(own, mesh)
+    if off and _is_cache(mesh, compared.there):
+        yield f"{name} is a point cache, which is not followed; cloth meets it as its joints move it, elsewhere {off}"
+    elif off and to and to != compared.there.prim:
+        text = f"{name} follows another Skeleton, {to.GetPath()}"
+        yield f"{text}; cloth meets it as the character's own moves it, elsewhere {off}"
+    elif off:
+        yield f"it shapes {name} otherwise, {off}; cloth meets the shape of the character's stage throughout"
+    elif not is_baked and (text := _faces(mesh, own)):
+        yield f"{text}; cloth meets all of it, and all of it is seen in what is written"
+
+
+def _garment_otherwise(mesh: Usd.Prim, own: Usd.Prim, compared: Compared, known: Iterable[str]) -> Iterator[str]:
+    """Yield in words that a shot has a garment of another shape as its joints move it, or with other faces."""
+    name, to = mesh.GetName(), bound_skeleton(mesh)
+    is_still = to and to != compared.there.prim and animation_source(to).prim is None  # nothing moves it in the shot
+    if own.GetName() in known or is_still or _is_baked(mesh) or _is_cache(mesh, compared.there):
+        return
+    if off := compared.off(own, mesh) if compared.meets(own) else rest_off(own, mesh):
+        yield f"it shapes the garment {name} otherwise, {off}; {KEPT}"
+    elif text := _faces(mesh, own) or _as_guide(mesh, own):
+        yield f"{text}; {KEPT}"
 
 
 def _is_cache(mesh: Usd.Prim, skel: SkelSource) -> bool:
@@ -154,58 +234,35 @@ def _is_cache(mesh: Usd.Prim, skel: SkelSource) -> bool:
     return not is_skinned(mesh, skel) and len(change_times([UsdGeom.Mesh(mesh).GetPointsAttr()])) > 1
 
 
-class _Compared:
-    """Bodies as a motion's joints move those of the character, beside the meshes that its own stage shows."""
-
-    def __init__(self, character: Character, motion: Motion, there: SkelSource) -> None:
-        self.bodies = {
-            "/" + body.mesh.path.rpartition(":/")[2]: body for body in (*character.bodies, *character.stand_ins)
-        }
-        self.motion, self.skeleton, self.there = motion, character.skeleton, there
-        self.skinned = skinning_of(there.stage)
-
-    def away(self, own: Usd.Prim, other: Usd.Prim) -> float | None:
-        """Return how far points of a body are at most from where the motion shows them [m], 0 if unseen.
-
-        None: these are other points, and not in the same places.
-        """
-        body = self.bodies.get(str(own.GetPath()))
-        if body is None:
-            return 0.0
-        codes = self._codes(other)
-        at = np.array(codes) * self.motion.fps / self.there.stage.GetTimeCodesPerSecond() - self.motion.start
-        frames = np.clip(at.round().astype(int), 0, self.motion.frame_count - 1)
-        shown, away = posed_mesh(other, self.skinned), 0.0
-        unseen = SAME * float(np.ptp(body.mesh.points, axis=0).max(initial=0))
-        for code, frame in zip(codes, frames):
-            rigid = self.motion.clip(frame, frame + 1)
-            world = kinematics.motion_transforms(rigid, self.skeleton.parents)
-            matrices = kinematics.skinning_matrices(world, self.skeleton.bind_transforms)
-            (met,) = kinematics.skin_points(body.mesh.points, body.skin, matrices)
-            seen = self.there.units.points_to_core(shown.points(Usd.TimeCode(code), UsdGeom.XformCache(code)))
-            unseen = max(unseen, 1e-6 * float(np.abs(met).max(initial=0)))  # of float32, far from the origin
-            if len(seen) != len(met):
-                return None if _nearest(met, seen) > unseen else 0.0
-            away = max(away, float(np.linalg.norm(seen - met, axis=1).max(initial=0)))
-        return away if away > unseen else 0.0
-
-    def _codes(self, mesh: Usd.Prim) -> list[float]:
-        """Return times of frames, and of changes of blendshapes that are at one or beyond them; some if many."""
-        rate = self.there.stage.GetTimeCodesPerSecond() / self.motion.fps
-        frames = (self.motion.start + np.arange(self.motion.frame_count)) * rate
-        animation = animation_source(self.there.prim).prim
-        shaped = animation and UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get()
-        times = np.array(change_times([UsdSkel.Animation(animation).GetBlendShapeWeightsAttr()] if shaped else []))
-        whole = np.abs((times - frames[0]) / rate % 1 - 0.5) > 0.49
-        times = times[(times < frames[0]) | (times > frames[-1]) | whole]
-        return sorted({*spread(frames, LOOKED_AT).tolist(), *spread(times, LOOKED_AT).tolist()})
+def _is_baked(mesh: Usd.Prim) -> bool:
+    """Return whether a mesh is a garment that was baked, simulated or fitted here."""
+    if not is_garment(mesh):
+        return False
+    written = any("ssilk" in spec.layer.customLayerData for spec in mesh.GetPrimStack())
+    return written or read_garment_record(mesh) is not None
 
 
-def _nearest(points: Floats, others: Floats) -> float:
-    """Return how far points are at most from the nearest of others; infinite without others."""
-    from scipy.spatial import cKDTree
+def _faces(mesh: Usd.Prim, own: Usd.Prim) -> str:
+    """Return in words that a shot's mesh has another number of faces that are no holes; else empty."""
+    counts = (np.array(value(prim, "faceVertexCounts") or [], dtype=np.int64) for prim in (mesh, own))
+    shown, kept = (len(kept_faces(prim, each)[1]) for prim, each in zip((mesh, own), counts))
+    return f"it shows {shown} faces of {mesh.GetName()} instead of {kept}" if shown != kept else ""
 
-    return float(max(cKDTree(a).query(b)[0].max(initial=0) for a, b in ((points, others), (others, points))))
+
+def _as_guide(mesh: Usd.Prim, own: Usd.Prim) -> str:
+    """Return in words that a shot leaves a mesh out of renders by its purpose; else empty."""
+    now, before = (UsdGeom.Imageable(prim).ComputePurpose() for prim in (mesh, own))
+    unseen = (UsdGeom.Tokens.guide, UsdGeom.Tokens.proxy)
+    return f"it gives {mesh.GetName()} the purpose {now}" if now != before and now in unseen else ""
+
+
+def _deactivated(own: Usd.Prim, skel: SkelSource, there: SkelSource) -> str:
+    """Return in words that a shot deactivates a garment, or what holds it; else empty."""
+    if not own.GetPath().HasPrefix(skel.root.GetPath()):
+        return ""
+    path = own.GetPath().ReplacePrefix(skel.root.GetPath(), there.root.GetPath())
+    found = next(prim for each in reversed(path.GetPrefixes()) if (prim := there.stage.GetPrimAtPath(each)))
+    return "" if found.IsActive() else f"it deactivates {found.GetPath()}, and with it the garment; {KEPT}"
 
 
 def _is_same_character(skel: SkelSource, there: SkelSource) -> bool:
@@ -220,10 +277,10 @@ def _other_bodies(
     """Yield in words which bodies a shot lacks, and which it alone has, if it is a shot of this character."""
     if not same and not _is_same_character(skel, there):
         return
-    guides = [own for mesh, own in same.items() if UsdGeom.Imageable(mesh).ComputePurpose() == UsdGeom.Tokens.guide]
+    guides = {own: said for mesh, own in same.items() if (said := _as_guide(mesh, own))}
     for body in bodies:
         if body not in same.values() or body in guides:
-            text = f"it shows no mesh {body.GetName()} that is the character's"
+            text = guides.get(body, f"it shows no mesh {body.GetName()} that is the character's")
             yield f"{text}; cloth meets it, and it is seen in what is written"
     extra = [mesh for mesh in _meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
     for mesh in extra:
