@@ -54,7 +54,8 @@ class BodyFamily:
     Attributes:
         names: of the members, the base first, length M.
         members: their coordinates, the base's zero, shape (M, K).
-        rows: which points of the base's merged body it knows, shape (V',).
+        vertex_count: of the base's merged body.
+        rows: which of its points this knows, shape (V',).
         joints, points: of the base in the bind pose [m], shapes (J, 3) and (V', 3).
         joint_moves, point_moves: how far a unit along each direction moves these [m], shapes (K, J, 3), (K, V', 3).
         taller: how much a unit along each direction adds to the height of the hub over the lowest point, relative to
@@ -63,6 +64,7 @@ class BodyFamily:
 
     names: tuple[str, ...]
     members: Floats
+    vertex_count: int
     rows: Ints
     joints: Floats
     points: Floats
@@ -83,6 +85,8 @@ class BodyFamily:
         for name, shape in shapes.items():
             if (found := getattr(self, name).shape) != shape:
                 fail("body family", f"{name} of shape {found}", f"{shape} is needed")
+        if not ((self.rows >= 0) & (self.rows < self.vertex_count)).all():
+            fail("body family", "points that the body does not have", f"they lie in 0 to {self.vertex_count - 1}")
         if not (1 <= size <= MOST_DIRECTIONS and len(self.names) > 1):
             fail(
                 "body family", f"{len(self.names)} members along {size} directions", "two members or more are needed"
@@ -127,7 +131,7 @@ class BodyFamily:
         taller = (joint_moves[:, base.hub, 1] - point_moves[:, lowest, 1]) / height if height > 0 else 0 * farthest
         names = tuple(character.path for character in characters)
         rows = np.arange(count)
-        return cls(names, along / farthest, rows, places[0], bodies[0], joint_moves, point_moves, taller)
+        return cls(names, along / farthest, count, rows, places[0], bodies[0], joint_moves, point_moves, taller)
 
     def place(self, joints: Floats, points: Floats) -> BodyPlace:
         """Return where a body is in this space.
@@ -148,9 +152,16 @@ class BodyFamily:
         return BodyPlace(found, joints_off, points_off, self.beyond(found))
 
     def place_of(self, character: Character) -> BodyPlace:
-        """Return where a character with these joints and this topology is."""
-        points = character.merged_body().mesh.points[self.rows]
-        return self.place(character.skeleton.bind_transforms[:, :3, 3], points)
+        """Return where a character with these joints and this topology is.
+
+        Raises:
+            SsilkError: its body has another number of points.
+        """
+        mesh = character.merged_body().mesh
+        if mesh.vertex_count != self.vertex_count:
+            allowed = f"bodies of the family have {self.vertex_count}"
+            fail(mesh.path, f"{mesh.vertex_count} body points", allowed, "take a body of the same topology")
+        return self.place(character.skeleton.bind_transforms[:, :3, 3], mesh.points[self.rows])
 
     def beyond(self, coordinates: Floats) -> float:
         """Return how far coordinates (K,) are beyond the members, as `BodyPlace.beyond`."""
@@ -265,7 +276,10 @@ class DressedFamily:
         return replace(self, bodies=self.bodies.stored())
 
     def scene_at(self, scene: Scene, coordinates: Floats) -> Scene:
-        """Return the base's scene at coordinates (K,); bodies that the scene has must be known whole."""
+        """Return the base's scene at coordinates (K,), its garment sewn as it is there.
+
+        Bodies that the scene has must be known whole.
+        """
         if not np.any(coordinates):
             return scene
         character = scene.character
@@ -277,7 +291,7 @@ class DressedFamily:
         binds[:, :3, 3] += np.tensordot(coordinates, self.proxy_moves, 1)
         return Scene(
             replace(character, skeleton=skeleton, bodies=bodies, stand_ins=()),
-            replace(scene.garment, mesh=replace(mesh, points=points)),
+            replace(scene.garment, mesh=replace(mesh, points=points), sewn=scene.garment.sewn_mesh.points),
             replace(rig, bind_transforms=binds),
         )
 

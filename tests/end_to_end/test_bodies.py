@@ -12,6 +12,11 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.cli import main
+from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
+from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model, save_model
+
+TRAIN = "train rigged.usda --motions clip.usda"
 
 
 def run(command: str, *more: str) -> int:
@@ -39,13 +44,24 @@ def heavier(points: np.ndarray) -> np.ndarray:
     return points * [1.3, 1, 1.3]
 
 
+@pytest.fixture(scope="module")
+def family(toy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy with taller.usda and heavier.usda, and family.safetensors, trained for all three bodies."""
+    folder = toy.copy(tmp_path_factory.mktemp("family"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        write_member(folder / "taller.usda", taller)
+        write_member(folder / "heavier.usda", heavier)
+        train = f"{TRAIN} --family taller.usda heavier.usda -o family.safetensors"
+        assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    return folder
+
+
 @pytest.fixture
-def world(toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """hero.usda, taller.usda and heavier.usda in the current folder."""
-    shutil.copy(toy.folder / "hero.usda", tmp_path)
+def world(family: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, the current folder."""
+    shutil.copytree(family, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    write_member(tmp_path / "taller.usda", taller)
-    write_member(tmp_path / "heavier.usda", heavier)
     return tmp_path
 
 
@@ -104,3 +120,130 @@ def test_a_garment_is_tried_on_another_body_before_any_training(world):
     high = own[:, 1] > 1.05
     assert (around[high] > 1.15).all()  # where the pillar grew by 1.3 it would be within the skin otherwise
     np.testing.assert_allclose(skinned_rest("again.usda")[0], its[0], atol=1e-5)
+
+
+def test_a_family_is_learned_and_the_model_file_holds_it(world):
+    family, alone = load_model("family.safetensors"), load_model("model.safetensors")
+    assert alone.bodies is None and len(family.bodies.family.bodies.names) == 3
+    assert all(np.abs(family.bodies.columns[name]).max() > 0 for name in ("initialiser", "output"))
+    assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
+
+
+def test_a_family_needs_members(world, capsys, toy):
+    stage = Usd.Stage.Open("taller.usda")
+    stage.GetPrimAtPath("/Hero/Rig").GetAttribute("joints").Set(["Hips", "Hips/Spine", "Hips/Spine/Skull"])
+    stage.Save()
+    assert run(f"{TRAIN} --family taller.usda -o new.safetensors", *toy.training) == 2
+    assert "Hips/Spine/Skull" in capsys.readouterr().err and not Path("new.safetensors").exists()
+    assert run(f"{TRAIN} --family heavier.usda --start-from model.safetensors -o new.safetensors") == 2
+    assert "a family of bodies" in capsys.readouterr().err
+
+
+def test_a_training_of_a_family_goes_on_as_if_it_had_not_stopped(world, toy, monkeypatch):
+    from ssilk_core.training import run as training
+
+    whole = Path("family.safetensors").read_bytes()
+    command = f"{TRAIN} --family taller.usda heavier.usda -o again.safetensors"
+    steps = []
+
+    def step(self) -> None:
+        steps.append(self.state.iteration)
+        if len(steps) == 5:
+            raise KeyboardInterrupt
+        original(self)
+
+    original = training.TrainingRun.step
+    monkeypatch.setattr(training.TrainingRun, "step", step)
+    assert run(command, *toy.training) == EXIT_INTERRUPTED
+    monkeypatch.setattr(training.TrainingRun, "step", original)
+    assert run(f"{command} --resume", *toy.training) in (EXIT_OK, EXIT_WORSE)
+    found = load_model("again.safetensors")
+    for name, values in load_model("family.safetensors").parameters.items():
+        np.testing.assert_allclose(found.parameters[name], values, atol=1e-6)
+    assert whole
+
+
+BAKE = "bake family.safetensors --motion clip.usda"
+
+
+def test_on_its_first_body_a_family_bakes_what_a_model_of_that_body_alone_does(world):
+    file = load_model("family.safetensors")
+    save_model("base.safetensors", file.on_body(np.zeros(2)))
+    assert run(f"{BAKE} --stage rigged.usda -o family.usda") == 0
+    assert run("bake base.safetensors --motion clip.usda --stage rigged.usda -o base.usda") == 0
+    family, base = (
+        Path(shot).read_text().replace(sha256(model), "").replace(sha256(model)[:12], "").replace(shot, "")
+        for shot, model in (("family.usda", "family.safetensors"), ("base.usda", "base.safetensors"))
+    )
+    differing = [one for one, other in zip(family.splitlines(), base.splitlines()) if one != other]
+    assert len(family) > 10_000 and not [line for line in differing if "safetensors" not in line]
+
+
+def shown(path: str, frame: float) -> dict[str, np.ndarray]:
+    """Points (V, 3) of skinned meshes in a frame of a shot, as UsdSkel deforms them with their blendshapes."""
+    stage, found = Usd.Stage.Open(path), {}
+    assert UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Mesh):
+            found[prim.GetName()] = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(frame))
+    return found
+
+
+def member_clip(path: str, ratio: float) -> None:
+    """The toy's clip for a body whose joints are so much higher."""
+    stage = Usd.Stage.Open(Usd.Stage.Open("clip.usda").Flatten())
+    translations = UsdSkel.Animation(stage.GetPrimAtPath("/Clip")).GetTranslationsAttr()
+    for time in translations.GetTimeSamples():
+        translations.Set([Gf.Vec3f(at[0], at[1] * ratio, at[2]) for at in translations.Get(time)], time)
+    stage.GetRootLayer().Export(path)
+
+
+def test_a_member_is_baked_as_plain_usdskel_with_its_own_body_and_garment(world, capsys):
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
+    told = capsys.readouterr()
+    assert "a body of the model's family" in told.out + told.err
+    assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
+    own, its = shown("base.usda", 0), shown("heavy.usda", 0)
+    np.testing.assert_allclose(its["Body"], heavier(own["Body"]), atol=1e-4)
+    assert run("verify heavy.usda") == 0
+    away = np.linalg.norm(its["Skirt"] - own["Skirt"], axis=1)
+    assert 0.005 < away.mean() < 0.3
+
+
+def test_a_taller_body_has_its_garment_higher(world):
+    member_clip("tall_clip.usda", 1.15)
+    assert run("bake family.safetensors --motion tall_clip.usda --stage taller.usda -o tall.usda") == 0
+    assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
+    own, its = shown("base.usda", 10), shown("tall.usda", 10)
+    assert its["Skirt"][:, 1].max() == pytest.approx(1.15 * own["Skirt"][:, 1].max(), rel=0.02)
+
+
+def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(world, capsys):
+    write_member(world / "between.usda", lambda points: points * [1.15, 1.05, 1.15])
+    assert run(f"{BAKE} --stage between.usda -o between_shot.usda") == 0
+    write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
+    capsys.readouterr()
+    assert run(f"{BAKE} --stage large.usda -o large_shot.usda") == 0
+    told = capsys.readouterr()
+    assert "beyond the bodies of the training" in told.out + told.err
+    write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
+    assert run(f"{BAKE} --stage huge.usda -o huge_shot.usda") == 2
+    assert "beyond the bodies that the model was trained for" in capsys.readouterr().err
+    write_member(world / "bent.usda", lambda points: points + [0.2, 0, 0] * np.sin(4 * points[:, 1:2]))
+    assert run(f"{BAKE} --stage bent.usda -o bent_shot.usda") == 2
+    assert "from all that the model's family of bodies adds up to" in capsys.readouterr().err
+    assert not Path("huge_shot.usda").exists() and not Path("bent_shot.usda").exists()
+
+
+def test_a_model_of_one_body_still_refuses_others(world, capsys):
+    assert run("bake model.safetensors --motion clip.usda --stage taller.usda -o out.usda") == 2
+    assert "a model bakes on the character it was trained with" in capsys.readouterr().err
+
+
+def test_evaluate_takes_a_member(world):
+    (world / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    listed = "--motions clips --no-probes"
+    assert run(f"evaluate family.safetensors --stage heavier.usda {listed} -o heavy.json") == 0
+    assert run(f"evaluate family.safetensors --stage rigged.usda {listed} -o base.json") == 0
+    assert Path("heavy.json").read_text() != Path("base.json").read_text()

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Carry a garment from the body that it was fitted to onto another body of the same family.
 
-Every vertex moves as the skin about it does. The similarity transform (a rotation, a scale, a displacement) that best
-takes the skin of one body to that of the other is fitted anew for each vertex, by moving least squares (Schaefer,
-McPhail and Warren 2006). Skin counts as 1 / (d^2 + n^2 + 2 e^2)^2 at the distance d, with the distance n of the
-nearest and the mean length e of its edges. Cloth on skin follows what is right beneath it, and cloth far away the body
-at large. Skin counts more where the joints that move it move the cloth as well: a sleeve beside the waist follows its
-arm. The cloth is then settled out of the new body.
+Every vertex moves as the skin about it does. For each, the similarity transform (a rotation, a scale, a displacement)
+that best takes the skin of one body to the other is fitted anew, by moving least squares (Schaefer 2006). Skin
+counts as 1 / (d^2 + n^2 + 2 e^2)^2 at the distance d, with the distance n of the nearest and the mean length e of
+edges. Cloth on skin follows what is right beneath it, and cloth far away the body at large. Skin counts more where
+the joints that move it move the cloth too: a sleeve beside the waist follows its arm. The cloth is then settled out
+of the new body.
 
 A body that is scaled, moved and turned as a whole takes its garment along exactly, and the same body leaves it
 exactly as it is. Weights and classes stay. Proxies move with the vertices that they lie at.
