@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import fail
-from ..scene.assets import Floats, Skeleton
+from ..scene.assets import Floats, Ints, Skeleton
 from ..scene.assets.arrays import assign, frozen
 from ..scene.family import BodyFamily, DressedFamily
 
@@ -89,6 +89,10 @@ class SeenBodies:
             f"{name}.0.bias": (parameters[f"{name}.0.bias"] + values @ coordinates).astype(np.float32)
             for name, values in self.columns.items()
         }
+
+    def with_proxies(self, kept: Ints) -> SeenBodies:
+        """Return this for a garment that keeps some of its proxies alone."""
+        return replace(self, family=replace(self.family, proxy_moves=self.family.proxy_moves[:, kept]))
 
     def stored(self) -> SeenBodies:
         """Return this as files hold it."""

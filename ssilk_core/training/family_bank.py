@@ -7,6 +7,7 @@ their rotations, and their positions are linear in a body's coordinates. So are 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +17,8 @@ from torch import Tensor
 from ..network.descriptors import SATURATION, accelerations, place_of_hub
 from ..scene.assets import Floats, Motion, Skeleton
 from ..scene.family import BodyFamily, motion_on
-from ..scene.kinematics import motion_transforms
-from .motion_bank import MotionBank, skinned
+from ..scene.kinematics import motion_transforms, resample
+from .motion_bank import MotionBank, arrays_of, bank_tensors, needed_spans, skinned
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +62,32 @@ class FamilyBank(MotionBank):
         return torch.cat([others, SATURATION * torch.tanh(raw / SATURATION)], dim=1)
 
 
-def family_arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, family: BodyFamily) -> dict[str, np.ndarray]:
+def build_family_bank(
+    motions: Sequence[Motion],
+    skeleton: Skeleton,
+    joints: np.ndarray,
+    fps: float,
+    device: torch.device,
+    family: BodyFamily,
+    *,
+    max_joint_speed: float = np.inf,
+) -> FamilyBank:
+    """Return what `build_bank` returns, on the base of a family and on all its other bodies.
+
+    Raises:
+        SsilkError: there is no motion.
+    """
+
+    def arrays(span: Motion) -> dict[str, np.ndarray]:
+        clip = resample(span, fps)
+        return {**arrays_of(clip, skeleton, joints, "relative"), **_family_arrays(clip, skeleton, joints, family)}
+
+    spans = needed_spans(motions, skeleton, fps, max_joint_speed)
+    place = torch.zeros(family.size, device=device)
+    return FamilyBank(**bank_tensors(map(arrays, spans), device), place=place)
+
+
+def _family_arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, family: BodyFamily) -> dict[str, np.ndarray]:
     """Return what a `FamilyBank` has of the frames of one clip beside those of the base, by name, float32."""
     hub = place_of_hub(skeleton, joints)
 

@@ -71,6 +71,9 @@ class TrainJob:
     def __post_init__(self) -> None:
         if self.family:
             self._need_family()
+        if self.base and self.base.bodies:
+            found = "training that goes on from a model of a family of bodies"
+            fail(self.scene.garment.mesh.path, found, "models of one body train on", "train for the family anew")
         need_wearable(self.over, self.scene, self.model.fps)
         if self.base:
             _need_same_scene(self.base, self.scene)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,7 +16,6 @@ from ..network.descriptors import pose_features
 from ..network.model.descriptors import gravity_features, seen_gravity, turned_vectors
 from ..network.model.feedback import BodyFrames
 from ..scene.assets import Motion, Skeleton
-from ..scene.family import BodyFamily
 from ..scene.kinematics import centred_matrices, resample, split_at_cuts
 
 
@@ -109,42 +108,49 @@ def build_bank(
     *,
     max_joint_speed: float = np.inf,
     kind: str = "relative",
-    family: BodyFamily | None = None,
 ) -> MotionBank:
     """Resample the spans of `usable_spans` to `fps` and copy them to a device, with descriptors of a kind.
-
-    Args:
-        family: bodies on which the motions play as well, with relative descriptors; the skeleton is the base's.
 
     Raises:
         SsilkError: there is no motion.
     """
+    spans = needed_spans(motions, skeleton, fps, max_joint_speed)
+    return MotionBank(
+        **bank_tensors((arrays_of(resample(span, fps), skeleton, joints, kind) for span in spans), device)
+    )
+
+
+def needed_spans(
+    motions: Sequence[Motion], skeleton: Skeleton, fps: float, max_joint_speed: float = np.inf
+) -> list[Motion]:
+    """Return the result of `usable_spans`; raise `SsilkError` where there is none."""
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
     spans = usable_spans(motions, skeleton, fps, max_joint_speed)
     if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
-    # In single precision clip by clip: a large bank in double precision does not fit a host.
-    clips = [resample(span, fps) for span in spans]
-    parts = [_arrays(clip, skeleton, joints, kind) for clip in clips]
-    if family:
-        from .family_bank import FamilyBank, family_arrays
+    return spans
 
-        parts = [{**part, **family_arrays(clip, skeleton, joints, family)} for clip, part in zip(clips, parts)]
+
+def bank_tensors(clips: Iterable[dict[str, np.ndarray]], device: torch.device) -> dict[str, Tensor]:
+    """Return what a bank has, from what each of its clips has in single precision, by name."""
+    # Clip by clip: a large bank in double precision does not fit a host.
+    parts = list(clips)
     ends = np.cumsum([len(part["root"]) for part in parts])
     starts = np.concatenate([[0], ends[:-1]])
 
     def joined(name: str) -> Tensor:
         return torch.as_tensor(np.concatenate([part.pop(name) for part in parts]), device=device)
 
-    both = {"starts": torch.as_tensor(starts, device=device), "stops": torch.as_tensor(ends, device=device)}
-    if family:
-        place = torch.zeros(family.size, device=device)
-        return FamilyBank(**{name: joined(name) for name in [*parts[0]]}, **both, place=place)
-    return MotionBank(**{name: joined(name) for name in [*parts[0]]}, **both)
+    found = {name: joined(name) for name in [*parts[0]]}
+    return {
+        **found,
+        "starts": torch.as_tensor(starts, device=device),
+        "stops": torch.as_tensor(ends, device=device),
+    }
 
 
-def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
+def arrays_of(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
     """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
     features = pose_features(clip, skeleton, joints, kind=kind)
     matrices, root = skinned(clip, skeleton)

@@ -27,7 +27,7 @@ from ..scene.assets import Floats, Ints, Motion
 from ..scene.family import motion_on
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .bodies import DrawnBodies, FamilyBody, Wearer
-from .family_bank import FamilyBank
+from .family_bank import FamilyBank, build_family_bank
 from .inner_garments import InnerGarments
 from .job import TrainJob
 from .memory import searches_contours
@@ -151,9 +151,12 @@ def build_parts(
     model = model.to(device)
     kind = job.model.descriptors
     bodies = job.family.bodies if job.family else None
-    bank = build_bank(
-        motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind, family=bodies
-    )
+    if bodies:
+        bank: MotionBank = build_family_bank(
+            motions, skeleton, joints, fps, device, bodies, max_joint_speed=MAX_JOINT_SPEED
+        )
+    else:
+        bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
     held = build_bank(job.held_out, skeleton, joints, fps, device, kind=kind)
     energy = GarmentEnergy(scene.garment.sewn_mesh, job.fabric, scene.classes, device=device)
     body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None

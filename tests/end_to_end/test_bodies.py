@@ -247,3 +247,23 @@ def test_evaluate_takes_a_member(world):
     assert run(f"evaluate family.safetensors --stage heavier.usda {listed} -o heavy.json") == 0
     assert run(f"evaluate family.safetensors --stage rigged.usda {listed} -o base.json") == 0
     assert Path("heavy.json").read_text() != Path("base.json").read_text()
+
+
+def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
+    onnx = pytest.importorskip("onnx")
+    assert run("export family.safetensors -o base.onnx") == 0
+    assert run("export family.safetensors --stage heavier.usda -o heavy.onnx") == 0
+    assert run("export model.safetensors --stage rigged.usda -o alone.onnx") == 0
+    sizes = [
+        sum(len(each.raw_data) for each in onnx.load(f"{name}.onnx").graph.initializer) for name in ("base", "heavy")
+    ]
+    assert sizes[0] == sizes[1] and Path("base.onnx").read_bytes() != Path("heavy.onnx").read_bytes()
+    assert run("reduce family.safetensors --motions clip.usda --joints 3 -o small.safetensors") == 0
+    small = load_model("small.safetensors")
+    assert small.scene.rig.proxy_count < 4 and small.bodies.family.proxy_moves.shape[1] == small.scene.rig.proxy_count
+    assert run("bake small.safetensors --motion clip.usda --stage heavier.usda -o small.usda") == 0
+
+
+def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
+    assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
+    assert "train for the family anew" in capsys.readouterr().err

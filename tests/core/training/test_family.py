@@ -18,6 +18,7 @@ from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
+from ssilk_core.training.family_bank import build_family_bank
 from ssilk_core.training.motion_bank import build_bank
 
 CPU = torch.device("cpu")
@@ -55,7 +56,7 @@ def model(scene, family):
 
 def test_motions_play_on_a_member_as_on_its_own_skeleton(scene, members, family, toy_motion):
     motion, base, bodies = toy_motion(scene, 12), members[0].skeleton, family.bodies
-    bank = build_bank([motion], base, np.arange(3), 30.0, CPU, family=bodies)
+    bank = build_family_bank([motion], base, np.arange(3), 30.0, CPU, bodies)
     frames = torch.arange(bank.frame_count)
     for member, coordinates in zip(members, bodies.members):
         bank.wear(torch.as_tensor(coordinates.copy()))
