@@ -126,10 +126,10 @@ class Bench:
         from ..quality.evaluation.takes import takes_of, within
 
         self.options, self.device = options, select_device(options.device)
-        stage = open_stage(options.stage)
-        self.files: dict[Path, ModelFile] = {
-            path: worn(load_model(path), stage, options.root).file for path in options.models
-        }
+        self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
+        for path, file in self.files.items():
+            if file.bodies:
+                self.files[path] = worn(file, open_stage(options.stage), options.root).file
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]
         if len(set(names)) != len(names):

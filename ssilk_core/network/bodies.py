@@ -63,7 +63,7 @@ class SeenBodies:
         """Return what the tensors of a file hold; `names` are those of the members."""
         found = {name: tensors[f"family.{name}"] for name in TENSORS}
         dressed = DressedFamily(
-            BodyFamily(names, vertex_count=int(tensors["family.vertex_count"]), **found),
+            BodyFamily(names, vertex_count=int(np.ravel(tensors["family.vertex_count"])[0]), **found),
             tensors["family.cloth_moves"],
             tensors["family.proxy_moves"],
         )

@@ -267,3 +267,15 @@ def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
 def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
     assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
     assert "train for the family anew" in capsys.readouterr().err
+
+
+def test_in_a_folder_of_layers_a_name_stays_with_its_body(world, capsys):
+    shot = "bake family.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage heavier.usda -o shots/") == 0
+    asset = next(Path("shots/assets").rglob("*.usd*")).read_bytes()
+    capsys.readouterr()
+    assert run(f"{shot} --stage rigged.usda --shot-name other -o shots/") == 2
+    assert "another body of its model's family" in capsys.readouterr().err
+    assert next(Path("shots/assets").rglob("*.usd*")).read_bytes() == asset
+    assert run(f"{shot} --stage rigged.usda --shot-name other --garment-name slim -o shots/") == 0
+    assert run(f"{shot} --stage heavier.usda --shot-name third -o shots/") == 0

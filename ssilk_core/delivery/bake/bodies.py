@@ -31,11 +31,13 @@ class WornModel:
         file: as a model for that body.
         scene: its garment there.
         told: what there is to say of the body.
+        body: its place in the model's family, in words; None for the body that the model is of.
     """
 
     file: ModelFile
     scene: Scene
     told: tuple[Event, ...] = ()
+    body: str | None = None
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
@@ -66,7 +68,7 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     one = file.on_body(place.coordinates, seen)
     bare = replace(own, bodies=(), stand_ins=())  # as model files have it
     one = replace(one, scene=replace(one.scene, character=bare))
-    return WornModel(one, replace(one.scene, character=own), tuple(_told(place, own)))
+    return WornModel(one, replace(one.scene, character=own), tuple(_told(place, own)), _words(place))
 
 
 def _need_like(place: BodyPlace, path: str) -> None:
@@ -79,10 +81,14 @@ def _need_like(place: BodyPlace, path: str) -> None:
         fail(path, found, f"{FARTHEST:.0%} are allowed", BETTER)
 
 
+def _words(place: BodyPlace) -> str:
+    return ", ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in place.coordinates)
+
+
 def _told(place: BodyPlace, character: Character) -> list[Event]:
     path = character.path
-    where = ", ".join(f"{value:.2f}" for value in place.coordinates)
-    told: list[Event] = [Message(f"{path}: a body of the model's family, at ({where})"), *_unlike(place, character)]
+    text = f"{path}: a body of the model's family, at ({_words(place)})"
+    told: list[Event] = [Message(text), *_unlike(place, character)]
     if place.beyond > TRAINED:
         text = f"it is {place.beyond:.0%} beyond the bodies of the training, which went to {TRAINED:.0%}"
         told.append(Message(f"{path}: {text}; the network sees it no farther off", "warning"))

@@ -16,11 +16,11 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.assets import Deformer, Floats, Motion
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
-from .bodies import worn
+from .bodies import WornModel, worn
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
@@ -69,6 +69,7 @@ class LoadedGarment:
         info: of the garment as an asset.
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
+        body: where in the model's family it is (`bodies.WornModel.body`).
     """
 
     request: BakeRequest
@@ -84,6 +85,7 @@ class LoadedGarment:
     info: AssetInfo
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
+    body: str | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -209,9 +211,10 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     device = select_device(request.device)
     file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
-    (file, scene, units, riders, told), stage_held = read_unchanged(
+    (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
+    file, scene = on.file, on.scene
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -232,21 +235,22 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         info=_info(request, model_held.digest),
         riders=riders,
         told=told,
+        body=on.body,
     )
 
 
 def _on_stage(
     file: ModelFile, request: BakeRequest
-) -> tuple[ModelFile, Scene, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
-    """Return a model for the character of a stage, its scene with that, the units of what is written, what rides on
-    it, and what there is to report."""
+) -> tuple[WornModel, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
+    """Return a model on the character of a stage, the units of what is written, what rides on it, and what there is
+    to report."""
     from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
     on = worn(file, stage, request.root)
     told: list[Event] = [*on.told]
     riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event))
-    return on.file, on.scene, _units(stage, request.receiver), riders, tuple(told)
+    return on, _units(stage, request.receiver), riders, tuple(told)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:
