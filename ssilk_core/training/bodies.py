@@ -48,6 +48,10 @@ class DrawnBodies:
         """Put on the body of an iteration, which a resumed run draws again."""
         self.wear(random_body(self.family, np.random.default_rng([self.seed, iteration])))
 
+    def take_off(self) -> None:
+        """Put on the base."""
+        self.wear(np.zeros(self.family.size))
+
     def wear(self, coordinates: Floats) -> None:
         """Put on the body at coordinates (K,)."""
         place = torch.as_tensor(coordinates, dtype=torch.float32, device=self.device)

@@ -85,6 +85,8 @@ class Stepper:
         self.average_gradients, self.smoothing = average_gradients, smoothing
         self.device = sampler.first.device
         self.optimisers = _optimisers(model, config, self.device)
+        if bodies:
+            bodies.take_off()  # the average is validated on the base
         self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = SkippedSteps(self.device)

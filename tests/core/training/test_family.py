@@ -2,6 +2,7 @@
 """Training for a family of bodies, and a model of one put on a body."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 from ssilk_core.authoring.bodies.carry import dressed_family
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, model_file, network, save_model
+from ssilk_core.network.model.bodies import SeenBody
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime.player import Player
 from ssilk_core.network.settings import ModelConfig
@@ -20,6 +22,8 @@ from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
 from ssilk_core.training.family_bank import build_family_bank
 from ssilk_core.training.motion_bank import build_bank
+from ssilk_core.training.settings import TrainConfig
+from ssilk_core.training.step import Stepper
 
 CPU = torch.device("cpu")
 CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
@@ -177,3 +181,18 @@ def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_
     for number in (3, 4, 3):
         DrawnBodies(bodies, [Seen()], 7, CPU).draw(number)
     assert torch.equal(seen[0], seen[2]) and not torch.equal(seen[0], seen[1])
+
+
+def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(model, family, scene):
+    """Steps that are timed, or a batch that is halved, leave the model on some body when its average is begun."""
+    model.wear(torch.tensor(family.bodies.members[1], dtype=torch.float32))
+    drawn = DrawnBodies(family.bodies, [model], 0, CPU)
+    sampler, objective = SimpleNamespace(first=torch.zeros(1)), SimpleNamespace(scale=1.0)
+    stepper = Stepper(model, objective, sampler, TrainConfig(), bodies=drawn)
+    rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32)
+    for found in (stepper.ema_model, model):
+        torch.testing.assert_close(found.decoder.rest, rest)
+        assert not any(module.place.any() for module in found.modules() if isinstance(module, SeenBody))
+    drawn.draw(1)
+    torch.testing.assert_close(stepper.ema_model.decoder.rest, rest)
+    assert not torch.allclose(model.decoder.rest, rest)
