@@ -68,7 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         shared.check_output(options.output, *options.models, options.index)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
-    results = evaluated(options, asked, open_model, report)
+    results = evaluated(options, asked, partial(open_model, options, report), report)
     if not options.json:
         print(tables([row for _, row in results.rows]))
     report(Result("evaluate", {"figures": results.figures} if options.json else {}))
@@ -99,12 +99,22 @@ Opener = Callable[[Path, "torch.device"], OpenedModel]
 """Opens a file on a device."""
 
 
-def open_model(path: Path, device: torch.device) -> OpenedModel:
-    """Open a model of 'ssilk train'; raise `SsilkError` as `checkpoint.load_model` does."""
+def open_model(options: argparse.Namespace, report: Reporter, path: Path, device: torch.device) -> OpenedModel:
+    """Open a model of 'ssilk train' for the body of the stage.
+
+    Raises:
+        SsilkError: the model cannot be read, or does not dress the character.
+    """
+    from ssilk_usd.opening.stage import open_stage
+
+    from ..delivery.bake import worn
     from ..network.checkpoint import load_model, network
     from ..quality.evaluation.methods import Network
 
-    file = load_model(path)
+    on = worn(load_model(path), open_stage(options.stage), options.root)
+    for event in on.told:
+        report(event)
+    file = on.file
     return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)))
 
 
@@ -167,10 +177,10 @@ def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device,
     """Put the garment of a model on the character of the stage."""
     from ssilk_usd.opening.stage import open_stage
 
-    from ..delivery.bake import on_character
+    from ..delivery.bake import worn
     from ..quality.evaluation.methods import EvaluationScene
 
-    scene = on_character(file, open_stage(options.stage), options.root)
+    scene = worn(file, open_stage(options.stage), options.root).scene
     return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact)
 
 

@@ -18,16 +18,26 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
 from . import options as shared
+
+if TYPE_CHECKING:
+    from ..network.checkpoint import ModelFile
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
     verb.add_argument("-o", "--output", type=Path, required=True, help="file to write (.onnx)")
+    verb.add_argument(
+        "--stage",
+        type=Path,
+        help="USD file with the body to export it for (default: the first of its family)",
+    )
+    verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -42,6 +52,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
     shared.check_output(output, options.model)
     file = load_model(options.model)
+    if options.stage:
+        file = _on_body(options, file, report)
     model = network(file)
     export_onnx(model, output)
     static, rates = descriptor_sizes(file.scene, file.joints, file.config)
@@ -65,3 +77,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     return EXIT_OK
+
+
+def _on_body(options: argparse.Namespace, file: ModelFile, report: Reporter) -> ModelFile:
+    """Return a model for the body of the stage, and tell what there is to say of that."""
+    from ssilk_usd.opening.stage import open_stage
+
+    from ..delivery.bake import worn
+
+    on = worn(file, open_stage(options.stage), options.root)
+    for event in on.told:
+        report(event)
+    return on.file

@@ -23,12 +23,15 @@ class Kind:
 
 MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
+CHARACTER = Kind("file", "a USD stage with a character is needed")
 KINDS = {
     "model": MODEL,
     "models": MODEL,
     "stepper_of": MODEL,
     "start_from": MODEL,
-    "stage": Kind("file", "a USD stage with a character is needed"),
+    "stage": CHARACTER,
+    "onto": CHARACTER,
+    "family": CHARACTER,
     "motion": MOTIONS,
     "motions": MOTIONS,
     "valid": MOTIONS,

@@ -3,7 +3,7 @@
 
 Every finding names the prim, the count, what was found, why it matters and what to do. --fix writes a copy of the
 garment's file with all safe repairs made, and reports what is left. The exit code is 2 when there are errors, and 0
-otherwise.
+otherwise. --family also says whether further characters are bodies of one family with the first, or what differs.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
 
+    from ..authoring.preflight.finding import Finding
     from ..authoring.preflight.inspection import PreflightInput
     from ..authoring.preflight.motion import MotionFile
     from ..authoring.preflight.units import FileUnits
@@ -41,6 +42,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="training to estimate memory and time for (default: draft on a CPU, else preview)",
     )
     verb.add_argument(
+        "--family", type=Path, nargs="+", default=[], metavar="STAGE",
+        help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
+    )  # fmt: skip
+    verb.add_argument(
         "--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)"
     )
 
@@ -54,7 +59,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.fix:
         repaired = _fix(options, inputs)
         inputs = _read_inputs(_moved(options, options.fix), silent)
-    findings = inspect(inputs)
+    findings = [*inspect(inputs), *_on_family(options, inputs, report)]
     if options.json:
         detail = {"fixed": {"output": str(options.fix), "repaired": repaired}} if options.fix else {}
         report(Result("inspect", {"findings": findings, **detail}))
@@ -81,6 +86,18 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
         preset=preset_named(options.preset or _default_preset()), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
     )  # fmt: skip
+
+
+def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
+    """Return what there is to say of the characters of --family beside this one."""
+    if not options.family:
+        return []
+    from ssilk_usd.reading.character import read_character
+
+    from ..authoring.bodies.differences import family_findings
+
+    others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
+    return list(family_findings([inputs.character, *others]))
 
 
 def _readable(paths: Sequence[Path], skeleton: Skeleton) -> tuple[list[Motion], dict[str, str]]:

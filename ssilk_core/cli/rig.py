@@ -3,7 +3,8 @@
 
 The proxies are joints at the end of the skeleton and can be edited by hand like any other joint. Weights, classes and
 proxies that the stage already has are kept. A garment that lies in the body is settled out of it first. Where a limb
-goes through it, it stays as it is, with a warning.
+goes through it, it stays as it is, with a warning. --onto puts it on another body of the same family instead, to see
+how it would lie there: the file written is that body's.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from ..events import Message, Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..scene.assets import Character, Garment
+    from ..scene.assets import Character, Garment, Scene
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -43,6 +44,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="proxies of each connected loose part that hang from the character itself (default %(default)s)",
     )  # fmt: skip
     verb.add_argument(
+        "--onto",
+        type=Path,
+        metavar="STAGE",
+        help="another body of the same skeleton and topology, to put the garment on",
+    )
+    verb.add_argument(
         "--keep-shape", action="store_true", help="leave the garment as it is, even where it lies inside the body"
     )
 
@@ -55,7 +62,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES
 
-    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0])
+    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], options.onto)
     report(Started("rig", options.proxies))
     character, garment, rig = shared.read(options, report)
     if garment.surface is not None:
@@ -70,7 +77,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report=report,
     )
     moved = settled.mesh.points - garment.mesh.points if settled else None
-    left_out = write_rigged_stage(options.stage, scene, options.output, moved=moved)
+    if options.onto:
+        scene, moved = _on_other(options, scene, report), None
+    left_out = write_rigged_stage(options.onto or options.stage, scene, options.output, moved=moved)
     if left_out:
         report(Message(f"{options.output}: {left_out}", "warning"))
     counts = np.bincount(scene.classes, minlength=3)
@@ -86,6 +95,35 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     return EXIT_OK
+
+
+def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Scene:
+    """Return the scene on the body of --onto, and say how far the garment moves.
+
+    Raises:
+        SsilkError: that body is none of the character's family.
+    """
+    import numpy as np
+    from ssilk_usd.reading.character import read_character
+
+    from ..authoring.bodies.carry import carry
+    from ..authoring.bodies.differences import need_family
+    from ..authoring.preflight.fit import describe_left, describe_move
+
+    path = scene.garment.mesh.path
+    other = read_character(options.onto, root=options.root, bodies=options.body, report=report)
+    family = need_family([scene.character, other])
+    carried = carry(scene, other)
+    moved = np.linalg.norm(carried.scene.garment.mesh.points - scene.garment.mesh.points, axis=1)
+    told = (
+        f"carried onto {family.names[1]}, by {1000 * moved.mean():.0f} mm on average and {1000 * moved.max():.0f} mm"
+    )
+    report(Message(f"{path}: {told} at most"))
+    if carried.settled.moved:
+        report(Message(f"{path}: settling it there {describe_move(carried.settled, 'moves')}"))
+    if left := describe_left(carried.settled, carried.unsettled, other):
+        report(Message(f"{path}: {left}", "warning"))
+    return carried.scene
 
 
 def settled_garment(character: Character, garment: Garment, report: Reporter) -> Garment | None:

@@ -92,14 +92,13 @@ def _subject(options: argparse.Namespace) -> StressSubject:
     from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
 
-    from ..delivery.bake import on_character
+    from ..delivery.bake import worn
     from ..network.checkpoint import load_model
     from ..quality.stress.subject import FULL, QUICK, StressSubject
 
-    file = load_model(options.model)
-    scene = on_character(file, open_stage(options.stage), options.root)
-    clip = read_motion(str(options.motion), scene.character.skeleton) if options.motion else None
-    return StressSubject(file, scene, clip, QUICK if options.quick else FULL)
+    on = worn(load_model(options.model), open_stage(options.stage), options.root)
+    clip = read_motion(str(options.motion), on.scene.character.skeleton) if options.motion else None
+    return StressSubject(on.file, on.scene, clip, QUICK if options.quick else FULL)
 
 
 def _kept(options: argparse.Namespace) -> KeptRows[CaseOutcome]:

@@ -118,12 +118,18 @@ class Bench:
     """
 
     def __init__(self, options: argparse.Namespace) -> None:
+        from ssilk_usd.opening.stage import open_stage
+
+        from ..delivery.bake import worn
         from ..devices import select_device
         from ..network.checkpoint import load_model
         from ..quality.evaluation.takes import takes_of, within
 
         self.options, self.device = options, select_device(options.device)
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
+        for path, file in self.files.items():
+            if file.bodies:
+                self.files[path] = worn(file, open_stage(options.stage), options.root).file
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]
         if len(set(names)) != len(names):
@@ -195,10 +201,10 @@ class Bench:
         """Put a garment on the character of the stage."""
         from ssilk_usd.opening.stage import open_stage
 
-        from ..delivery.bake import on_character
+        from ..delivery.bake import worn
         from ..quality.evaluation.methods import EvaluationScene
 
-        scene = on_character(file, open_stage(self.options.stage), self.options.root)
+        scene = worn(file, open_stage(self.options.stage), self.options.root).scene
         return EvaluationScene(scene, file.fabric, file.config.fps, self.device)
 
     def _weigh(self, path: Path) -> Weigh:

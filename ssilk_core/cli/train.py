@@ -15,6 +15,7 @@ import argparse
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
@@ -24,6 +25,10 @@ from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
 from . import options as shared
+
+if TYPE_CHECKING:
+    from ..scene.assets import Scene
+    from ..scene.family import DressedFamily
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -81,6 +86,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="a trained garment that is worn beneath this one, on the same character (repeatable): it plays along "
         "while this one learns to lie on it, and to be worn without",
     )
+    verb.add_argument(
+        "--family", type=Path, nargs="+", default=[], metavar="STAGE",
+        help="other bodies of the character's skeleton and topology, which the model is to dress as well: steps are "
+             "done on bodies drawn among these, and the garment's rest shape stays",
+    )  # fmt: skip
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
@@ -180,9 +190,12 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
     over = [InnerModel.load(path) for path in options.over]
+    family = _family(options, scene, report) if options.family else None
+    if family and train.collider_fraction:
+        report(Message("a family of bodies is trained without colliders: its models see none", "warning"))
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
-    files |= {*options.over}
+    files |= {*options.over, *options.family}
     return TrainJob(
         scene=scene,
         motions=motions,
@@ -198,7 +211,30 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         base=base,
         whole=options.start_from is not None,
         over=over,
+        family=family,
     )
+
+
+def _family(options: argparse.Namespace, scene: Scene, report: Reporter) -> DressedFamily:
+    """Return the scene's garment on the bodies of --family, and say what of it stays in one.
+
+    Raises:
+        SsilkError: a body is none of the character's family.
+    """
+    from ssilk_usd.reading.character import read_character
+
+    from ..authoring.bodies.carry import dressed_family
+    from ..authoring.bodies.differences import need_family
+    from ..authoring.preflight.fit import describe_left
+
+    others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
+    bodies = need_family([scene.character, *others], trained=True)
+    report(Message(f"the garment is carried onto {len(others)} more bodies, along {bodies.size} directions"))
+    dressed, carried = dressed_family(scene, bodies, others)
+    for one, other in zip(carried, others):
+        if left := describe_left(one.settled, one.unsettled, other):
+            report(Message(f"{other.path}: {left}", "warning"))
+    return dressed
 
 
 def _need_settings_of(base: ModelConfig, model: ModelConfig, train: TrainConfig, options: argparse.Namespace) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,8 +20,9 @@ import numpy as np
 from .. import __version__
 from ..errors import SsilkError, fail
 from ..files import is_usd, replacing
-from ..scene.assets import Character, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
+from ..scene.assets import Character, Floats, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from ..scene.fabrics import Fabric
+from .bodies import SeenBodies, parted
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
 from .settings import ModelConfig
@@ -35,6 +36,7 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
+    "family": (),
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
@@ -50,6 +52,7 @@ class ModelFile:
         joints: character joints in the descriptors, shape (J',).
         parameters: the network's tensors by name.
         provenance: seed, schedule, versions, hashes of the inputs and validation results.
+        bodies: the family of bodies that it dresses, whose base the scene's is; None for that body alone.
     """
 
     scene: Scene
@@ -58,6 +61,20 @@ class ModelFile:
     joints: np.ndarray
     parameters: dict[str, np.ndarray]
     provenance: dict[str, Any] = field(default_factory=dict)
+    bodies: SeenBodies | None = None
+
+    def on_body(self, coordinates: Floats, seen: Floats | None = None) -> ModelFile:
+        """Return the model for one body of its family, at coordinates (K,) (`network.bodies`).
+
+        Args:
+            seen: what the networks see as such (K,), where bodies so far off were not trained for.
+        """
+        if self.bodies is None or not np.any(coordinates):
+            return replace(self, bodies=None)
+        scene = self.bodies.family.scene_at(self.scene, coordinates)
+        biases = self.bodies.biases(self.parameters, coordinates if seen is None else seen)
+        parameters = {**self.parameters, **biases}
+        return replace(self, scene=scene, parameters=parameters, bodies=None)
 
 
 def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
@@ -96,7 +113,9 @@ def _tensors(model: ModelFile) -> dict[str, Any]:
         "scene.rig.weights": rig.skin.weights,
         "joints": model.joints,
         **({} if mesh.uvs is None else {"scene.mesh.uvs": mesh.uvs}),
+        **({} if (sewn := scene.garment.sewn) is None else {"scene.mesh.sewn": sewn}),
         **{f"model.{name}": value for name, value in model.parameters.items()},
+        **({} if model.bodies is None else model.bodies.stored().tensors()),
     }
 
 
@@ -114,6 +133,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
+        **({} if model.bodies is None else {"family": model.bodies.family.bodies.names}),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
 
@@ -194,7 +214,8 @@ def _need_header(document: dict[str, Any]) -> None:
     _need_types(document, HEADER)
     _need_types(document["config"], vars(ModelConfig()))
     _need_types(document["fabric"], vars(Fabric("")))
-    for words in (document["joint_names"], document["proxy_names"], document["paths"].values()):
+    members = document.get("family", [])
+    for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
@@ -226,13 +247,18 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
             f"joints must lie in 0 to {skeleton.joint_count - 1}",
             "train again",
         )
+    parameters, bodies = _parameters(tensors, scene.garment.mesh.path), None
+    if "family" in document:
+        bodies = SeenBodies.of(tensors, tuple(document["family"]))
+        bodies.need_fit(skeleton, scene.garment.mesh.vertex_count, scene.rig.proxy_count, parameters)
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
         Fabric(**document["fabric"]),
         joints.astype(np.int64),
-        _parameters(tensors, scene.garment.mesh.path),
+        parameters,
         document["provenance"],
+        bodies,
     )
 
 
@@ -271,7 +297,8 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
     if colour is not None:
         red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
         colour = red, green, blue
-    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour)
+    sewn = tensors.get("scene.mesh.sewn")
+    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour, sewn=sewn)
     return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
 
 
@@ -306,8 +333,12 @@ def _need_fit(model: ModelFile, expected: Shapes) -> None:
 
 def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
     """Return a network as the contents of a model file."""
-    parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
-    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance)
+    values = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    if model.family is None:
+        return ModelFile(model.scene, model.config, fabric, model.joints, values, provenance)
+    parameters, columns = parted(values)
+    seen = SeenBodies(model.family, columns)
+    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance, seen)
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:

@@ -53,7 +53,7 @@ def spread_vertices(scene: Scene, count: int) -> Ints:
     machine, so that each finds the same vertices.
     """
     free = np.flatnonzero(scene.classes != PINNED)
-    return free[spread_rows(scene.garment.mesh.points[free], count)]
+    return free[spread_rows(scene.garment.sewn_mesh.points[free], count)]
 
 
 def spread_rows(points: Floats, count: int) -> Ints:

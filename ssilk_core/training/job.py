@@ -16,6 +16,7 @@ from ..network.checkpoint import ModelFile
 from ..network.settings import PROXIMITY_POINTS, ModelConfig
 from ..scene.assets import LOOSE, PINNED, Motion, Scene
 from ..scene.fabrics import Fabric
+from ..scene.family import DressedFamily
 from ..scene.mesh.stitches import find_stitches
 from .inner_garments import InnerModel, need_wearable
 from .perturb import perturb_motions
@@ -48,6 +49,7 @@ class TrainJob:
         whole: whether all networks of `base` learn, with its settings. Otherwise its initialiser and decoder stay as
             they are while a new stepper learns.
         over: trained garments that are worn beneath this one, in some of the windows.
+        family: bodies to train for, the scene's as the base; None for that one alone.
     """
 
     scene: Scene
@@ -64,8 +66,14 @@ class TrainJob:
     base: ModelFile | None = None
     whole: bool = False
     over: Sequence[InnerModel] = ()
+    family: DressedFamily | None = None
 
     def __post_init__(self) -> None:
+        if self.family:
+            self._need_family()
+        if self.base and self.base.bodies:
+            found = "training that goes on from a model of a family of bodies"
+            fail(self.scene.garment.mesh.path, found, "models of one body train on", "train for the family anew")
         need_wearable(self.over, self.scene, self.model.fps)
         if self.base:
             _need_same_scene(self.base, self.scene)
@@ -108,6 +116,18 @@ class TrainJob:
                 perturbations=0,
             )
             object.__setattr__(self, "train", least)
+
+    def _need_family(self) -> None:
+        """Raise `SsilkError` where a family is asked for with what knows one body; it sees no colliders."""
+        for found, there in (
+            ("training that goes on from a model", self.base is not None),
+            ("garments beneath", bool(self.over)),
+            (f"descriptors '{self.model.descriptors}'", self.model.descriptors != "relative"),
+        ):
+            if there:
+                fail(self.scene.garment.mesh.path, f"{found} and a family of bodies", "one of both", "leave one out")
+        object.__setattr__(self, "train", replace(self.train, collider_fraction=0))
+        object.__setattr__(self, "model", replace(self.model, proximity_points=0))
 
     @property
     def stepper_alone(self) -> bool:
@@ -155,6 +175,7 @@ class TrainJob:
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
+                **({"family": self.family.bodies.members.tolist()} if self.family else {}),
             }
         )
 

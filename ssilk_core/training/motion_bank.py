@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -53,13 +53,25 @@ class MotionBank:
     def joint_count(self) -> int:
         return self.matrices.shape[1] // 12
 
+    def matrices_at(self, frames: Tensor) -> Tensor:
+        """Return skinning matrices (..., J * 12) of frame indices (...,)."""
+        return self.matrices[frames]
+
+    def root_at(self, frames: Tensor | slice) -> Tensor:
+        """Return the hub's positions (N, 3) in frames (N,) [m]."""
+        return self.root[frames]
+
+    def dynamic_at(self, frames: Tensor) -> Tensor:
+        """Return what `dynamic` has of frames (N,), shape (N, D)."""
+        return self.dynamic[frames]
+
     def character(self, frames: Tensor) -> Tensor:
         """Return skinning matrices (J, 3, 4, N) of frame indices (N,)."""
-        return self.matrices[frames].T.reshape(-1, 3, 4, len(frames))
+        return self.matrices_at(frames).T.reshape(-1, 3, 4, len(frames))
 
     def body(self, frames: Tensor) -> BodyFrames:
         """Return the character in frames (F, N) of N clips, F consecutive ones of each, about each clip's origin."""
-        matrices = self.matrices[frames].reshape(*frames.shape, -1, 3, 4).permute(0, 2, 3, 4, 1)
+        matrices = self.matrices_at(frames).reshape(*frames.shape, -1, 3, 4).permute(0, 2, 3, 4, 1)
         return BodyFrames(matrices, matrices.new_zeros(len(frames), 3, frames.shape[1]))
 
     def triples(self, frames: Tensor) -> BodyFrames:
@@ -80,7 +92,7 @@ class MotionBank:
         Args:
             heading: of absolute ones, where a motion is turned (`turned_vectors`); as it is without.
         """
-        dynamic = self.dynamic[frames]
+        dynamic = self.dynamic_at(frames)
         if heading is not None:
             dynamic = turned_vectors(dynamic, gravity, heading)
         earlier = gravity_features(self.earlier[frames], seen_gravity(gravity))
@@ -102,31 +114,46 @@ def build_bank(
     Raises:
         SsilkError: there is no motion.
     """
+    spans = needed_spans(motions, skeleton, fps, max_joint_speed)
+    return MotionBank(
+        **bank_tensors((arrays_of(resample(span, fps), skeleton, joints, kind) for span in spans), device)
+    )
+
+
+def needed_spans(
+    motions: Sequence[Motion], skeleton: Skeleton, fps: float, max_joint_speed: float = np.inf
+) -> list[Motion]:
+    """Return the result of `usable_spans`; raise `SsilkError` where there is none."""
     if not motions:
         fail("motions", "none given", "at least one is needed", "name motion files with --motions")
     spans = usable_spans(motions, skeleton, fps, max_joint_speed)
     if not spans:
         fail(motions[0].path, "every motion is shorter than four frames", "longer ones are needed")
-    # In single precision clip by clip: a large bank in double precision does not fit a host.
-    parts = [_arrays(resample(span, fps), skeleton, joints, kind) for span in spans]
+    return spans
+
+
+def bank_tensors(clips: Iterable[dict[str, np.ndarray]], device: torch.device) -> dict[str, Tensor]:
+    """Return what a bank has, from what each of its clips has in single precision, by name."""
+    # Clip by clip: a large bank in double precision does not fit a host.
+    parts = list(clips)
     ends = np.cumsum([len(part["root"]) for part in parts])
     starts = np.concatenate([[0], ends[:-1]])
 
     def joined(name: str) -> Tensor:
         return torch.as_tensor(np.concatenate([part.pop(name) for part in parts]), device=device)
 
-    return MotionBank(
-        **{name: joined(name) for name in [*parts[0]]},
-        starts=torch.as_tensor(starts, device=device),
-        stops=torch.as_tensor(ends, device=device),
-    )
+    found = {name: joined(name) for name in [*parts[0]]}
+    return {
+        **found,
+        "starts": torch.as_tensor(starts, device=device),
+        "stops": torch.as_tensor(ends, device=device),
+    }
 
 
-def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
+def arrays_of(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> dict[str, np.ndarray]:
     """Return what a `MotionBank` has of the frames of one clip, by name, in single precision."""
-    features, matrices = pose_features(clip, skeleton, joints, kind=kind), centred_matrices(clip, skeleton)[0]
-    hub = matrices[:, skeleton.hub]
-    root = hub[:, :3, :3] @ skeleton.bind_transforms[skeleton.hub, :3, 3] + hub[:, :3, 3]
+    features = pose_features(clip, skeleton, joints, kind=kind)
+    matrices, root = skinned(clip, skeleton)
     values = {
         "matrices": matrices[:, :, :3].reshape(len(matrices), -1),
         "root": root,
@@ -136,6 +163,13 @@ def _arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, kind: str) -> 
         "earlier": features.earlier,
     }
     return {name: value.astype(np.float32) for name, value in values.items()}
+
+
+def skinned(clip: Motion, skeleton: Skeleton) -> tuple[np.ndarray, np.ndarray]:
+    """Return skinning matrices (F, J, 4, 4) about where the root starts, and the hub's positions (F, 3) [m]."""
+    matrices = centred_matrices(clip, skeleton)[0]
+    hub = matrices[:, skeleton.hub]
+    return matrices, hub[:, :3, :3] @ skeleton.bind_transforms[skeleton.hub, :3, 3] + hub[:, :3, 3]
 
 
 def usable_spans(

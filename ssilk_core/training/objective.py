@@ -84,6 +84,11 @@ class Objective:
         self.newton = NewtonDistance(model.scene, energy, self.dt, newton_weight) if newton_weight else None
         self.scale = GRAVITY * float(energy.mass.sum()) * model.scene.garment.mesh.diagonal
 
+    def wear(self, place: Tensor) -> None:
+        """Hold tight cloth where it lies on the body of the model's family at coordinates (K,)."""
+        if self.skin:
+            self.tethered_rest.copy_(self.model.worn.at(place)[0][self.energy.tethered])
+
     def quasi_static_terms(
         self,
         x: Tensor,
@@ -239,7 +244,7 @@ class Objective:
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
-        root = bank.root[times].T
+        root = bank.root_at(times).T
         dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
             x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
         )

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -20,7 +22,11 @@ from ..physics.energy import GarmentEnergy
 from ..physics.intersections.cloth import ClothIntersections
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
+from ..scene.assets import Floats, Ints, Motion
+from ..scene.family import motion_on
 from ..scene.kinematics import MAX_JOINT_SPEED
+from .bodies import DrawnBodies, FamilyBody, Wearer
+from .family_bank import FamilyBank, build_family_bank
 from .inner_garments import InnerGarments
 from .job import TrainJob
 from .memory import searches_contours
@@ -46,6 +52,7 @@ class TrainingParts:
         bank: the motions to train on.
         body: the part of the body that the garment can touch, with `reached` vertices; None for nothing.
         inner: garments beneath; None where there are none that the garment can touch.
+        shape: gives `body` the shape of any body of a family; None for one body.
     """
 
     model: GarmentModel
@@ -58,6 +65,7 @@ class TrainingParts:
     group: ProcessGroup = SINGLE_PROCESS
     smoothing: ShapeSmoothing | None = None
     inner: InnerGarments | None = None
+    shape: FamilyBody | None = None
 
     @cached_property
     def buried(self) -> Tensor | None:
@@ -101,7 +109,12 @@ class TrainingParts:
         if self.inner:
             self.inner.attach(sampler)
         average = group.average if group.size > 1 else None
-        return Stepper(self.model, objective, sampler, own, average, self.smoothing)
+        bodies = None
+        if family := self.model.family:
+            assert isinstance(self.bank, FamilyBank)
+            wearers: list[Wearer] = [self.model, self.bank, objective, *([self.shape] if self.shape else [])]
+            bodies = DrawnBodies(family.bodies, wearers, seed, self.device)
+        return Stepper(self.model, objective, sampler, own, average, self.smoothing, bodies)
 
 
 def build_parts(
@@ -120,10 +133,10 @@ def build_parts(
         report(Message("{} recombined and {} perturbed motions are added for each, as many as fit".format(*extra)))
     every = [*motions, *job.held_out]
     report(Message(f"the body is posed in {format_count(len(every), 'motions')}, to find what the garment can touch"))
-    reach = reachable_body(scene, every)
-    joints = job.base.joints if job.base else model_joints(scene, reach.joints)
+    vertices, moving = _reachable(job, every)
+    joints = job.base.joints if job.base else model_joints(scene, moving)
     report(Message(f"the network and its inputs are built on {device}"))
-    model = GarmentModel(scene, job.model, joints, job.train.seed)
+    model = GarmentModel(scene, job.model, joints, job.train.seed, job.family)
     if job.base and job.whole:
         known = seeing_more(job.base.parameters, scene, job.base.config, job.model)
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
@@ -133,15 +146,22 @@ def build_parts(
         report(Message(f"the stepper {start}"))
     model = model.to(device)
     kind = job.model.descriptors
-    bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
+    bodies = job.family.bodies if job.family else None
+    if bodies:
+        bank: MotionBank = build_family_bank(
+            motions, skeleton, joints, fps, device, bodies, max_joint_speed=MAX_JOINT_SPEED
+        )
+    else:
+        bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
     held = build_bank(job.held_out, skeleton, joints, fps, device, kind=kind)
-    energy = GarmentEnergy(scene.garment.mesh, job.fabric, scene.classes, device=device)
+    energy = GarmentEnergy(scene.garment.sewn_mesh, job.fabric, scene.classes, device=device)
     body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None
-    if len(reach.vertices):
-        touched = CollisionBody(body, skeleton.joint_count, vertices=reach.vertices, limbs=limbs, device=device)
+    if len(vertices):
+        touched = CollisionBody(body, skeleton.joint_count, vertices=vertices, limbs=limbs, device=device)
+    shape = FamilyBody(touched, scene, bodies) if touched and bodies else None
     # Validation uses the whole body, to detect collisions with parts that training leaves out.
     whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
-    rest, frames = model.decoder.rest, job.train.valid_frames
+    rest, frames = model.decoder.rest.clone(), job.train.valid_frames  # the base's, whichever body steps are done on
     spans = usable_spans(job.held_out, skeleton, fps)
     contours = None
     if searches_contours(scene, job.train):
@@ -158,8 +178,24 @@ def build_parts(
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
-    reached = len(reach.vertices)
-    return TrainingParts(model, bank, energy, touched, validator, reached, device, group, smoothing, inner)
+    reached = len(vertices)
+    return TrainingParts(model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape)
+
+
+def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
+    """Return the vertices of the body that the garment can touch on some member, and flags of what moves these."""
+    reach = reachable_body(job.scene, motions)
+    vertices, joints = reach.vertices, reach.joints
+    if not job.family:
+        return vertices, joints
+    bodies, base = job.family.bodies, job.scene.character.skeleton
+    for coordinates in bodies.members[1:]:
+        other = job.family.scene_at(job.scene, coordinates)
+        skeleton = other.character.skeleton
+        ratio = 1 + float(bodies.taller @ coordinates)
+        reach = reachable_body(other, [motion_on(motion, base, skeleton, ratio) for motion in motions])
+        vertices, joints = np.union1d(vertices, reach.vertices), np.logical_or(joints, reach.joints)
+    return vertices, joints
 
 
 def _take_over(model: GarmentModel, base: ModelFile) -> bool:

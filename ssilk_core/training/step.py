@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ..network.model.network import GarmentModel
 from ..physics import loops
+from .bodies import DrawnBodies
 from .memory import decoded_frames
 from .muon import Muon
 from .objective import Objective, total
@@ -61,6 +62,7 @@ class Stepper:
     Args:
         average_gradients: called with the gradients before they are used, to average them over processes.
         smoothing: of the blendshapes' steps.
+        bodies: of a family, one of which each step is done on; that of the scene by default.
 
     Attributes:
         terms: energies of the last step [J], updated in place so that reading them needs no new launch.
@@ -76,11 +78,15 @@ class Stepper:
         config: TrainConfig,
         average_gradients: GradientAverage | None = None,
         smoothing: ShapeSmoothing | None = None,
+        bodies: DrawnBodies | None = None,
     ) -> None:
+        self.bodies = bodies
         self.model, self.objective, self.sampler, self.config = model, objective, sampler, config
         self.average_gradients, self.smoothing = average_gradients, smoothing
         self.device = sampler.first.device
         self.optimisers = _optimisers(model, config, self.device)
+        if bodies:
+            bodies.take_off()  # the average is validated on the base
         self.ema_model = copy.deepcopy(model).requires_grad_(False)
         self.terms: dict[str, Tensor] = {}
         self.skipped = SkippedSteps(self.device)
@@ -170,6 +176,8 @@ class Stepper:
                 group["lr"].fill_(rate * group["scale"])
             else:
                 group["lr"] = rate * group["scale"]
+        if self.bodies:
+            self.bodies.draw(iteration)
         name = "static" if iteration < self.config.static_iterations else "dynamic"
         body = self.static_step if name == "static" else self.dynamic_step
         if self.device.type == "cuda":
@@ -232,7 +240,8 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
         elif name == "decoder.shapes":
             parts["shapes"].append(value)
         else:
-            parts["matrices" if value.ndim == 2 else "biases"].append(value)
+            # What a network sees of bodies adds to biases, and is learned as these are.
+            parts["matrices" if value.ndim == 2 and not name.endswith(".columns") else "biases"].append(value)
     on_gpu = device.type == "cuda"
 
     def group(name: str) -> dict[str, Any]:

@@ -252,8 +252,8 @@ class Validator:
             path = [
                 model.vertices(latents[at], self.bank.character(clip.start + at)) for at in (frames - 2, frames - 1)
             ]
-            character, root = self.bank.character(clip.start + frames), self.bank.root[clip.start + frames]
-            shift = (root - self.bank.root[clip.start + frames - 1]).T
+            character, root = self.bank.character(clip.start + frames), self.bank.root_at(clip.start + frames)
+            shift = (root - self.bank.root_at(clip.start + frames - 1)).T
             path.append(model.vertices(latents[frames], character))
             body, lbs = self.body.pose(character, exact=True), self.lbs_vertices(character)
             parts.append([values.cpu() for values in self._newton.measure(path, lbs, body, shift)])

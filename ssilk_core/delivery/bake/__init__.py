@@ -9,7 +9,7 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 `VerificationError`. This package and the command line are the only ones that join the core and USD.
 """
 
-from .character import on_character
+from .bodies import WornModel, worn
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
@@ -24,7 +24,7 @@ from .write import bake
 
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
-    "LoadedGarment", "RefinementSummary", "Verification", "bake", "bake_layers", "cache_origin", "load_garment",
-    "load_rollout", "motion_at", "on_character", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
-    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model",
+    "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "cache_origin",
+    "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
+    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model", "worn",
 ]  # fmt: skip

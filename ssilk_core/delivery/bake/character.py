@@ -1,45 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A trained garment on the character of a stage."""
+"""The skeleton that a garment was trained on, in the order in which a stage has its joints."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import fail
-from ...network.checkpoint import ModelFile
-from ...scene.assets import Character, Ints, Scene, Skeleton, SkinWeights
-
-if TYPE_CHECKING:
-    from pxr import Usd
+from ...scene.assets import Character, Ints, Skeleton, SkinWeights
+from ...scene.family import with_joints
 
 BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 ALLOWED, TODO = "a model bakes on the character it was trained with", "train on this character"
 
 
-def on_character(file: ModelFile, stage: Usd.Stage, root: str | None) -> Scene:
-    """Return a model's scene with the character of a stage; a model file keeps only the body near the garment.
-
-    Raises:
-        SsilkError: the stage's character is not the one that the model was trained with.
-    """
-    from ssilk_usd.reading.character import read_character
-
-    character = read_character(stage, root=root, garment=None)
-    return replace(file.scene, character=in_order_of(file.scene.character.skeleton, character))
-
-
-def in_order_of(trained: Skeleton, character: Character) -> Character:
+def in_order_of(trained: Skeleton, character: Character, *, moved: bool = False) -> Character:
     """Return a character with the skeleton of a model, whose joints are its own in another order perhaps.
 
     Programs list joints in the order that they like: UsdSkel only wants parents before their children.
+
+    Args:
+        moved: whether joints may be bound elsewhere, at the same rotations, and stay there.
 
     Raises:
         SsilkError: the character has other joints, or other bind transforms.
     """
     order = _places(character.skeleton, trained)
+    if moved:
+        trained = with_joints(trained, character.skeleton.bind_transforms[order, :3, 3])
     _need_same_binds(character.skeleton, trained, order)
     joints = np.argsort(order)  # of the model, for each joint of the character
     bodies, stand_ins = (

@@ -23,7 +23,7 @@ from .latents import solved
 from .layered import tell_layers, tell_other_layers
 from .levels import need_levels
 from .load import LoadedGarment, load_garment
-from .names_used import GarmentUse, UsedNames, need_distinct_case, says, write_use
+from .names_used import GarmentUse, UsedNames, need_distinct_case, need_same_body, says, write_use
 from .origin import shot_metadata
 from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
 from .refinement import refined
@@ -192,7 +192,8 @@ class LayerFolder:
         rollout.tell(report)
         check_influences(rollout.influences, request.target, request.model)
         key, inputs = task_key(task, rollout.inputs), inputs_of(request, rollout.inputs, self.path)
-        use = GarmentUse.of(task, inputs["model"], self.path)
+        use = GarmentUse.of(task, inputs["model"], self.path, garment.body)
+        need_same_body(self.path, task, use)
         write_use(self.path, task.garment, use.untold(self.path, task.garment))  # no asset is without it
         asset = self._asset(task, garment, use, report)
         write_use(self.path, task.garment, use)  # the asset says so now

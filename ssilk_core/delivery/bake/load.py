@@ -16,11 +16,11 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion, Scene
+from ...scene.assets import Deformer, Floats, Motion
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
-from .character import on_character
+from .bodies import WornModel, worn
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
@@ -68,7 +68,8 @@ class LoadedGarment:
         record: how the model was made, as its mesh stores it.
         info: of the garment as an asset.
         riders: what rides on it.
-        told: what was found about riders, to be reported.
+        told: what was found about the body and riders, to be reported.
+        body: where in the model's family it is (`bodies.WornModel.body`).
     """
 
     request: BakeRequest
@@ -84,6 +85,7 @@ class LoadedGarment:
     info: AssetInfo
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
+    body: str | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -213,9 +215,10 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
 
     device = select_device(request.device)
     file, model_held = read_unchanged(partial(model_contents, request.model), partial(load_model, request.model))
-    (scene, units, riders, told), stage_held = read_unchanged(
+    (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
+    file, scene = on.file, on.scene
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -236,21 +239,22 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         info=_info(request, model_held.digest),
         riders=riders,
         told=told,
+        body=on.body,
     )
 
 
 def _on_stage(
     file: ModelFile, request: BakeRequest
-) -> tuple[Scene, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
-    """Return a model's scene with the character of a stage, the units of what is written, what rides on it, and what
-    there is to report of that."""
+) -> tuple[WornModel, StageUnits, tuple[Rider, ...], tuple[Event, ...]]:
+    """Return a model on the character of a stage, the units of what is written, what rides on it, and what there is
+    to report."""
     from ssilk_usd.opening.stage import open_stage
 
     stage = open_stage(request.stage)
-    scene = on_character(file, stage, request.root)
-    told: list[Event] = []
-    riders = riders_of(stage, scene.garment.mesh, request.root, lambda event: told.append(event))
-    return scene, _units(stage, request.receiver), riders, tuple(told)
+    on = worn(file, stage, request.root)
+    told: list[Event] = [*on.told]
+    riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event))
+    return on, _units(stage, request.receiver), riders, tuple(told)
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

@@ -30,21 +30,23 @@ class GarmentUse:
         model: of the garment.
         root: the SkelRoot, where one was named.
         asset_version, asset_identifier: of the asset, where they were given.
+        body: that it lies on, by its place in the model's family; None for the body that the model is of.
     """
 
     model: RecordedInput
     root: str | None
     asset_version: str | None = None
     asset_identifier: str | None = None
+    body: str | None = None
 
     @classmethod
-    def of(cls, task: BakeTask, model: RecordedInput, folder: Path) -> GarmentUse:
+    def of(cls, task: BakeTask, model: RecordedInput, folder: Path, body: str | None = None) -> GarmentUse:
         """Return what a task uses its garment's name for in a folder: what it does not say of the asset stays, as
         long as the model is the same."""
         before = _stated(_place(folder, task.garment))
         same = before is not None and before.model.sha256 == model.sha256
         told = {name: getattr(task, name) or (getattr(before, name) if same else None) for name in OF_ASSET}
-        return cls(model, task.request.root, **told)
+        return cls(model, task.request.root, **told, body=body)
 
     def untold(self, folder: Path, garment: str) -> GarmentUse:
         """Return this with what the asset of a garment says of itself until it is written."""
@@ -66,7 +68,8 @@ def write_use(folder: Path, garment: str, use: GarmentUse) -> None:
     if _stated(_place(folder, garment)) == use:
         return
     with replacing(_place(folder, garment)) as temporary:
-        temporary.write_text(json.dumps(asdict(use), indent=1, sort_keys=True) + "\n", encoding="utf-8")
+        told = {name: value for name, value in asdict(use).items() if name != "body" or value is not None}
+        temporary.write_text(json.dumps(told, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
 def read_use(folder: Path, garment: str) -> GarmentUse | None:
@@ -85,6 +88,18 @@ def read_use(folder: Path, garment: str) -> GarmentUse | None:
             "name this garment with --garment-name, or use the name all the same with --replace",
         )
     return found
+
+
+def need_same_body(folder: Path, task: BakeTask, use: GarmentUse) -> None:
+    """Raise `SsilkError` where the name's asset lies on another body of its model's family: shots share it."""
+    before = _stated(_place(folder, task.garment))
+    if before and not task.replace and before.model.sha256 == use.model.sha256 and before.body != use.body:
+        fail(
+            str(folder),
+            f"the garment '{task.garment}' was baked on another body of its model's family",
+            "the shots of a name share one asset, which lies on one body",
+            "name it otherwise for each body with --garment-name, or use the name all the same with --replace",
+        )
 
 
 def says(folder: Path, task: BakeTask) -> bool:

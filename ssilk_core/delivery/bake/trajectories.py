@@ -18,7 +18,7 @@ from ...scene.assets import Deformer, Floats, Motion, Scene, Skeleton
 from ...scene.kinematics import held_at_cuts, sample_motion
 from ...scene.riders import Rider, RiderJoints
 from ..targets import GLB
-from .character import on_character
+from .bodies import worn
 from .counted import state_counts
 from .glb import warn_of_sets, write_glb_shot
 from .nearness import need_near
@@ -51,8 +51,8 @@ def trained_deformer(model: str | os.PathLike[str], stage: str | os.PathLike[str
 
     from ...network.checkpoint import load_model, network
 
-    file = load_model(os.fspath(model))
-    deformer = network(file, on_character(file, open_stage(os.fspath(stage)), root)).deformer()
+    on = worn(load_model(os.fspath(model)), open_stage(os.fspath(stage)), root)
+    deformer = network(on.file, on.scene).deformer()
     return replace(deformer, shapes=deformer.shapes[:0])
 
 

@@ -78,7 +78,7 @@ class Decoder(nn.Module):
         rig, shapes = scene.rig, config.shapes
         self.proxy_count, self.shape_count, self.activation_count = rig.proxy_count, shapes, config.activation_count
         self.proxy_outputs, self.is_reduced, self.tanh = config.proxy_outputs, config.activations > 0, config.tanh
-        self.reach = scene.garment.mesh.diagonal  # several times what trained models use
+        self.reach = scene.garment.sewn_mesh.diagonal  # several times what trained models use
         self.parent_indices = tuple(rig.parents.tolist())  # as Python numbers, without a copy from the GPU
         self.skin = Skinning(rig.skin, range(scene.character.skeleton.joint_count, len(scene.joint_names)))
         free = np.flatnonzero(scene.classes != PINNED)

@@ -11,11 +11,13 @@ from torch import Tensor, nn
 
 from ...errors import fail
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Scene, SkinWeights
+from ...scene.family import DressedFamily
 from ...scene.kinematics import ProxyAxes
 from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
 from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
+from .bodies import SeenBody, WornCloth, see_bodies
 from .decoder import Decoder
 from .feedback import BodyFrames, DecodedPoints, DecodedState, Feedback
 from .integrators import integrator
@@ -47,9 +49,17 @@ class GarmentModel(nn.Module):
         config: sizes of the network.
         joints: character joints in the descriptors (`descriptors.descriptor_joints`).
         seed: of the initial parameters.
+        family: bodies that it is trained for, of which it sees the one that it is on; the scene's alone by default.
     """
 
-    def __init__(self, scene: Scene, config: ModelConfig, joints: np.ndarray, seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        config: ModelConfig,
+        joints: np.ndarray,
+        seed: int = 0,
+        family: DressedFamily | None = None,
+    ) -> None:
         super().__init__()
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
         self.axes = ProxyAxes.of(scene)
@@ -69,6 +79,20 @@ class GarmentModel(nn.Module):
         )
         # Small: training starts as linear blend skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
+        self.family = family
+        if family:
+            self.worn = WornCloth(family, self.decoder.rest, self.decoder.pivots)
+            see_bodies(self, family)
+
+    @torch.no_grad()
+    def wear(self, place: Tensor) -> None:
+        """Put the garment on the body of its family at coordinates (K,), in place; the base's are zero."""
+        for module in self.modules():
+            if isinstance(module, SeenBody):
+                module.place.copy_(place)
+        rest, pivots = self.worn.at(place)
+        self.decoder.rest.copy_(rest)
+        self.decoder.pivots.copy_(pivots)
 
     def initial(self, static: Tensor) -> Tensor:
         """Return quasi-static latents (N, latent) from static descriptors (Eq. 1)."""

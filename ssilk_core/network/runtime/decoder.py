@@ -31,7 +31,7 @@ class NumpyDecoder:
         self.tanh, self.range = config.tanh, config.activation_range
         self.readout = parameters.get("decoder.readout")
         self.axes, self.moves, size = ProxyAxes.of(scene), config.translations, config.proxy_outputs
-        self.reach = np.float32(scene.garment.mesh.diagonal)
+        self.reach = np.float32(scene.garment.sewn_mesh.diagonal)
         self.identity, self.scale = IDENTITY[:size, None], OUTPUT_SCALE[:size, None]
 
     def decode(self, z: NDArray) -> tuple[NDArray, NDArray]:

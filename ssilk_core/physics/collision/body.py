@@ -58,6 +58,11 @@ class CollisionBody:
         self.points = tensor(body.mesh.points[chosen])[:, :, None]
         self.normals = tensor(normals)[:, :, None]
 
+    def reshape(self, points: Tensor, normals: Tensor) -> None:
+        """Take other points and unit normals in the bind pose, (V, 3), in place."""
+        self.points.copy_(points[:, :, None])
+        self.normals.copy_(normals[:, :, None])
+
     @torch.no_grad()
     def pose(
         self,

@@ -182,6 +182,17 @@ class LimbPoser:
             self._rest, self._skin = tensor(part.mesh.points), Skinning(part.skin).to(device)
             self._at_rest = inside(self._ends[1, self._last], self._rest[..., None], self._faces)
 
+    @property
+    def paths(self) -> Tensor:
+        """Bones of each limb, as `LimbAxes.paths`."""
+        return self._paths
+
+    def reshape(self, ends: Tensor, radii: Tensor, beyond: Tensor) -> None:
+        """Take other ends (M, 2, 3), radii (M,) and lengths (L, K) [m], in place; what is buried stays as it was."""
+        self._ends.copy_(ends.transpose(0, 1)[..., None])
+        self._radii.copy_(radii)
+        self._beyond.copy_(beyond)
+
     def pose(self, character: Tensor, buried: Tensor | None = None) -> PosedLimbs:
         """Pose the axes with skinning matrices (J, 3, 4, N).
 

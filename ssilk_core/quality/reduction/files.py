@@ -48,7 +48,8 @@ def with_weights(file: ModelFile, weights: Floats, gone: list[int]) -> ModelFile
         **_last_layer(file, stays[character:] - character),
         "decoder.skin_offset": np.zeros((free, skin.indices.shape[1]), dtype=np.float32),
     }
-    return replace(file, scene=Scene(scene.character, scene.garment, rig), parameters=parameters)
+    bodies = file.bodies and file.bodies.with_proxies(stays[character:] - character)
+    return replace(file, scene=Scene(scene.character, scene.garment, rig), parameters=parameters, bodies=bodies)
 
 
 def _rig(scene: Scene, proxies: np.ndarray, skin: SkinWeights) -> ProxyRig:

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import fail
-from .arrays import Floats, Ints, assign, frozen
+from .arrays import Floats, Ints, assign, frozen, need_finite
 from .mesh import Mesh
 from .skin import SkinWeights
 from .surface import SurfaceMaterial
@@ -34,13 +34,15 @@ class Garment:
     """A garment mesh fitted to the character's bind pose.
 
     Attributes:
-        mesh: the garment at rest, which is also the rest shape of the energies.
+        mesh: the garment at rest, which is also the rest shape of the energies but where `sewn` is another.
         skin: weights over the character's joints for linear blend skinning, or None if not authored.
         classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None if not authored.
         pins: 1 for each vertex that is to be pinned when classes are found, 0 for others, shape (V,), or None.
         levels: the least tightness at which each vertex is tight, as `classes_at` takes it, shape (V,), or None.
         surface: the physics material that its stage states, or None.
         colour: (red, green, blue) of linear light to show it in, each from 0 to 1, or None if not authored.
+        sewn: its points on the body that it was made for, where it lies on another [m], shape (V, 3), or None. They
+            are the rest shape of the energies, and those by which networks choose vertices to look at.
     """
 
     mesh: Mesh
@@ -50,6 +52,7 @@ class Garment:
     levels: Floats | None = None
     surface: SurfaceMaterial | None = None
     colour: tuple[float, float, float] | None = None
+    sewn: Floats | None = None
 
     def __post_init__(self) -> None:
         count = self.mesh.vertex_count
@@ -65,6 +68,11 @@ class Garment:
                 assign(self, **{name: frozen(values, kind)})
                 if getattr(self, name).shape != (count,):
                     fail(self.mesh.path, f"{len(values)} {name} for {count} points", "one for each point is needed")
+        if self.sewn is not None:
+            assign(self, sewn=frozen(self.sewn, np.float64))
+            need_finite(self.sewn, self.mesh.path, "sewn points")
+            if self.sewn.shape != (count, 3):
+                fail(self.mesh.path, f"sewn points of shape {self.sewn.shape}", f"({count}, 3) is needed")
         if self.classes is not None:
             classes = frozen(self.classes, np.int8)
             assign(self, classes=classes)
@@ -83,3 +91,8 @@ class Garment:
                     "pinned is 0, tight is 1, loose is 2",
                     "paint the classes again",
                 )
+
+    @property
+    def sewn_mesh(self) -> Mesh:
+        """The mesh as it was made: at `sewn`, where it lies on another body."""
+        return self.mesh if self.sewn is None else replace(self.mesh, points=self.sewn)

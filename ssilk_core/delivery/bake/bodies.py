@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model on the character of a stage, which need be no body that the model was trained on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import fail
+from ...events import Event, Message
+from ...network.checkpoint import ModelFile
+from ...scene.assets import Character, Scene
+from ...scene.family import BodyPlace
+from .character import BIND_TOLERANCE, TODO, in_order_of
+
+if TYPE_CHECKING:
+    from pxr import Usd
+
+TRAINED, FARTHEST = 0.1, 0.5  # how far beyond the members bodies were trained on, and may be
+NEAR, UNLIKE = 0.005, 0.03  # [m] from the family's space, from which on it is told, and refused
+BETTER = f"{TODO}, or with it among --family"
+
+
+@dataclass(frozen=True, eq=False)
+class WornModel:
+    """A model on the character of a stage.
+
+    Attributes:
+        file: as a model for that body.
+        scene: its garment there.
+        told: what there is to say of the body.
+        body: its place in the model's family, in words; None for the body that the model is of.
+    """
+
+    file: ModelFile
+    scene: Scene
+    told: tuple[Event, ...] = ()
+    body: str | None = None
+
+
+def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
+    """Put a model on the character of a stage.
+
+    A model for one body fits that body. One of a family fits any body of it. What its networks see of a body ends at
+    `TRAINED` beyond the members. A body beyond `FARTHEST`, or one that the members do not add up to, is refused.
+
+    Raises:
+        SsilkError: the stage's character is none that the model dresses.
+    """
+    from ssilk_usd.reading.character import read_character
+
+    character, base = read_character(stage, root=root, garment=None), file.scene.character.skeleton
+    if file.bodies is None:
+        return WornModel(file, replace(file.scene, character=in_order_of(base, character)))
+    own, bodies = in_order_of(base, character, moved=True), file.bodies.family.bodies
+    place = bodies.place_of(own)
+    _need_like(place, character.path)
+    away = np.linalg.norm(own.skeleton.bind_transforms[:, :3, 3] - base.bind_transforms[:, :3, 3], axis=1)
+    if not place.coordinates.any() and away.max() < BIND_TOLERANCE:
+        one = file.on_body(place.coordinates)
+        return WornModel(one, replace(one.scene, character=in_order_of(base, character)), _unlike(place, own))
+    seen = place.coordinates
+    if place.beyond > TRAINED:
+        nearest = bodies.nearest(seen)
+        seen = nearest + (seen - nearest) * (TRAINED / place.beyond)
+    one = file.on_body(place.coordinates, seen)
+    bare = replace(own, bodies=(), stand_ins=())  # as model files have it
+    one = replace(one, scene=replace(one.scene, character=bare))
+    return WornModel(one, replace(one.scene, character=own), tuple(_told(place, own)), _words(place))
+
+
+def _need_like(place: BodyPlace, path: str) -> None:
+    off = max(place.joints_off, place.points_off)
+    if off > UNLIKE:
+        found = f"its shape is {1000 * off:.0f} mm from all that the model's family of bodies adds up to"
+        fail(path, found, f"{1000 * UNLIKE:.0f} mm are allowed", BETTER)
+    if place.beyond > FARTHEST:
+        found = f"its body is {place.beyond:.0%} beyond the bodies that the model was trained for"
+        fail(path, found, f"{FARTHEST:.0%} are allowed", BETTER)
+
+
+def _words(place: BodyPlace) -> str:
+    return ", ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in place.coordinates)
+
+
+def _told(place: BodyPlace, character: Character) -> list[Event]:
+    path = character.path
+    text = f"{path}: a body of the model's family, at ({_words(place)})"
+    told: list[Event] = [Message(text), *_unlike(place, character)]
+    if place.beyond > TRAINED:
+        text = f"it is {place.beyond:.0%} beyond the bodies of the training, which went to {TRAINED:.0%}"
+        told.append(Message(f"{path}: {text}; the network sees it no farther off", "warning"))
+    return told
+
+
+def _unlike(place: BodyPlace, character: Character) -> tuple[Event, ...]:
+    off = max(place.joints_off, place.points_off)
+    if off <= NEAR:
+        return ()
+    text = f"its shape is {1000 * off:.0f} mm from the family's; the garment lies as on the nearest of its bodies"
+    return (Message(f"{character.path}: {text}", "warning"),)

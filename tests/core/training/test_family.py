@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training for a family of bodies, and a model of one put on a body."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from ssilk_core.authoring.bodies.carry import dressed_family
+from ssilk_core.errors import SsilkError
+from ssilk_core.network.checkpoint import load_model, model_file, network, save_model
+from ssilk_core.network.model.bodies import SeenBody
+from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.runtime.player import Player
+from ssilk_core.network.settings import ModelConfig
+from ssilk_core.physics.collision import CollisionBody, limb_axes
+from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
+from ssilk_core.scene.kinematics import motion_transforms
+from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
+from ssilk_core.training.family_bank import build_family_bank
+from ssilk_core.training.motion_bank import build_bank
+from ssilk_core.training.settings import TrainConfig
+from ssilk_core.training.step import Stepper
+
+CPU = torch.device("cpu")
+CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
+
+
+def shaped(character, change, path):
+    bodies = tuple(replace(b, mesh=replace(b.mesh, points=change(b.mesh.points))) for b in character.bodies)
+    joints = change(np.array(character.skeleton.bind_transforms[:, :3, 3]))
+    return replace(character, path=path, skeleton=with_joints(character.skeleton, joints), bodies=bodies)
+
+
+@pytest.fixture(scope="module")
+def members(scene):
+    base = scene.character
+    taller = shaped(base, lambda points: points * [1, 1.2, 1], "/taller")
+    heavier = shaped(base, lambda points: points * [1.3, 1, 1.25], "/heavier")
+    return [base, taller, heavier]
+
+
+@pytest.fixture(scope="module")
+def family(scene, members):
+    return dressed_family(scene, BodyFamily.of(members), members[1:])[0]
+
+
+@pytest.fixture
+def model(scene, family):
+    found = GarmentModel(scene, CONFIG, np.arange(3), 0, family)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for value in found.parameters():
+            value.add_(0.2 * torch.randn(value.shape, generator=generator))
+    return found
+
+
+def test_motions_play_on_a_member_as_on_its_own_skeleton(scene, members, family, toy_motion):
+    motion, base, bodies = toy_motion(scene, 12), members[0].skeleton, family.bodies
+    bank = build_family_bank([motion], base, np.arange(3), 30.0, CPU, bodies)
+    frames = torch.arange(bank.frame_count)
+    for member, coordinates in zip(members, bodies.members):
+        bank.wear(torch.as_tensor(coordinates.copy()))
+        ratio = 1 + float(bodies.taller @ coordinates)
+        own = build_bank([motion_on(motion, base, member.skeleton, ratio)], member.skeleton, np.arange(3), 30.0, CPU)
+        torch.testing.assert_close(bank.character(frames), own.character(frames), atol=2e-6, rtol=1e-5)
+        torch.testing.assert_close(bank.root_at(frames), own.root, atol=2e-6, rtol=1e-5)
+        torch.testing.assert_close(bank.dynamic_at(frames), own.dynamic, atol=2e-5, rtol=1e-5)
+        torch.testing.assert_close(bank.static, own.static, atol=1e-6, rtol=1e-5)
+    at = frames[3:5][:, None].expand(2, 2)
+    torch.testing.assert_close(bank.body(at).matrices, own.body(at).matrices, atol=2e-6, rtol=1e-5)
+
+
+def test_what_garments_collide_with_takes_the_shape_of_a_member(scene, members, family):
+    limbs, joints = limb_axes(scene), scene.character.skeleton.joint_count
+    chosen = np.arange(10, 90)
+    body = CollisionBody(members[0].merged_body(), joints, vertices=chosen, limbs=limbs, device=CPU)
+    shape = FamilyBody(body, scene, family.bodies)
+    still = torch.eye(3, 4)[None, :, :, None].expand(joints, 3, 4, 1).contiguous()
+    before = body.pose(still)
+    for member, coordinates in zip((*members[1:], members[0]), family.bodies.members[[1, 2, 0]]):
+        shape.wear(torch.tensor(coordinates, dtype=torch.float32))
+        own = CollisionBody(member.merged_body(), joints, vertices=chosen, device=CPU).pose(still)
+        found = body.pose(still)
+        torch.testing.assert_close(found.points, own.points, atol=1e-6, rtol=1e-5)
+        torch.testing.assert_close(found.normals, own.normals, atol=1e-5, rtol=1e-4)
+    if limbs:
+        torch.testing.assert_close(found.limbs.end, before.limbs.end, atol=1e-6, rtol=1e-5)
+
+
+def frames_of(model, motion, skeleton):
+    bank = build_bank([motion], skeleton, model.joints, 30.0, CPU)
+    frames = torch.arange(bank.frame_count)
+    down = torch.tensor([0.0, -1.0, 0.0]).expand(len(frames), 3)
+    static, pose = bank.static_descriptor(frames, down), bank.dynamic_descriptor(frames, down)
+    rest = model.initial(static)[:, None]
+    z = torch.cat(model.roll([rest[0], rest[1]], rest[2:], pose[2:, None], bank.body(frames[:, None])))
+    return model.vertices(z, bank.character(frames))
+
+
+@torch.no_grad()
+def test_a_model_put_on_a_body_is_what_it_is_when_it_sees_that_body(scene, members, family, model, toy_motion):
+    motion, base = toy_motion(scene, 12), members[0].skeleton
+    file = model_file(model, Fabric("toy"), {})
+    for member, coordinates in zip(members, family.bodies.members):
+        ratio = 1 + float(family.bodies.taller @ coordinates)
+        its = motion_on(motion, base, member.skeleton, ratio)
+        model.wear(torch.tensor(coordinates, dtype=torch.float32))
+        one = file.on_body(coordinates)
+        assert one.bodies is None and one.parameters.keys() == file.parameters.keys()
+        folded = frames_of(network(one), its, member.skeleton)
+        torch.testing.assert_close(folded, frames_of(model, its, member.skeleton), atol=1e-5, rtol=1e-4)
+        # Banks have a motion about where its hub starts.
+        start = motion_transforms(its, base.parents)[0, base.hub, :3, 3]
+        played = Player(one).play(its).vertices(7) - start
+        np.testing.assert_allclose(played, folded[..., 7], atol=1e-4)
+    model.wear(torch.zeros(family.bodies.size))
+
+
+@torch.no_grad()
+def test_bodies_make_a_difference_to_all_three_networks(scene, family, model):
+    static = torch.randn(4, model.static, generator=torch.Generator().manual_seed(2))
+    z = torch.randn(4, CONFIG.latent, generator=torch.Generator().manual_seed(3))
+    inputs = torch.randn(4, model.stepper[0].in_features, generator=torch.Generator().manual_seed(4))
+    seen = []
+    for coordinates in family.bodies.members[:2]:
+        model.wear(torch.tensor(coordinates, dtype=torch.float32))
+        seen.append((model.initialiser(static), model.stepper(inputs), model.output(z)))
+    model.wear(torch.zeros(family.bodies.size))
+    assert all((one - other).abs().max() > 1e-3 for one, other in zip(*seen))
+
+
+def test_at_the_base_the_file_is_as_one_of_that_body(model, tmp_path, scene):
+    file = model_file(model, Fabric("toy"), {"seed": 1})
+    save_model(tmp_path / "family.safetensors", file)
+    save_model(tmp_path / "base.safetensors", file.on_body(np.zeros(2)))
+    found, base = (load_model(tmp_path / f"{name}.safetensors") for name in ("family", "base"))
+    assert base.bodies is None and found.bodies is not None
+    for name, value in base.parameters.items():
+        np.testing.assert_array_equal(found.parameters[name], value)
+    np.testing.assert_array_equal(found.scene.garment.mesh.points, base.scene.garment.mesh.points)
+    known = found.bodies.family.bodies
+    np.testing.assert_array_equal(known.members, file.bodies.family.bodies.members)
+    assert known.names == ("/toy", "/taller", "/heavier")
+
+
+def test_a_stored_family_finds_its_members(model, members, tmp_path):
+    save_model(tmp_path / "family.safetensors", model_file(model, Fabric("toy"), {}))
+    bodies = load_model(tmp_path / "family.safetensors").bodies.family.bodies
+    for member, coordinates in zip(members, bodies.members):
+        place = bodies.place_of(member)
+        np.testing.assert_allclose(place.coordinates, coordinates, atol=1e-5)
+        assert place.beyond == 0 and max(place.joints_off, place.points_off) < 1e-6
+
+
+def test_a_family_of_another_network_is_refused(model, tmp_path):
+    file = model_file(model, Fabric("toy"), {})
+    columns = {name: values[:-1] for name, values in file.bodies.columns.items()}
+    save_model(tmp_path / "odd.safetensors", replace(file, bodies=replace(file.bodies, columns=columns)))
+    with pytest.raises(SsilkError, match="do not fit the network"):
+        load_model(tmp_path / "odd.safetensors")
+
+
+def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_number(family):
+    bodies = family.bodies
+    drawn = np.array([random_body(bodies, np.random.default_rng([0, number])) for number in range(300)])
+    middle = bodies.members.mean(axis=0)
+    within = middle + (drawn - middle) / (1 + BEYOND)
+    assert all(bodies.beyond(each) < 1e-3 for each in within[:20])
+    assert 0 < max(map(bodies.beyond, drawn[:100])) < BEYOND + 1e-3
+    np.testing.assert_allclose(drawn.mean(axis=0), middle, atol=0.06)  # evenly
+    seen = []
+
+    class Seen:
+        def wear(self, place):
+            seen.append(place.clone())
+
+    for number in (3, 4, 3):
+        DrawnBodies(bodies, [Seen()], 7, CPU).draw(number)
+    assert torch.equal(seen[0], seen[2]) and not torch.equal(seen[0], seen[1])
+
+
+def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(model, family, scene):
+    """Steps that are timed, or a batch that is halved, leave the model on some body when its average is begun."""
+    model.wear(torch.tensor(family.bodies.members[1], dtype=torch.float32))
+    drawn = DrawnBodies(family.bodies, [model], 0, CPU)
+    sampler, objective = SimpleNamespace(first=torch.zeros(1)), SimpleNamespace(scale=1.0)
+    stepper = Stepper(model, objective, sampler, TrainConfig(), bodies=drawn)
+    rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32)
+    for found in (stepper.ema_model, model):
+        torch.testing.assert_close(found.decoder.rest, rest)
+        assert not any(module.place.any() for module in found.modules() if isinstance(module, SeenBody))
+    drawn.draw(1)
+    torch.testing.assert_close(stepper.ema_model.decoder.rest, rest)
+    assert not torch.allclose(model.decoder.rest, rest)

@@ -1,0 +1,281 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Families of bodies as users meet them: compared, dressed before any training, trained for and baked."""
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+
+from ssilk_core.cli import main
+from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
+from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model, save_model
+
+TRAIN = "train rigged.usda --motions clip.usda"
+
+
+def run(command: str, *more: str) -> int:
+    return main([*shlex.split(command), *more])
+
+
+def write_member(path: Path, change: Callable[[np.ndarray], np.ndarray], source: str = "hero.usda") -> Path:
+    """The hero with other proportions: points and joints (N, 3) moved by a function, without the skirt."""
+    stage = Usd.Stage.Open(Usd.Stage.Open(source).Flatten())
+    stage.RemovePrim("/Hero/Skirt")
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr()
+    points.Set(Vt.Vec3fArray.FromNumpy(change(np.array(points.Get(), dtype=float)).astype(np.float32)))
+    binds = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")).GetBindTransformsAttr()
+    places = change(np.array([np.array(matrix)[3, :3] for matrix in binds.Get()]))
+    binds.Set([Gf.Matrix4d().SetTranslate(Gf.Vec3d(*place)) for place in places.tolist()])
+    stage.GetRootLayer().Export(str(path))
+    return path
+
+
+def taller(points: np.ndarray) -> np.ndarray:
+    return points * [1, 1.15, 1]
+
+
+def heavier(points: np.ndarray) -> np.ndarray:
+    return points * [1.3, 1, 1.3]
+
+
+@pytest.fixture(scope="module")
+def family(toy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The toy with taller.usda and heavier.usda, and family.safetensors, trained for all three bodies."""
+    folder = toy.copy(tmp_path_factory.mktemp("family"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        write_member(folder / "taller.usda", taller)
+        write_member(folder / "heavier.usda", heavier)
+        train = f"{TRAIN} --family taller.usda heavier.usda -o family.safetensors"
+        assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    return folder
+
+
+@pytest.fixture
+def world(family: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, the current folder."""
+    shutil.copytree(family, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def findings(capsys, command: str) -> tuple[int, dict[str, dict]]:
+    capsys.readouterr()
+    code = run(command, "--json")
+    result = json.loads(capsys.readouterr().out.splitlines()[-1])
+    return code, {finding["code"]: finding for finding in result["detail"]["findings"]}
+
+
+def test_inspect_says_that_bodies_are_a_family_and_by_how_much_they_differ(world, capsys):
+    code, found = findings(capsys, "inspect hero.usda --garment Skirt --family taller.usda heavier.usda")
+    assert code == 0 and found["family"]["count"] == 3
+    assert "points up to 25.5 cm from the first one's, along 2 directions" in found["family"]["found"]
+
+
+def test_inspect_names_what_keeps_a_body_out_of_the_family(world, capsys):
+    stage = Usd.Stage.Open("taller.usda")
+    rig = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    rig.GetJointsAttr().Set(["Hips", "Hips/Spine", "Hips/Spine/Skull"])
+    stage.Save()
+    code, found = findings(capsys, "inspect hero.usda --garment Skirt --family taller.usda")
+    assert code == 2 and "Hips/Spine/Head" in found["no-family"]["found"]
+    assert run("rig hero.usda --garment Skirt --onto taller.usda -o out.usda") == 2
+    told = capsys.readouterr().err
+    assert "taller.usda" in told and "Hips/Spine/Skull" in told and not Path("out.usda").exists()
+
+
+def test_a_file_of_the_family_that_is_not_there_is_told(world, capsys):
+    assert run("inspect hero.usda --garment Skirt --family tallest.usda") == 2
+    assert "there is no such file" in capsys.readouterr().err
+
+
+def skinned_rest(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Points of the skirt and of the body as UsdSkel skins them in the rest pose (V, 3)."""
+    stage, cache = Usd.Stage.Open(path), UsdSkel.Cache()
+    root = UsdSkel.Root(stage.GetPrimAtPath("/Hero"))
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    (binding,) = cache.ComputeSkelBindings(root, Usd.PrimDefaultPredicate)
+    joints = cache.GetSkelQuery(binding.GetSkeleton()).ComputeSkinningTransforms(Usd.TimeCode.Default())
+    found = {}
+    for query in binding.GetSkinningTargets():
+        points = UsdGeom.Mesh(query.GetPrim()).GetPointsAttr().Get()
+        assert query.ComputeSkinnedPoints(joints, points, Usd.TimeCode.Default())
+        found[query.GetPrim().GetName()] = np.array(points)
+    return found["Skirt"], found["Body"]
+
+
+def test_a_garment_is_tried_on_another_body_before_any_training(world):
+    assert run("rig hero.usda --garment Skirt --proxies 4 -o hero_skirt.usda") == 0
+    assert run("rig hero.usda --garment Skirt --proxies 4 --onto heavier.usda -o heavier_skirt.usda") == 0
+    assert run("rig hero_skirt.usda --onto heavier.usda -o again.usda") == 0
+    own, its = skinned_rest("hero_skirt.usda")[0], skinned_rest("heavier_skirt.usda")
+    np.testing.assert_allclose(its[1], heavier(skinned_rest("hero_skirt.usda")[1]), atol=1e-5)
+    around = np.linalg.norm(its[0][:, [0, 2]], axis=1) / np.linalg.norm(own[:, [0, 2]], axis=1)
+    high = own[:, 1] > 1.05
+    assert (around[high] > 1.15).all()  # where the pillar grew by 1.3 it would be within the skin otherwise
+    np.testing.assert_allclose(skinned_rest("again.usda")[0], its[0], atol=1e-5)
+
+
+def test_a_family_is_learned_and_the_model_file_holds_it(world):
+    family, alone = load_model("family.safetensors"), load_model("model.safetensors")
+    assert alone.bodies is None and len(family.bodies.family.bodies.names) == 3
+    assert all(np.abs(family.bodies.columns[name]).max() > 0 for name in ("initialiser", "output"))
+    assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
+
+
+def test_a_family_needs_members(world, capsys, toy):
+    stage = Usd.Stage.Open("taller.usda")
+    stage.GetPrimAtPath("/Hero/Rig").GetAttribute("joints").Set(["Hips", "Hips/Spine", "Hips/Spine/Skull"])
+    stage.Save()
+    assert run(f"{TRAIN} --family taller.usda -o new.safetensors", *toy.training) == 2
+    assert "Hips/Spine/Skull" in capsys.readouterr().err and not Path("new.safetensors").exists()
+    assert run(f"{TRAIN} --family heavier.usda --start-from model.safetensors -o new.safetensors") == 2
+    assert "a family of bodies" in capsys.readouterr().err
+
+
+def test_a_training_of_a_family_goes_on_as_if_it_had_not_stopped(world, toy, monkeypatch):
+    from ssilk_core.training import run as training
+
+    whole = Path("family.safetensors").read_bytes()
+    command = f"{TRAIN} --family taller.usda heavier.usda -o again.safetensors"
+    steps = []
+
+    def step(self) -> None:
+        steps.append(self.state.iteration)
+        if len(steps) == 5:
+            raise KeyboardInterrupt
+        original(self)
+
+    original = training.TrainingRun.step
+    monkeypatch.setattr(training.TrainingRun, "step", step)
+    assert run(command, *toy.training) == EXIT_INTERRUPTED
+    monkeypatch.setattr(training.TrainingRun, "step", original)
+    assert run(f"{command} --resume", *toy.training) in (EXIT_OK, EXIT_WORSE)
+    found = load_model("again.safetensors")
+    for name, values in load_model("family.safetensors").parameters.items():
+        np.testing.assert_allclose(found.parameters[name], values, atol=1e-6)
+    assert whole
+
+
+BAKE = "bake family.safetensors --motion clip.usda"
+
+
+def test_on_its_first_body_a_family_bakes_what_a_model_of_that_body_alone_does(world):
+    file = load_model("family.safetensors")
+    save_model("base.safetensors", file.on_body(np.zeros(2)))
+    assert run(f"{BAKE} --stage rigged.usda -o family.usda") == 0
+    assert run("bake base.safetensors --motion clip.usda --stage rigged.usda -o base.usda") == 0
+    family, base = (
+        Path(shot).read_text().replace(sha256(model), "").replace(sha256(model)[:12], "").replace(shot, "")
+        for shot, model in (("family.usda", "family.safetensors"), ("base.usda", "base.safetensors"))
+    )
+    differing = [one for one, other in zip(family.splitlines(), base.splitlines()) if one != other]
+    assert len(family) > 10_000 and not [line for line in differing if "safetensors" not in line]
+
+
+def shown(path: str, frame: float) -> dict[str, np.ndarray]:
+    """Points (V, 3) of skinned meshes in a frame of a shot, as UsdSkel deforms them with their blendshapes."""
+    stage, found = Usd.Stage.Open(path), {}
+    assert UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Mesh):
+            found[prim.GetName()] = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(frame))
+    return found
+
+
+def member_clip(path: str, ratio: float) -> None:
+    """The toy's clip for a body whose joints are so much higher."""
+    stage = Usd.Stage.Open(Usd.Stage.Open("clip.usda").Flatten())
+    translations = UsdSkel.Animation(stage.GetPrimAtPath("/Clip")).GetTranslationsAttr()
+    for time in translations.GetTimeSamples():
+        translations.Set([Gf.Vec3f(at[0], at[1] * ratio, at[2]) for at in translations.Get(time)], time)
+    stage.GetRootLayer().Export(path)
+
+
+def test_a_member_is_baked_as_plain_usdskel_with_its_own_body_and_garment(world, capsys):
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
+    told = capsys.readouterr()
+    assert "a body of the model's family" in told.out + told.err
+    assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
+    own, its = shown("base.usda", 0), shown("heavy.usda", 0)
+    np.testing.assert_allclose(its["Body"], heavier(own["Body"]), atol=1e-4)
+    assert run("verify heavy.usda") == 0
+    away = np.linalg.norm(its["Skirt"] - own["Skirt"], axis=1)
+    assert 0.005 < away.mean() < 0.3
+
+
+def test_a_taller_body_has_its_garment_higher(world):
+    member_clip("tall_clip.usda", 1.15)
+    assert run("bake family.safetensors --motion tall_clip.usda --stage taller.usda -o tall.usda") == 0
+    assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
+    own, its = shown("base.usda", 10), shown("tall.usda", 10)
+    assert its["Skirt"][:, 1].max() == pytest.approx(1.15 * own["Skirt"][:, 1].max(), rel=0.02)
+
+
+def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(world, capsys):
+    write_member(world / "between.usda", lambda points: points * [1.15, 1.05, 1.15])
+    assert run(f"{BAKE} --stage between.usda -o between_shot.usda") == 0
+    write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
+    capsys.readouterr()
+    assert run(f"{BAKE} --stage large.usda -o large_shot.usda") == 0
+    told = capsys.readouterr()
+    assert "beyond the bodies of the training" in told.out + told.err
+    write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
+    assert run(f"{BAKE} --stage huge.usda -o huge_shot.usda") == 2
+    assert "beyond the bodies that the model was trained for" in capsys.readouterr().err
+    write_member(world / "bent.usda", lambda points: points + [0.2, 0, 0] * np.sin(4 * points[:, 1:2]))
+    assert run(f"{BAKE} --stage bent.usda -o bent_shot.usda") == 2
+    assert "from all that the model's family of bodies adds up to" in capsys.readouterr().err
+    assert not Path("huge_shot.usda").exists() and not Path("bent_shot.usda").exists()
+
+
+def test_a_model_of_one_body_still_refuses_others(world, capsys):
+    assert run("bake model.safetensors --motion clip.usda --stage taller.usda -o out.usda") == 2
+    assert "a model bakes on the character it was trained with" in capsys.readouterr().err
+
+
+def test_evaluate_takes_a_member(world):
+    (world / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    listed = "--motions clips --no-probes"
+    assert run(f"evaluate family.safetensors --stage heavier.usda {listed} -o heavy.json") == 0
+    assert run(f"evaluate family.safetensors --stage rigged.usda {listed} -o base.json") == 0
+    assert Path("heavy.json").read_text() != Path("base.json").read_text()
+
+
+def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
+    onnx = pytest.importorskip("onnx")
+    assert run("export family.safetensors -o base.onnx") == 0
+    assert run("export family.safetensors --stage heavier.usda -o heavy.onnx") == 0
+    assert run("export model.safetensors --stage rigged.usda -o alone.onnx") == 0
+    sizes = [
+        sum(len(each.raw_data) for each in onnx.load(f"{name}.onnx").graph.initializer) for name in ("base", "heavy")
+    ]
+    assert sizes[0] == sizes[1] and Path("base.onnx").read_bytes() != Path("heavy.onnx").read_bytes()
+    assert run("reduce family.safetensors --motions clip.usda --joints 3 -o small.safetensors") == 0
+    small = load_model("small.safetensors")
+    assert small.scene.rig.proxy_count < 4 and small.bodies.family.proxy_moves.shape[1] == small.scene.rig.proxy_count
+    assert run("bake small.safetensors --motion clip.usda --stage heavier.usda -o small.usda") == 0
+
+
+def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
+    assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
+    assert "train for the family anew" in capsys.readouterr().err
+
+
+def test_in_a_folder_of_layers_a_name_stays_with_its_body(world, capsys):
+    shot = "bake family.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage heavier.usda -o shots/") == 0
+    asset = next(Path("shots/assets").rglob("*.usd*")).read_bytes()
+    capsys.readouterr()
+    assert run(f"{shot} --stage rigged.usda --shot-name other -o shots/") == 2
+    assert "another body of its model's family" in capsys.readouterr().err
+    assert next(Path("shots/assets").rglob("*.usd*")).read_bytes() == asset
+    assert run(f"{shot} --stage rigged.usda --shot-name other --garment-name slim -o shots/") == 0
+    assert run(f"{shot} --stage heavier.usda --shot-name third -o shots/") == 0
