@@ -34,7 +34,7 @@ def test_importing_is_light():
 def test_a_shot_stores_what_differs_from_the_defaults():
     assert BakeRequest(**INPUTS).to_metadata() == INPUTS
     stored = CHANGED.to_metadata()
-    assert stored.keys() == {item.name for item in fields(BakeRequest)} - {"lbs", "certify"}  # neither goes with all others
+    assert stored.keys() == {item.name for item in fields(BakeRequest)} - {"lbs", "certify"}  # not with all others
     assert all(isinstance(value, str | int | float | bool) for value in stored.values())  # as USD's metadata holds
 
 
