@@ -34,11 +34,14 @@ def test_importing_is_light():
 def test_a_shot_stores_what_differs_from_the_defaults():
     assert BakeRequest(**INPUTS).to_metadata() == INPUTS
     stored = CHANGED.to_metadata()
-    assert stored.keys() == {item.name for item in fields(BakeRequest)} - {"lbs"}
+    assert stored.keys() == {item.name for item in fields(BakeRequest)} - {"lbs", "certify"}  # not with all others
     assert all(isinstance(value, str | int | float | bool) for value in stored.values())  # as USD's metadata holds
 
 
-@pytest.mark.parametrize("request_", [BakeRequest(**INPUTS), CHANGED, BakeRequest(**INPUTS, lbs=True)])
+ALONE = [BakeRequest(**INPUTS, lbs=True), BakeRequest(**INPUTS, certify=True)]
+
+
+@pytest.mark.parametrize("request_", [BakeRequest(**INPUTS), CHANGED, *ALONE])
 def test_a_stored_request_is_read_again(request_):
     assert BakeRequest.from_metadata(request_.to_metadata()) == request_
 
