@@ -24,7 +24,7 @@ BEYOND = 0.1  # how much farther from the members' mean bodies are drawn than me
 CORNERS = 3  # members among which a body is drawn
 
 
-class Wearer(Protocol):
+class BodyWearer(Protocol):
     """Whatever knows the body that it is on."""
 
     def wear(self, place: Tensor, /) -> None: ...
@@ -41,7 +41,7 @@ def random_body(family: BodyFamily, generator: np.random.Generator) -> Floats:
 class DrawnBodies:
     """Draws the body of each step, by its number, and puts it on all that know it."""
 
-    def __init__(self, family: BodyFamily, wearers: Sequence[Wearer], seed: int, device: torch.device) -> None:
+    def __init__(self, family: BodyFamily, wearers: Sequence[BodyWearer], seed: int, device: torch.device) -> None:
         self.family, self.wearers, self.seed, self.device = family, wearers, seed, device
 
     def draw(self, iteration: int) -> None:

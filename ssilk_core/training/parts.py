@@ -25,7 +25,7 @@ from ..physics.intersections.pairs import need_predicates
 from ..scene.assets import Floats, Ints, Motion
 from ..scene.family import motion_on
 from ..scene.kinematics import MAX_JOINT_SPEED
-from .bodies import DrawnBodies, FamilyBody, Wearer
+from .bodies import BodyWearer, DrawnBodies, FamilyBody
 from .family_bank import FamilyBank, build_family_bank
 from .inner_garments import InnerGarments
 from .job import TrainJob
@@ -112,7 +112,7 @@ class TrainingParts:
         bodies = None
         if family := self.model.family:
             assert isinstance(self.bank, FamilyBank)
-            wearers: list[Wearer] = [self.model, self.bank, objective, *([self.shape] if self.shape else [])]
+            wearers: list[BodyWearer] = [self.model, self.bank, objective, *([self.shape] if self.shape else [])]
             bodies = DrawnBodies(family.bodies, wearers, seed, self.device)
         return Stepper(self.model, objective, sampler, own, average, self.smoothing, bodies)
 

@@ -70,6 +70,10 @@ def unbound_beneath_another_transform(stage: Usd.Stage) -> None:
     UsdGeom.Xformable(cape(stage)).AddTranslateOp().Set((0, 10, 0))
 
 
+def not_a_number(stage: Usd.Stage) -> None:
+    cape(stage).GetPointsAttr().Set([Gf.Vec3f(float("nan"))] * 4)
+
+
 CHANGES = [
     sculpted, reweighed, bound_elsewhere, sculpted_shape, corrected, unbound_beneath_another_transform,
 ]  # fmt: skip
@@ -119,6 +123,11 @@ def test_other_points_faces_purposes_and_a_garment_that_is_off_are_told(tmp_path
     hero = dressed(tmp_path, [0.0, 1.0])
     for change, words in (
         (lambda stage: with_more_points(stage, CAPE), "it shapes the garment Cape otherwise, with other points"),
+        (
+            lambda stage: cape(stage).GetPointsAttr().Block(),
+            "it shapes the garment Cape otherwise, with other points",
+        ),
+        (not_a_number, "it shapes the garment Cape otherwise, with other points"),
         (lambda stage: cape(stage).CreateHoleIndicesAttr([0]), "it shows 1 faces of Cape instead of 2"),
         (lambda stage: UsdGeom.Imageable(cape(stage)).CreatePurposeAttr("guide"), "it gives Cape the purpose guide"),
         (lambda stage: cape(stage).GetPrim().SetActive(False), f"it deactivates {CAPE}, and with it the garment"),

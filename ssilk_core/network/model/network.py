@@ -19,7 +19,7 @@ from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
 from .bodies import SeenBody, WornCloth, see_bodies
 from .decoder import Decoder
-from .feedback import BodyFrames, DecodedPoints, DecodedState, Feedback
+from .feedback import BodyFrames, DecodedState, Feedback, PointDecoder
 from .integrators import integrator
 
 
@@ -72,7 +72,7 @@ class GarmentModel(nn.Module):
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
         scheme, self.feedback = self.integrator.scheme, Feedback(scene, config, self.decoder)
-        self.sight = DecodedPoints(proximity_vertices(scene, config), self.decoder)
+        self.sight = PointDecoder(proximity_vertices(scene, config), self.decoder)
         inputs = scheme.states * z + static + dynamic + self.feedback.size
         self.stepper = (
             mlp(inputs, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()

@@ -20,7 +20,7 @@ from .skin import match_joints
 from .spaces import SkelSource, similarity_scale
 
 SAME = 1e-3  # of a mesh's size, by which its points may differ unseen
-LOOKED_AT = 32  # times at which points are compared, of each kind
+LOOKED_AT = 16  # times at which points are compared, of each kind
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,8 @@ class Compared:
 
     def off(self, own: Usd.Prim, other: Usd.Prim) -> Off | None:
         """Return how far points of a mesh that is met are from where the motion has them; None if nobody sees it."""
+        if not value(other, "points"):
+            return Off(None)
         met, shown = self.met[str(own.GetPath())], posed_mesh(other, self.skinned)
         codes = self._codes(shown)
         at = np.array(codes) * self.motion.fps / self.there.stage.GetTimeCodesPerSecond() - self.motion.start
@@ -89,6 +91,8 @@ class Compared:
             unseen = max(unseen, 1e-6 * float(np.abs(points).max(initial=0)))  # of float32, far from the origin
             paired = len(seen) == len(points)
             away = float(np.linalg.norm(seen - points, axis=1).max(initial=0)) if paired else np.inf
+            if not np.isfinite(seen).all():
+                return Off(None, code)
             if away > unseen and not (paired and in_order):
                 away = _nearest(points, seen)  # the same points may stand in another order
                 if away > unseen and not paired:

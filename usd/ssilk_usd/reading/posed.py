@@ -60,9 +60,8 @@ class SkinnedMesh:
 
     def reach(self) -> Floats:
         """Return how far each blendshape moves a point at most, weighing one, in the mesh's space, shape (K,)."""
-        if self.shapes is None:
-            return np.zeros(0)
-        shapes = (self.shapes.GetBlendShape(index) for index in range(self.shapes.GetNumBlendShapes()))
+        query = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(self.prim))
+        shapes = (query.GetBlendShape(index) for index in range(query.GetNumBlendShapes()))
         offsets = (np.array(shape.GetOffsetsAttr().Get() or [], dtype=np.float64).reshape(-1, 3) for shape in shapes)
         return np.array([np.linalg.norm(each, axis=1).max(initial=0) for each in offsets])
 
