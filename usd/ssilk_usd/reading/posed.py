@@ -67,7 +67,9 @@ class SkinnedMesh:
 
     def points(self, time: Usd.TimeCode, xforms: UsdGeom.XformCache) -> Floats:
         """Return the posed points in stage units, shape (V, 3)."""
-        points = self.rest.Get(EARLIEST)  # where UsdSkel begins, whatever later ones are
+        joints = self.skinning.HasJointInfluences()
+        # UsdSkel begins with the earliest points, whatever later ones are, but deforms no cache.
+        points = self.rest.Get(EARLIEST if joints or self.shapes else time)
         if self.shapes:
             weights = self.skeleton.GetAnimQuery().ComputeBlendShapeWeights(time)
             own = self.skinning.GetBlendShapeMapper().Remap(weights)
@@ -75,7 +77,7 @@ class SkinnedMesh:
                 *self.shapes.ComputeSubShapeWeights(own), self.rows, self.offsets, points
             )
         space = self.prim
-        if self.skinning.HasJointInfluences():
+        if joints:
             self.skinning.ComputeSkinnedPoints(self.skeleton.ComputeSkinningTransforms(time), points, time)
             space = self.rig
         return apply(column_matrix(xforms.GetLocalToWorldTransform(space)), np.array(points, dtype=np.float64))
