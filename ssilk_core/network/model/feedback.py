@@ -75,7 +75,7 @@ class DecodedState:
     depth: Tensor | None = None
 
 
-class DecodedPoints(nn.Module):
+class PointDecoder(nn.Module):
     """Decodes a few vertices of a garment.
 
     Args:
@@ -117,7 +117,7 @@ class Feedback(nn.Module):
     def __init__(self, scene: Scene, config: ModelConfig, decoder: Decoder) -> None:
         super().__init__()
         self.hub, self.size = scene.character.skeleton.hub, feedback_size(scene, config)
-        self.points = DecodedPoints(feedback_vertices(scene, config), decoder)
+        self.points = PointDecoder(feedback_vertices(scene, config), decoder)
         self.stopped = stopped_points(scene, config)
 
     @property

@@ -17,7 +17,7 @@ from ..parameters import descriptor_sizes
 from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
 from .decoder import Decoder
-from .feedback import BodyFrames, DecodedPoints, DecodedState, Feedback
+from .feedback import BodyFrames, DecodedState, Feedback, PointDecoder
 from .integrators import integrator
 
 
@@ -62,7 +62,7 @@ class GarmentModel(nn.Module):
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
         scheme, self.feedback = self.integrator.scheme, Feedback(scene, config, self.decoder)
-        self.sight = DecodedPoints(proximity_vertices(scene, config), self.decoder)
+        self.sight = PointDecoder(proximity_vertices(scene, config), self.decoder)
         inputs = scheme.states * z + static + dynamic + self.feedback.size
         self.stepper = (
             mlp(inputs, config.widths, z, generator, 0.0, scheme.bias) if scheme.states else nn.Sequential()
