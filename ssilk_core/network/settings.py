@@ -52,8 +52,8 @@ class ModelConfig:
         feedback_points: points of the decoded cloth that S sees (`network.feedback`); zero for none.
         feedback_proxies: whether S sees the proxies of the last two states, as in the paper's Figure 2, which
             "spring_verlet" cannot take.
-        proximity_points: points of the garment, as the body carries them, at which the network sees how near
-            colliders are (`network.proximity`); zero for a network that sees none.
+        proximity_points: points of the garment, where it would rest without colliders, at which the network sees how
+            near these are (`network.proximity`); zero for a network that sees none.
         stiffness: largest spring constant of "spring_verlet", in (0, 1].
         velocity_allowance: what S may give for each unit of the state's velocity, in [0, 1], beside what the spring
             and the rates of the pose allow (`model.integrators.SpringVerlet`).

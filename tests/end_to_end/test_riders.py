@@ -378,6 +378,15 @@ def test_how_deep_a_rider_enters_its_cloth_is_told_where_it_is_more_than_a_milli
     assert run(again) == 0 and "current" in capsys.readouterr().err
 
 
+def test_what_three_vertices_carry_far_from_the_cloth_enters_none_of_it(hero, capsys):
+    mesh, stage = skirt_of(), Usd.Stage.Open("worn.usda")
+    points, _ = disc_on(mesh, FACES[1], SHARES[1], 0.01)
+    add_rider(stage, "/Hero/Lantern", points + [0, 0, 1.5], vertices=tuple(map(int, mesh.faces[FACES[1]])))
+    stage.GetRootLayer().Save()
+    assert run("bake model.safetensors --stage worn.usda --motion clip.usda -o shot.usda") == 0
+    assert "Lantern enters" not in capsys.readouterr().err
+
+
 def depth_by_libigl(mesh: Mesh, cloth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """How far samples lie beneath cloth that is wound to face outwards [m], by the normals of its nearest faces."""
     squares, face, nearest = igl.point_mesh_squared_distance(samples, cloth, mesh.faces)

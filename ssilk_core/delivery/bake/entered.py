@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...physics.world.surface import CollisionSurface
-from ...scene.assets import Floats, Mesh
+from ...scene.assets import Floats, Ints, Mesh
 from ...scene.riders import Rider
 
 LEAST = 1e-3  # [m] that is told: less is hidden by the thickness of cloth
@@ -49,7 +49,8 @@ class EnteredCounter:
     """Measures the rigid ones of some riders frame by frame.
 
     Args:
-        riders: with all that are soft, in the order of their meshes in the shot.
+        riders: with all that are soft, in the order of their meshes in the shot. What named vertices carry far from
+            it enters no cloth.
         cloth: the garment at rest.
     """
 
@@ -60,8 +61,8 @@ class EnteredCounter:
         for rider in riders:
             meshes = slice(first, first + len(rider.meshes))
             first = meshes.stop
-            if rider.attachment:
-                self._rigid.append((rider.name, meshes, _Patch(rider, cloth)))
+            if rider.attachment and len(faces := _faces_around(rider, cloth)):
+                self._rigid.append((rider.name, meshes, _Patch(rider, cloth, faces)))
 
     def add(self, garment: Floats, riders: Sequence[Floats], frame: float) -> None:
         """Measure in a frame.
@@ -85,19 +86,28 @@ class EnteredCounter:
         )
 
 
-class _Patch:
-    """The cloth around a rider, with the side on which the rider lies as its outside."""
+def _faces_around(rider: Rider, cloth: Mesh) -> Ints:
+    """Return the faces of the cloth around a rider (T, 3); none where what carries it is far from it."""
+    points = np.concatenate([mesh.points for mesh in rider.meshes])
+    centre = points.mean(axis=0)
+    reach = np.linalg.norm(points - centre, axis=1).max() + AROUND
+    corners = cloth.points[cloth.faces]
+    middle = corners.mean(axis=1)
+    size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    return cloth.faces[np.linalg.norm(middle - centre, axis=1) < reach + size]
 
-    def __init__(self, rider: Rider, cloth: Mesh) -> None:
+
+class _Patch:
+    """The cloth around a rider, with the side on which the rider lies as its outside.
+
+    Args:
+        around: faces of the cloth (T, 3), one at least.
+    """
+
+    def __init__(self, rider: Rider, cloth: Mesh, around: Ints) -> None:
         self._faces = [mesh.faces for mesh in rider.meshes]
         samples = self._samples([mesh.points for mesh in rider.meshes])
-        centre = samples.mean(axis=0)
-        reach = np.linalg.norm(samples - centre, axis=1).max() + AROUND
-        corners = cloth.points[cloth.faces]
-        middle = corners.mean(axis=1)
-        size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
-        near = np.linalg.norm(middle - centre, axis=1) < reach + size
-        self._rows, faces = np.unique(cloth.faces[near], return_inverse=True)
+        self._rows, faces = np.unique(around, return_inverse=True)
         self._surface = CollisionSurface(cloth.path, cloth.points[self._rows], faces.reshape(-1, 3))
         at_rest = self._surface.at(cloth.points[self._rows])
         self._sides = at_rest.outside(samples)

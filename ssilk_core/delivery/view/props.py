@@ -3,7 +3,7 @@
 
 Sets can be of any size. What is further away than a few times the figure's size is left out, and so is what stands
 between camera and figure. Large triangles are split, so that light and shadow fall on parts of them. A level floor is
-the ground of the picture.
+the ground of the picture, unless it is over the figure's feet, as ceilings are.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ REACH = 2.0  # sizes of the figure around its middle that are shown
 EDGE = 0.1  # the same, longest edge of a triangle
 LEVEL = 1e-3  # [m] between the lowest and the highest point of a level floor
 WIDE = 1.5  # sizes of the figure that such a floor measures at least
+SUNK = 0.25  # the same, that its lowest point may be under a floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,13 +34,14 @@ class ShotProps:
     seconds: Callable[[int], float]
 
     def ground(self, lowest: float, size: float) -> float | None:
-        """Return the height of the level floor that is nearest to a figure's lowest point [m]; None without one.
+        """Return the height of the level floor that a figure's lowest point is nearest to [m]; None without one.
 
         Args:
             size: of the figure [m].
         """
         heights = [height for each in self.world.colliders if (height := _level(each, size)) is not None]
-        return min(heights, key=lambda height: abs(height - lowest), default=None)
+        beneath = [height for height in heights if height < lowest + SUNK * size]
+        return min(beneath, key=lambda height: abs(height - lowest), default=None)
 
     def surfaces(self, frame: int, figure: Floats, camera: Camera, ground: float) -> list[Surface]:
         """Return what is shown in a frame around a figure of points (P, 3) [m], but for what is its ground."""

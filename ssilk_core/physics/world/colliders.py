@@ -20,6 +20,7 @@ from ...scene.kinematics import (
 )
 from .surface import CollisionSurface, PosedSurface, Search, SurfaceDistance, boxes
 
+AT_ONCE = 256  # frames that are skinned together, to bound memory
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
 
 
@@ -146,7 +147,9 @@ def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
     skin, skeleton = scene.lbs_skin, scene.character.skeleton
     matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
     own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])
-    return skin_points(scene.garment.mesh.points[rows], own, matrices)
+    points = scene.garment.mesh.points[rows]
+    parts = (matrices[at : at + AT_ONCE] for at in range(0, len(matrices), AT_ONCE))
+    return np.concatenate([skin_points(points, own, part) for part in parts])
 
 
 def voting_points(motion: Motion, scene: Scene) -> Floats:

@@ -85,10 +85,16 @@ def test_props_are_where_their_world_has_them_and_when():
 
 def test_a_level_floor_is_the_ground_of_the_picture():
     props = ShotProps(ShotWorld(10.0, (floor(-0.3), floor(7.0), floor(0.0, 0.5), wall(-2.0))), lambda frame: 0.0)
-    assert props.ground(0.1, 2.0) == pytest.approx(-0.3) and props.ground(5.0, 2.0) == pytest.approx(7.0)
+    assert props.ground(0.1, 2.0) == pytest.approx(-0.3) and props.ground(7.1, 2.0) == pytest.approx(7.0)
     drawn = [surface.points[surface.faces][..., 1].max() for surface in props.surfaces(0, FIGURE, CAMERA, -0.3)]
     assert len(drawn) == 2 and min(drawn) == 0  # the small one and the wall
     assert ShotProps(ShotWorld(10.0, (wall(-2.0),)), float).ground(0.0, 2.0) is None
+
+
+def test_a_ceiling_is_no_ground_and_feet_sink_into_a_floor():
+    ceiling = ShotProps(ShotWorld(10.0, (floor(2.5),)), float)
+    assert ceiling.ground(0.0, 2.0) is None and ceiling.ground(2.3, 2.0) == pytest.approx(2.5)
+    assert ShotProps(ShotWorld(10.0, (floor(2.5), floor(-9.0))), float).ground(0.0, 2.0) == pytest.approx(-9.0)
 
 
 def test_sheets_show_props_beside_the_figure(tmp_path):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssilk_core.physics.simulate.incremental_potential import IncrementalPotenti
 from ssilk_core.physics.simulate.newton import SolverOptions
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
+from ssilk_core.physics.world.colliders import voting_points
 from ssilk_core.physics.world.felt import felt_gravity
 from ssilk_core.physics.world.surface import CollisionSurface, Nearest
 from ssilk_core.physics.world.surroundings import Surroundings
@@ -305,6 +307,16 @@ def test_a_sheet_that_hangs_in_wind_tilts_by_the_ratio_of_drag_and_weight(scene,
     hem, seam = found[-1, -3:].mean(axis=0), found[-1, :3].mean(axis=0)
     tilt = np.arctan2(hem[2] - seam[2], seam[1] - hem[1])
     assert tilt == pytest.approx(np.arctan(fabric.drag * speed / (fabric.density * G)), abs=5e-3)
+
+
+def test_where_the_body_carries_cloth_in_a_long_shot_takes_the_memory_of_what_is_found(scene) -> None:
+    motion = still(scene, 1500)
+    tracemalloc.start()
+    found = voting_points(motion, scene)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found) == motion.frame_count and np.array_equal(found[0], voting_points(motion.clip(0, 1), scene)[0])
+    assert peak < 5 * found.nbytes
 
 
 def test_an_even_wind_is_gravity_to_cloth_whatever_the_character_does(scene, toy_grid) -> None:
