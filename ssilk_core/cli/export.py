@@ -50,6 +50,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     output: Path = options.output
     if output.suffix != ".onnx":
         fail(str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
+    if options.root and not options.stage:
+        fail("--root", "a SkelRoot without a stage", "it says which character of --stage is meant", "give --stage")
     shared.check_output(output, options.model)
     file = load_model(options.model)
     if options.stage:

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdSkel, Vt
 from ssilk_usd.reading.facts import read_provenance
+from ssilk_usd.shots.layers_animation import with_points
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import certificate, hiding
 from ssilk_core.physics.intersections.pairs import self_intersections
 
 FRAMES = 21
@@ -103,6 +105,45 @@ def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
     stage.Export("bent.usda")
     assert main(["verify", "bent.usda"]) == 3
     assert "where its certificate says that none does" in capsys.readouterr().err
+
+
+def test_a_refined_shot_verifies_where_frames_of_it_were_moved(there):
+    assert main([*BAKE[:-1], "-o", "refined.usda", "--certify", "--refine", "2"]) == 0
+    assert read_provenance("refined.usda")["certificate"]["moved frames"]
+    assert main(["verify", "refined.usda"]) == 0
+
+
+@pytest.fixture
+def missing_at_first(monkeypatch):
+    """Shapes that move nothing, until frames get one each: the first file is as wrong as without a certificate."""
+    found = certificate._shapes_of
+
+    def shapes(offsets, *, exact):
+        shapes, weights = found(offsets, exact=exact)
+        return (shapes if exact else 0 * shapes), weights
+
+    monkeypatch.setattr(certificate, "_shapes_of", shapes)
+
+
+def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first):
+    assert main([*BAKE, "-o", "attempts/", "--certify", "--points"]) == 0
+    faces, (path,) = skinned("plain.usda")[1], there.glob("attempts/shots/*/*/anim.usdc")
+    shot = with_points(path)
+    assert not any(len(self_intersections(shot.garment_points(time), faces)) for time in shot.frame_times)
+
+
+def test_what_is_hidden_is_what_the_last_attempt_covers(there, missing_at_first, monkeypatch):
+    seen, found = [], hiding.covered_polygons
+    monkeypatch.setattr(hiding, "covered_polygons", lambda rollout, report: seen.append(rollout) or found(rollout))
+    assert main([*BAKE, "-o", "hidden.usda", "--certify", "--hide-covered"]) == 0
+    cloth = np.stack(list(seen[-1].vertices()))
+    np.testing.assert_allclose(cloth, skinned("hidden.usda")[0], atol=1e-5)
+
+
+def test_a_bake_without_a_certificate_records_nothing_of_it(there):
+    assert main([*BAKE, "-o", "bare/"]) == 0
+    (record,) = there.glob("bare/shots/*/*/bake.json")
+    assert "certificate" not in record.read_text()
 
 
 def test_layers_hold_it_too(there):

@@ -20,6 +20,15 @@ if TYPE_CHECKING:
 CHUNK = 16  # frames whose bodies are in memory at once
 
 
+def hidden_polygons_of(rollout: BakeRollout, report: Reporter = silent) -> HiddenPolygons | None:
+    """Return what a shot hides of each body; None where its request does not ask for it.
+
+    Raises:
+        SsilkError: as `covered_polygons` does.
+    """
+    return covered_polygons(rollout, report) if rollout.request.hide_covered else None
+
+
 def covered_polygons(rollout: BakeRollout, report: Reporter = silent) -> HiddenPolygons:
     """Return which polygons of each body the garment covers in the bind pose and in every frame of a shot.
 

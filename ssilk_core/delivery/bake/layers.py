@@ -17,7 +17,7 @@ from ...work_record import is_file
 from ..targets import check_influences
 from .certificate import certified, need_certifier, proven
 from .counted import state_rollout_counts
-from .hiding import covered_polygons
+from .hiding import hidden_polygons_of
 from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
 from .layered import tell_layers, tell_other_layers
@@ -302,7 +302,7 @@ def _write_layer(
     from ssilk_usd.shots import layers_animation
 
     rollout = certified(refined(solved(rollout, report), report, add_shapes=True), report)
-    hidden = covered_polygons(rollout, report) if task.request.hide_covered else None
+    hidden = hidden_polygons_of(rollout, report)
     riders = rollout.rider_joints()
     if riders and rollout.request.writes_points:
         text = "what rides on the garment follows the joints, also where the variant 'points' is selected"
@@ -314,10 +314,6 @@ def _write_layer(
         "lean": task.request.receiver.lean,
     }
     digests: dict[Path, str] = {}
-    if task.points:
-        digests[layout.points] = layers_animation.write_points(
-            layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
-        )
     with replacing(layout.animation) as unverified:
         while True:
             summary = layers_animation.write_animation(
@@ -337,7 +333,11 @@ def _write_layer(
             again = proven(rollout, unverified, report)
             if again is None:
                 break
-            rollout, riders = again, again.rider_joints()
+            rollout, riders, hidden = again, again.rider_joints(), hidden_polygons_of(again, report)
+        if task.points:  # not before: what the file shows may have moved the garment again
+            digests[layout.points] = layers_animation.write_points(
+                layout, asset, rollout.points(), rollout.deformer, rollout.motion, **common
+            )
         counts = state_rollout_counts(unverified, rollout)
         verification = verify_file(rollout, unverified, report) if task.verify else None
         digests[layout.animation] = sha256(unverified)  # not later: another process may replace the file

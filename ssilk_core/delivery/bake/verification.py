@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -135,12 +135,10 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
         if not shot.is_skinned:
             return verify_energies(rollout, map(shot.garment_points, times), report)
         if not rollout.request.writes_points:
-            return compare_trajectories(shot, refined_points(rollout, report), samples_per_frame=samples)
+            fitted = _with_moved(shot, times, refined_points(rollout, report), moved)
+            return compare_trajectories(shot, fitted, samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
-    if moved is not None:  # the last digits of where frames were moved to depend on the machine
-        expected = (
-            shot.garment_points(times[frame]) if moved(frame) else points for frame, points in enumerate(expected)
-        )
+    expected = _with_moved(shot, times, expected, moved)
     found = compare_points(shot, expected, samples_per_frame=samples)
     if not found.passed:
         todo = "bake it again, closer to the origin if it is many kilometres away"
@@ -151,6 +149,18 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
             f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; {todo}."
         )
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
+
+
+def _with_moved(
+    shot: PosedGarment, times: Sequence[float], expected: Iterator[Floats], moved: Callable[[int], bool] | None
+) -> Iterator[Floats]:
+    """Yield what a shot should hold (V, 3) [m], with its own points in frames that a certificate says were moved.
+
+    The last digits of where they were moved to depend on the machine.
+    """
+    for frame, points in enumerate(expected):
+        is_moved = moved is not None and frame < len(times) and moved(frame)
+        yield shot.garment_points(times[frame]) if is_moved else points
 
 
 def _verify_extent(

@@ -16,7 +16,7 @@ from ..targets import GLB
 from .certificate import certified, need_certifier, proven
 from .counted import ShotCounts, state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
-from .hiding import covered_polygons
+from .hiding import hidden_polygons_of
 from .latents import solved
 from .origin import shot_metadata
 from .refinement import refined
@@ -71,8 +71,7 @@ def bake(
     rollout = certified(refined(solved(rollout, report), report), report)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, path, report)
-    hidden = covered_polygons(rollout, report) if request.hide_covered else None
-    rollout, summary, counts, verification = _write_verified(rollout, path, include_body, hidden, verify, report)
+    rollout, hidden, summary, counts, verification = _write_verified(rollout, path, include_body, verify, report)
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
     result = result_of(rollout, path, summary, counts, verification, hidden)
@@ -127,23 +126,25 @@ def _write_verified(
     rollout: BakeRollout,
     output: Path,
     include_body: bool,
-    hidden: HiddenPolygons | None,
     verify: bool,
     report: Reporter,
-) -> tuple[BakeRollout, ShotSummary, ShotCounts, Verification | None]:
-    """Write a file that appears once it is verified; return the rollout that it holds, and what was found in it."""
+) -> tuple[BakeRollout, HiddenPolygons | None, ShotSummary, ShotCounts, Verification | None]:
+    """Write a file that appears once it is verified; return the rollout that it holds, what is hidden, and what was
+    found in it."""
     from ssilk_usd.writing.export import packaged
 
     with replacing(output) as unverified:
         with packaged(unverified, report, name=output) as layer:
+            hidden = hidden_polygons_of(rollout, report)
             summary = _write(layer, rollout, output, include_body, hidden)
             while again := proven(rollout, layer, report):
-                rollout = again
+                rollout, hidden = again, hidden_polygons_of(again, report)
                 summary = _write(layer, rollout, output, include_body, hidden)
             counts = state_rollout_counts(layer, rollout)
         if not verify:
             report(Message("not verified, as asked", "warning"))
-        return rollout, summary, counts, verify_file(rollout, unverified, report) if verify else None
+        verification = verify_file(rollout, unverified, report) if verify else None
+        return rollout, hidden, summary, counts, verification
 
 
 def _write(

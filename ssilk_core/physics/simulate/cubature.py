@@ -203,5 +203,6 @@ def _coarse(scene: Scene, cubature: Cubature) -> Scene:
         classes=scene.classes[vertices],
         pins=None,
         levels=None,
+        sewn=None,  # contacts, which alone look at it, are about where it lies
     )
     return Scene(scene.character, dressed, replace(rig, skin=part(rig.skin)))

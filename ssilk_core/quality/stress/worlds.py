@@ -38,7 +38,11 @@ def scale_scene(scene: Scene, scale: float) -> Scene:
     bodies = [Body(_scaled(body.mesh, scale), body.skin) for body in scene.character.bodies]
     return Scene(
         replace(scene.character, skeleton=grown, bodies=tuple(bodies)),
-        replace(garment, mesh=_scaled(garment.mesh, scale)),
+        replace(
+            garment,
+            mesh=_scaled(garment.mesh, scale),
+            sewn=None if garment.sewn is None else scale * garment.sewn,
+        ),
         replace(rig, bind_transforms=_moved(rig.bind_transforms, scale)),
     )
 
@@ -58,9 +62,15 @@ def add_slivers(scene: Scene, height: float, every: int = 100) -> Scene:
 
     The tip of the triangle moves next to the middle of the opposite edge. Slivers share no vertices.
     """
-    mesh = scene.garment.mesh
-    points, used = np.array(mesh.points), np.zeros(mesh.vertex_count, dtype=bool)
-    for face in mesh.faces[::every]:
+    garment, mesh = scene.garment, scene.garment.mesh
+    sewn = None if garment.sewn is None else _with_slivers(garment.sewn, mesh.faces, height, every)
+    thin = Mesh(mesh.path, _with_slivers(mesh.points, mesh.faces, height, every), mesh.faces)
+    return replace(scene, garment=replace(garment, mesh=thin, sewn=sewn))
+
+
+def _with_slivers(places: Floats, faces: Ints, height: float, every: int) -> Floats:
+    points, used = np.array(places), np.zeros(len(places), dtype=bool)
+    for face in faces[::every]:
         if used[face].any():
             continue
         used[face] = True
@@ -68,7 +78,7 @@ def add_slivers(scene: Scene, height: float, every: int = 100) -> Scene:
         base, middle = b - a, (a + b) / 2
         rise = (tip - a) - base * ((tip - a) @ base) / (base @ base)
         points[face[2]] = middle + height * np.linalg.norm(base) * rise / max(np.linalg.norm(rise), 1e-300)
-    return replace(scene, garment=replace(scene.garment, mesh=Mesh(mesh.path, points, mesh.faces)))
+    return points
 
 
 def resize_garment(scene: Scene, count: int) -> Scene:

@@ -126,6 +126,15 @@ def test_what_vertices_stand_for_adds_up(whole, monkeypatch) -> None:
     assert set(cubature.vertices[found.free.numpy()]) <= set(free.tolist())
 
 
+def test_a_garment_on_another_body_is_summed_over_few_elements_too(whole, monkeypatch) -> None:
+    monkeypatch.setattr(elements, "PAIRS", FEW)
+    monkeypatch.setattr(elements, "ADDED", 0)
+    scene, potential, cubature = whole.scene, whole.shots.simulator.potential, whole.chosen()
+    sewn = replace(scene, garment=replace(scene.garment, sewn=scene.garment.mesh.points))
+    own, its = (sampled_potential(potential, each, cubature) for each in (scene, sewn))
+    torch.testing.assert_close(its.mass, own.mass)
+
+
 def test_weights_give_the_forces_of_the_whole_garment_better_than_those_of_areas_do(whole, monkeypatch) -> None:
     monkeypatch.setattr(elements, "PAIRS", FEW)
     monkeypatch.setattr(elements, "ADDED", FEW)

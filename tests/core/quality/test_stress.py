@@ -210,6 +210,24 @@ def test_a_larger_scene_is_the_same_but_larger(scene, base, scale):
     torch.testing.assert_close(pair[1], scale * pair[0])
 
 
+@pytest.fixture
+def elsewhere(scene):
+    """The garment on a body for which it was not sewn."""
+    return replace(scene, garment=replace(scene.garment, sewn=0.8 * scene.garment.mesh.points))
+
+
+def test_a_garment_on_another_body_is_scaled_with_the_shape_it_was_sewn_in(elsewhere):
+    large = worlds.scale_scene(elsewhere, 100.0)
+    np.testing.assert_allclose(large.garment.sewn, 80.0 * elsewhere.garment.mesh.points)
+
+
+def test_slivers_of_a_garment_on_another_body_are_sewn_as_such(elsewhere):
+    mesh = worlds.add_slivers(elsewhere, 1e-3, every=20).garment.sewn_mesh
+    a, b, c = mesh.points[mesh.faces[::20]].swapaxes(0, 1)
+    ratio = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.linalg.norm(b - a, axis=1) ** 2
+    assert np.isclose(ratio, 1e-3, rtol=1e-6).sum() >= 3
+
+
 @pytest.mark.parametrize("count", [30, 60, 500, 2000])
 def test_a_garment_of_any_number_of_vertices(scene, count):
     found = worlds.resize_garment(scene, count)
