@@ -147,7 +147,7 @@ def test_nothing_is_interpolated_across_a_cut_where_the_grids_of_motion_and_shot
     moved = source.translations.copy()
     moved[:, 0, 0] = 0.9 * np.arange(len(moved)) + 100 * (np.arange(len(moved)) > 40)  # at 54 m/s
     felt = np.where(np.arange(len(moved)) > 40, 1.0, -1.0)  # gravity and colliders of either side alone
-    given = {"gravity": felt[:, None] * [0, 9.81, 0], "proximity": felt[:, None, None] * np.ones((2, 3))}
+    given = {"gravity": felt[:, None] * [0, 9.81, 0], "proximity": felt[:, None, None] * np.ones((2, 5))}
     found = _from_fraction(replace(source, translations=moved, **given), skeleton, 0.25)
     later = np.arange(len(moved)) + 0.25
     np.testing.assert_allclose(found.translations[:, 0, 0], 0.9 * later + 100 * (later > 40), atol=1e-9)
