@@ -75,9 +75,16 @@ def bends(origins: Floats) -> Floats:
     return found
 
 
+def feedback_points(scene: Scene, config: ModelConfig) -> int:
+    """Return how many vertices S sees."""
+    if not SCHEMES[config.scheme].states:
+        return 0
+    return min(config.feedback_points, int((scene.classes != PINNED).sum()))
+
+
 def feedback_size(scene: Scene, config: ModelConfig) -> int:
     """Return the number of features that S sees: three for each vertex of `feedback_vertices`, and of proxies."""
     if not SCHEMES[config.scheme].states:
         return 0
     proxies = 2 * config.proxy_outputs * scene.rig.proxy_count if config.feedback_proxies else 0
-    return 3 * min(config.feedback_points, int((scene.classes != PINNED).sum())) + proxies
+    return 3 * feedback_points(scene, config) + proxies

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..scene.assets import PINNED, Floats, Ints, Scene
 from .descriptors import VECTORS, inner_joints
-from .feedback import feedback_size
+from .feedback import feedback_points, feedback_size
 from .proximity import proximity_size
 from .schemes import SCHEMES
 from .settings import ModelConfig
@@ -56,15 +56,17 @@ def seeing_more(
 
     Points are those of before and others, so that the features of others come after theirs.
     """
-    proximity, seen = proximity_size(scene, before), feedback_size(scene, before)
-    near, more = proximity_size(scene, after) - proximity, feedback_size(scene, after) - seen
+    proximity, points = proximity_size(scene, before), feedback_points(scene, before)
+    near = proximity_size(scene, after) - proximity
+    more = 3 * (feedback_points(scene, after) - points)
+    proxies = feedback_size(scene, before) - 3 * points  # which come last
     states = SCHEMES[before.scheme].states * before.latent
     found = dict(parameters)
-    for name, first, last in (("initialiser.0.weight", 0, 0), ("stepper.0.weight", states, more)):
+    for name, first, added, last in (("initialiser.0.weight", 0, 0, 0), ("stepper.0.weight", states, more, proxies)):
         if name in found:
-            weights, at = found[name], first + proximity
-            blank = np.zeros((len(weights), near + last), weights.dtype)
-            found[name] = np.hstack([weights[:, :at], blank[:, :near], weights[:, at:], blank[:, near:]])
+            parts = np.split(found[name], [first + proximity, found[name].shape[1] - last], axis=1)
+            blank = np.zeros((len(parts[0]), near + added), parts[0].dtype)
+            found[name] = np.hstack([parts[0], blank[:, :near], parts[1], blank[:, near:], parts[2]])
     return found
 
 

@@ -228,9 +228,10 @@ def test_what_is_not_near_is_not_seen_and_what_holds_a_point_is_seen_from_inside
     np.testing.assert_allclose(length, vectors[:, 1], atol=1e-12)
 
 
-def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model) -> None:
-    before = toy_model(scene)
-    after = toy_model(scene, proximity_points=POINTS, feedback_points=before.config.feedback_points + 2)
+@pytest.mark.parametrize("given", [{}, {"scheme": "verlet", "feedback_proxies": True}])
+def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model, given) -> None:
+    before = toy_model(scene, feedback_points=3, **given)
+    after = toy_model(scene, proximity_points=POINTS, feedback_points=5, **given)
     kept = {name: value.numpy() for name, value in before.state_dict().items()}
     more = seeing_more(kept, scene, before.config, after.config)
     assert {name: value.shape for name, value in more.items()} == parameter_shapes(scene, after.config, JOINTS)
@@ -238,7 +239,8 @@ def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model) -> None
     static = torch.randn(4, before.initialiser[0].in_features)
     pose = torch.cat([static, torch.randn(4, before.described - static.shape[1])], dim=1)
     rest, seen = before.initial(static), torch.randn(4, after.feedback.size)
-    blind = before.step(rest, rest + 0.1, rest, pose, seen[:, : before.feedback.size])
+    known = torch.cat([seen[:, : 3 * 3], seen[:, 5 * 3 :]], dim=1)  # proxies come after points
+    blind = before.step(rest, rest + 0.1, rest, pose, known)
     for near in (torch.zeros(4, after.proximity), torch.rand(4, after.proximity)):
         given = torch.cat([near, static], dim=1), torch.cat([near, pose], dim=1)
         torch.testing.assert_close(after.initial(given[0]), rest)
