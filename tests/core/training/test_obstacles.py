@@ -239,6 +239,7 @@ def test_a_network_that_learns_to_see_begins_as_it_was(scene, toy_model, given) 
     static = torch.randn(4, before.initialiser[0].in_features)
     pose = torch.cat([static, torch.randn(4, before.described - static.shape[1])], dim=1)
     rest, seen = before.initial(static), torch.randn(4, after.feedback.size)
+    seen[:, 3 * 3 : 5 * 3] = 0  # their size bounds what S may give
     known = torch.cat([seen[:, : 3 * 3], seen[:, 5 * 3 :]], dim=1)  # proxies come after points
     blind = before.step(rest, rest + 0.1, rest, pose, known)
     for near in (torch.zeros(4, after.proximity), torch.rand(4, after.proximity)):
