@@ -264,6 +264,11 @@ def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
     assert run("bake small.safetensors --motion clip.usda --stage heavier.usda -o small.usda") == 0
 
 
+def test_a_character_without_a_stage_is_no_body_to_export_for(world, capsys):
+    assert run("export family.safetensors --root /Hero -o hero.onnx") == 2
+    assert "a SkelRoot without a stage" in capsys.readouterr().err and not Path("hero.onnx").exists()
+
+
 def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
     assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
     assert "train for the family anew" in capsys.readouterr().err

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdSkel, Vt
@@ -12,6 +14,7 @@ from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import certificate, hiding
+from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.pairs import self_intersections
 
 FRAMES = 21
@@ -144,6 +147,17 @@ def test_a_bake_without_a_certificate_records_nothing_of_it(there):
     assert main([*BAKE, "-o", "bare/"]) == 0
     (record,) = there.glob("bare/shots/*/*/bake.json")
     assert "certificate" not in record.read_text()
+
+
+def test_pairs_that_do_not_count_are_told(there, capsys):
+    file = load_model("model.safetensors")
+    garment = file.scene.garment
+    points = garment.mesh.points.copy()
+    points[len(points) // 2] = [-1.3, 1, -1.2] * points[len(points) // 2] + [0, 0.007, 0]  # through the opposite side
+    crossed = replace(garment, mesh=replace(garment.mesh, points=points))
+    save_model("crossed.safetensors", replace(file, scene=replace(file.scene, garment=crossed)))
+    assert main(["bake", "crossed.safetensors", *BAKE[2:], "-o", "crossed.usda", "--range", "0-1", "--certify"]) == 0
+    assert "that intersect in the bind pose, or that stitches join, do not count" in capsys.readouterr().err
 
 
 def test_layers_hold_it_too(there):

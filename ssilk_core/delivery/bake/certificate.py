@@ -11,7 +11,7 @@ more room between cloth and cloth.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,6 +85,9 @@ def certified(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     poses = tuple(rollout.poses())
     points = [vertices for pose in poses for vertices in rollout.decode(pose)]
     work = CertificateWork(rollout, Certifier(rollout.deformer.scene), _frames(rollout, poses, points))
+    if excused := len(work.certifier.finder.cloth.allowed):
+        text = f"{excused} pairs of triangles that intersect in the bind pose, or that stitches join, do not count"
+        report(Message(f"{rollout.deformer.scene.garment.mesh.path}: {text}", "warning"))
     report(Message("looking for cloth that passes through cloth, and for covered skin that shows"))
     faults = work.certifier.faults(work.frames, Countdown(work.frames.count, report))
     work.faulty = tuple(faults)
@@ -149,8 +152,7 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
 
 def _frames_said(said: object) -> set[int]:
     """Return the frames of spans such as "3 to 5" that a file lists."""
-    spans = [str(each).split(" to ") for each in said] if isinstance(said, Sequence | np.ndarray) else []
-    spans = spans or [str(each).split(" to ") for each in (said or ())]  # type: ignore[attr-defined]
+    spans = [str(each).split(" to ") for each in said] if isinstance(said, Iterable) else []
     return {frame for first, last in spans for frame in range(int(first), int(last) + 1)}
 
 
