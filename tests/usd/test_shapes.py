@@ -8,7 +8,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 from ssilk_usd.reading.scene import read_scene
-from ssilk_usd.reading.shapes import animated_shapes
+from ssilk_usd.reading.shapes import AnimatedShape, animated_shapes, tell_animated_shapes
 from ssilk_usd.reading.shown import shown_otherwise, tell_shown_otherwise
 
 from ssilk_core.scene import kinematics
@@ -539,3 +539,15 @@ def test_of_bodies_of_one_name_each_is_compared_with_its_own(tmp_path):
     off = np.linalg.norm(seen(path, "/Hero/Body", 1) - seen(hero, "/Hero/Body", 1), axis=1).max()
     (told,) = shown_otherwise(hero, path, garment="Cape")
     assert told.startswith(f"it shapes Body otherwise, by up to {mm(off)} mm")
+
+
+def test_shapes_of_one_mesh_hide_those_of_no_other():
+    found = [AnimatedShape(*each) for each in (
+        ("Brow", "Body", 0, 0, 1), ("Heavy", "Body", 0, 1, 1), ("Heavy", "Skirt", 0, 0.3, 1),
+    )]  # fmt: skip
+    told: list[str] = []
+    tell_animated_shapes("shot.usda", found, lambda event: told.append(event.text))
+    assert len(told) == 1 and told[0].startswith(
+        "shot.usda: it weighs blendshapes that are not followed: 'Brow' of Body, from 0 to 1 where the character's "
+        "stage has 0; 'Heavy' of Skirt, from 0.3 to 1 where the character's stage has 0, and 1 more; "
+    )
