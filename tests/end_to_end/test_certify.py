@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,8 @@ from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import certificate, hiding
+from ssilk_core.delivery.bake.certificate import need_certifier
+from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.pairs import self_intersections
 
@@ -185,3 +188,13 @@ def test_a_missing_library_is_told_before_work(there, capsys, monkeypatch):
     monkeypatch.setattr("ssilk_core.delivery.bake.certificate.NEEDED", ("no_such_library",))
     assert main([*BAKE, "-o", "none.usda", "--certify"]) == 2
     assert "pip install 'ssilk[certify]'" in capsys.readouterr().err and not (there / "none.usda").exists()
+
+
+def test_an_ipctk_that_cannot_be_loaded_is_told_before_any_work(tmp_path, monkeypatch):
+    (tmp_path / "ipctk.py").write_text("raise ImportError('libtbb.so.12: cannot open shared object file')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "ipctk", raising=False)
+    with pytest.raises(
+        SsilkError, match=r"^--certify: ipctk cannot be loaded: libtbb\.so\.12: .*force-reinstall ipctk"
+    ):
+        need_certifier()

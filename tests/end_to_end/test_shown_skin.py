@@ -113,7 +113,7 @@ def test_the_figure_is_that_of_the_written_file(folder, monkeypatch, capsys, wor
     assert (crossed["frames"], crossed["triangles"]) == (len(expected.frames), len(skirt.faces))
     one = 1 / len(skirt.faces)  # a pair that merely touches may part where float32 rounds
     assert crossed["mean"] == pytest.approx(expected.shares.mean(), abs=2 * one, rel=1e-3)
-    assert re.search(r"^ *triangles that intersect others: [0-9.]+%, in 2 frames$", printed, re.MULTILINE)
+    assert re.search(r"^ *triangles that intersect others: [0-9.]+%, the mean of 2 frames$", printed, re.MULTILINE)
     _, others, _ = counted("shot.usdc", 12_000, SEED + 1)
     assert others.mean() == pytest.approx(shows.mean(), rel=0.1, abs=1e-3)  # few points show
 

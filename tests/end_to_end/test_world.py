@@ -169,7 +169,7 @@ def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
             {"/Set/Floor": under.sum() / together, "/Set/Box": boxed.sum() / together}, abs=1e-4
         )
         assert said["deepest"] == pytest.approx(max(depth.max() for depth in depths), rel=1e-3)
-        assert f"cloth inside colliders: {share.mean():.3%}, in 5 frames" in told
+        assert f"cloth inside colliders: {share.mean():.3%}, the mean of 5 frames" in told
         assert f"{share.max():.2%}, floored at time code {share.argmax()}" in told and "/Set/Floor" in told
     layers = [*baked, "floored.usda", "plain.usda", "-o", "layers"]
     assert main(layers) == 0

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,13 +49,18 @@ def need_certifier() -> None:
     """Check that frames can be certified, before work that ends in it.
 
     Raises:
-        SsilkError: a library is missing.
+        SsilkError: a library is missing, or cannot be loaded.
     """
     need_predicates()
+    allowed = "--certify moves cloth by continuous tests of ipctk"
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:
-        found, allowed = f"{', '.join(missing)} not installed", "--certify moves cloth by continuous tests of ipctk"
-        fail("--certify", found, allowed, "pip install 'ssilk[certify]'")
+        fail("--certify", f"{', '.join(missing)} not installed", allowed, "pip install 'ssilk[certify]'")
+    for name in NEEDED:
+        try:
+            import_module(name)
+        except ImportError as error:  # such as a wheel of another machine
+            fail("--certify", f"{name} cannot be loaded: {error}", allowed, "pip install --force-reinstall ipctk")
 
 
 @dataclass(eq=False)

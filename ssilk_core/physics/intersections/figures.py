@@ -97,7 +97,7 @@ class SelfIntersections(TriangleShares):
         """Return figures for people; `clock` is what `frame` counts. No frame is the worst where all have none."""
         worst = {"most in one frame": f"{self.worst:.2%}, {self.clip} at {clock} {self.frame:g}"}
         return {
-            SHARE: f"{self.mean:.3%}, in {self.frames} frames",
+            SHARE: f"{self.mean:.3%}, the mean of {self.frames} frames",
             **(worst if self.worst else {}),
             **({"mostly at": self.where} if self.where else {}),
         }

@@ -44,7 +44,7 @@ class SunkCloth:
 
     def summary(self, clock: str = "frame") -> dict[str, str]:
         """Return figures for people; `clock` is what `frame` counts. No frame is the worst where none is inside."""
-        found = {"cloth inside colliders": f"{self.mean:.3%}, in {self.frames} frames"}
+        found = {"cloth inside colliders": f"{self.mean:.3%}, the mean of {self.frames} frames"}
         if not self.worst:
             return found
         depth = f"{1000 * self.deepest:.0f} mm deep at most"

@@ -79,7 +79,9 @@ class AnimatedShape:
 def tell_animated_shapes(motion: str, found: Sequence[AnimatedShape], report: Reporter) -> None:
     """Report the blendshapes that a motion changes, in which cloth does not meet the character's meshes."""
     if found:
-        named = {each.mesh: each for each in found[::-1]}  # the first of each mesh: those of a face hide no body's
+        named: dict[str, AnimatedShape] = {}
+        for each in found:
+            named.setdefault(each.mesh, each)  # those of a face hide no body's
         text = f"{motion}: it weighs blendshapes that are not followed: {'; '.join(map(str, named.values()))}"
         more = f", and {len(found) - len(named)} more" if len(found) > len(named) else ""
         report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
