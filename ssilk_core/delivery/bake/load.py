@@ -175,8 +175,10 @@ class LoadedGarment:
 
         gravity = felt_gravity(around.pull, motion, scene, self.file.fabric) if sight.pull else None
         motion = motion if gravity is None else replace(motion, gravity=gravity)
-        near = seen_proximity(around.seen, motion, NumpyGarment(self.file)) if sight.colliders else None
-        return motion if near is None else replace(motion, proximity=near)
+        seen = around.seen if sight.colliders else None
+        if seen is None or not seen.colliders:  # then no network is built to look
+            return motion
+        return replace(motion, proximity=seen_proximity(seen, motion, NumpyGarment(self.file)))
 
     def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""

@@ -154,8 +154,12 @@ def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
 
 def voting_points(motion: Motion, scene: Scene) -> Floats:
     """Return vertices of a garment by which floors have their outside, as `carried_points`, shape (F, P, 3)."""
-    count = scene.garment.mesh.vertex_count
-    return carried_points(motion, scene, np.linspace(0, count - 1, min(VOTERS, count)).astype(int))
+    return carried_points(motion, scene, voting_rows(scene.garment.mesh.vertex_count))
+
+
+def voting_rows(count: int) -> Ints:
+    """Return which of a garment's vertices, so many, tell the outside of floors, shape (P,)."""
+    return np.linspace(0, count - 1, min(VOTERS, count)).astype(int)
 
 
 def placed_at(placements: Floats, world: ShotWorld, seconds: float) -> Floats:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ...scene.assets import Floats, ShotWorld
 from .air import MovingAir
-from .colliders import VOTERS, ColliderPoser, PosedCollider
+from .colliders import ColliderPoser, PosedCollider, voting_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class Surroundings:
             carried: the garment as the body carries it, relative to the roots, shape (V, 3, N).
         """
         roots = root.double().cpu().numpy().T
-        voters = np.linspace(0, len(carried) - 1, min(VOTERS, len(carried))).astype(int)
+        voters = voting_rows(len(carried))
         points = carried[torch.as_tensor(voters, device=carried.device)].double().cpu().numpy()
         gravity = np.zeros((len(places), 3))
         colliders = []
