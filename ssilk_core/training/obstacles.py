@@ -30,8 +30,10 @@ from .motion_bank import MotionBank
 BODY_POINTS = 256  # spread over the body, by which it is kept out of obstacles
 SKIN = 0.005  # [m] between these and an obstacle that touches the body
 FLOORS, BOTH = 0.4, 0.25  # shares of poses with obstacles that have a floor or wall alone, and one beside something
-LYING = 0.6  # share of floors that the body touches
+TOUCHED = 0.6  # share of floors that the body touches
 LEVEL = 0.6  # share of floors that are level; others are tilted, or walls
+LYING = 0.6  # share of bodies that are turned over that lie on a level floor, beside all others
+TURNED = 0.7  # cosine between gravity and straight down, below which a body is turned over
 FURTHEST = 0.4  # of the reach, up to which others are away from the body
 UNTOUCHED = 0.4  # share of obstacles beside the garment that do not touch it; they are away as far as floors are
 LARGE = 50.0  # [m] half extents of a floor
@@ -173,20 +175,21 @@ class ObstacleDrawer:
             gravity: its directions (N, 3).
         """
         count, middle = frames.shape[1], frames[len(frames) // 2]
-        chance = self._uniform(4, count)
-        floor = (chance[0] < self.share) & (chance[1] < FLOORS + BOTH)
+        chance = self._uniform(5, count)
+        lies = (-gravity[:, 1] < TURNED) & (chance[4] < LYING)
+        floor = lies | (chance[0] < self.share) & (chance[1] < FLOORS + BOTH)
         other = (chance[0] < self.share) & (chance[1] > FLOORS)
         points = self._resting(middle, gravity)
         # A floor is at the body or further away, and others where they were put unless the body or cloth is there.
         gap, beside = self._uniform(2, count) ** 2 * FURTHEST * self.reach
-        gap = torch.where(chance[2] < LYING, torch.zeros_like(gap), gap)
+        gap = torch.where(lies | (chance[2] < TOUCHED), torch.zeros_like(gap), gap)
         beside = torch.where(chance[3] < UNTOUCHED, beside, torch.full_like(beside, -LARGE))
 
         def in_the_way(box: Obstacles) -> Tensor:
             cloth = beside - box.distance(points, 0).amin(dim=0)
             return torch.maximum(-self._clearance(box, frames)[0], cloth).clamp_min(0)
 
-        level, (box, way) = self._floors(points, gravity), self._others(points)
+        level, (box, way) = self._floors(points, gravity, lies), self._others(points)
         box = Obstacles(box.turn, box.centre + in_the_way(box)[:, None] * way, box.half, box.radius)
         radius = torch.cat([
             level.radius + self._clearance(level, frames) - gap,
@@ -214,13 +217,14 @@ class ObstacleDrawer:
         least = [repeated.distance(points, box).amin(dim=0) for box in range(len(obstacles.radius))]
         return torch.stack(least).unflatten(1, frames.shape).amin(dim=1) - SKIN
 
-    def _floors(self, points: Tensor, gravity: Tensor) -> Obstacles:
-        """Return floors and walls that pass through the middle of the garment."""
+    def _floors(self, points: Tensor, gravity: Tensor, level: Tensor) -> Obstacles:
+        """Return floors and walls that pass through the middle of the garment; level ones where `level` (N,) says."""
         count, device = len(gravity), points.device
         tilt = 0.2 * self._normal(count, 3)
         anywhere, chance = self._normal(count, 3), self._uniform(2, count, 1)
         up = nn.functional.normalize(-gravity, dim=1)
-        up = torch.where(chance[0] < LEVEL, up, torch.where(chance[1] < 0.5, up + tilt, anywhere))
+        flat = level[:, None] | (chance[0] < LEVEL)
+        up = torch.where(flat, up, torch.where(chance[1] < 0.5, up + tilt, anywhere))
         turn = _frames_along(nn.functional.normalize(up, dim=1), self._normal(count, 3))
         centre = points.mean(dim=0).T - LARGE * turn[..., 0]
         half, radius = torch.full((count, 3), LARGE, device=device), torch.zeros(count, device=device)

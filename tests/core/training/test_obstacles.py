@@ -124,8 +124,7 @@ def test_of_several_the_nearest_counts() -> None:
 def test_the_body_stays_outside_and_the_share_without_has_nothing_near(scene, seeing, bank) -> None:
     draws = drawer(scene, seeing, bank, share=0.6)
     frames = torch.arange(0, 15)[:, None] + torch.randint(0, 10, (1, 300), generator=torch.Generator().manual_seed(2))
-    gravity = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(3)), dim=1)
-    found = draws.draw(frames, gravity)
+    found = draws.draw(frames, torch.tensor([0.0, -1, 0]).expand(300, 3))
     absent = found.radius < -LARGE
     assert 0.3 < absent.all(dim=0).float().mean() < 0.5
     # Of obstacles beside the garment some have no room.
@@ -142,6 +141,22 @@ def test_the_body_stays_outside_and_the_share_without_has_nothing_near(scene, se
     # Most floors touch the body.
     touching = draws._clearance(found, frames)[0][~absent[0]]
     assert 0.4 < (touching.abs() < 1e-3).float().mean() < 0.8
+
+
+def test_bodies_that_are_turned_over_mostly_lie_on_a_level_floor(scene, seeing, bank) -> None:
+    draws = drawer(scene, seeing, bank, share=1e-3)
+    frames = torch.arange(0, 6)[:, None].expand(6, 400)
+    turn = torch.linspace(0, np.pi, 400)
+    gravity = torch.stack([turn.sin(), -turn.cos(), torch.zeros(400)], dim=1)
+    found = draws.draw(frames, gravity)
+    floor = found.radius[0] > -LARGE
+    turned = turn > 0.8
+    assert 0.5 < floor[turned].float().mean() < 0.7
+    assert floor[~turned].float().mean() < 0.05
+    lies = floor & turned
+    up = found.turn[0, :, :, 0]
+    assert torch.allclose(up[lies], -gravity[lies], atol=1e-6)
+    assert draws._clearance(found, frames)[0][lies].abs().max() < 1e-3
 
 
 def test_an_obstacle_in_the_way_draws_back_and_others_stay(scene, seeing, bank) -> None:
