@@ -391,6 +391,14 @@ def tell_shapes(options: argparse.Namespace, motions: Iterable[Motion], report: 
     tell_shown_otherwise(options.stage, paths, report, **chosen)
 
 
+def with_shapes(options: argparse.Namespace, motion: Motion, source: str | Path, scene: Scene) -> Motion:
+    """Return a motion with the blendshapes of the character that its file weighs; options as `load_scene`."""
+    from ssilk_usd.reading.body_shapes import with_body_shapes
+
+    chosen = {"root": options.root, "garment": scene.garment.mesh.path.rpartition("/")[2]}
+    return with_body_shapes(options.stage, str(source), motion, scene.character, **chosen)
+
+
 def load_scene(
     options: argparse.Namespace,
     report: Reporter,

@@ -110,7 +110,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
+    read = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
+    motions = [shared.with_shapes(options, motion, path, scene) for motion, path in zip(read, options.motion)]
     shared.tell_shapes(options, motions, report)
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric), str(path), asked)

@@ -125,7 +125,7 @@ class LatentShots:
         poses = self.simulator.poser.pose(*(
             np.concatenate([getattr(motion, name)[rows] for motion, rows in zip(motions, kept)])
             for name in ("rotations", "translations")
-        ))  # fmt: skip
+        ), self.simulator.poser.moves(zip(motions, kept)))  # fmt: skip
         scene = self.model.scene
         cubature = choose_elements(scene, self.simulator, self.solver, z, poses)
         simulator = self.simulator.sampled(scene, cubature)
@@ -192,7 +192,7 @@ class LatentShots:
             counts = torch.tensor([span.frame_count for span in spans], device=device)
             posed = simulator.poser.pose(*(
                 np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
-            ))  # fmt: skip
+            ), simulator.poser.moves((span, slice(None)) for span in spans))  # fmt: skip
             rows = counts.cumsum(0) - counts
             for frame in range(max(first - start, 0), spans[0].frame_count):
                 yield posed.select(rows[counts > frame] + frame)

@@ -198,7 +198,8 @@ class Refiner:
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._next_frames(network, stop - start)
-            poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
+            moves = self.simulator.poser.moves([(span, slice(start, stop))])
+            poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop], moves)
             if surroundings is not None:
                 places = [(0, (first + frame) / span.fps) for frame in range(start, stop)]
                 poses = replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
@@ -230,7 +231,7 @@ class Refiner:
             poses = self.simulator.poser.pose(*(
                 np.stack([getattr(motion, name)[number] for motion in running])
                 for name in ("rotations", "translations")
-            ))  # fmt: skip
+            ), self.simulator.poser.moves((motion, slice(number, number + 1)) for motion in running))  # fmt: skip
             frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None)
             yield list(frames)
 

@@ -16,6 +16,7 @@ from ..opening.times import change_times
 from ..units import StageUnits
 from .clips import spread
 from .posed import SkinnedMesh, posed_mesh, skinning_of
+from .same_meshes import faces_of
 from .skin import match_joints
 from .spaces import SkelSource, similarity_scale
 
@@ -166,13 +167,6 @@ def _most_on(shown: SkinnedMesh, times: Floats) -> Ints:
 def _prim_path(mesh: Mesh) -> str:
     """Return the path of the prim that a mesh was read from."""
     return "/" + mesh.path.rpartition(":/")[2]
-
-
-def faces_of(prim: Usd.Prim) -> tuple[bytes, bytes]:
-    """Return the faces of a mesh, to be compared."""
-    values = (value(prim, name) for name in ("faceVertexCounts", "faceVertexIndices"))
-    counts, indices = (np.array(each or [], dtype=np.int32).tobytes() for each in values)
-    return counts, indices
 
 
 def rest_off(own: Usd.Prim, other: Usd.Prim) -> Off | None:

@@ -27,7 +27,7 @@ SAME = 1e-3  # difference of weights that nobody sees
 
 def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> Floats | None:
     """Return how far the blendshapes that are on move a mesh's points in its own space, (V, 3); None without any."""
-    weights = _weights(prim, skel, code)
+    weights = shape_weights(prim, skel, code)
     if weights is None or not np.any(weights):
         return None
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
@@ -39,7 +39,7 @@ def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIES
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
-def _weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:
+def shape_weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:
     """Return the weight of each blendshape of a mesh at a time; None where nothing weighs them."""
     cache = UsdSkel.Cache()
     cache.Populate(UsdSkel.Root(skel.root), PRIMS)
@@ -122,7 +122,7 @@ def animated_shapes(
         if not (len(rows) and mesh.IsA(UsdGeom.Mesh) and bound_skeleton(mesh) == skel.prim):
             continue
         own = [str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ()]
-        weights = _weights(mesh, skel) or [0.0] * len(own)
+        weights = shape_weights(mesh, skel) or [0.0] * len(own)
         for name, weight in zip(own, weights):
             unnamed = weight if placed is None else 0.0
             course = rows[:, names.index(name)] if name in names else np.array([unnamed])

@@ -23,11 +23,12 @@ from ..opening.stage import PRIMS, USD_SUFFIXES, StageLike, named, needs_whole_f
 from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
 from .character import is_skinned, read_character
-from .compared import Compared, faces_of, rest_off
+from .compared import Compared, rest_off
 from .garment import find_garment, read_garment
 from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in, kept_faces
 from .motion import find_animation, read_motion
 from .rig import read_proxy_rig
+from .same_meshes import same_meshes, skinned_meshes
 from .shapes import animated_shapes, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource
@@ -83,7 +84,7 @@ def shown_otherwise(
     """
     stage, (file, prim) = open_stage(source), split_location(motion)
     skel = find_skeleton(stage, root=root, garment=garment)
-    own = [mesh for mesh in _meshes(skel) if is_drawn(mesh)]
+    own = [mesh for mesh in skinned_meshes(skel) if is_drawn(mesh)]
     found = [_hidden(mesh, skel, " of its own stage") for mesh in own]
     _, placed = find_animation(of_motion := open_stage(file), prim, root)
     if placed is None:
@@ -102,7 +103,7 @@ def shown_otherwise(
         found.append(f"its garment is not compared with the character's: {error}")
     if cloth is not None and cloth.prim not in own:
         own.append(cloth.prim)
-    same = _same_meshes(there, skel, own, cloth)
+    same = same_meshes(there, skel, own, cloth.prim if cloth else None)
     read = read_motion(of_motion, character.skeleton, prim=prim, root=root)
     compared = Compared(character, cloth.garment if cloth else None, cloth.rig if cloth else None, read, there)
     # Cloth that was simulated, in place of the character's, over bodies whose faces may be hidden.
@@ -144,58 +145,6 @@ def _read_cloth(stage: Usd.Stage, skeleton: Skeleton, garment: str | None, root:
     read = read_garment(stage, skeleton, garment=garment, root=root)
     rig = read_proxy_rig(stage, skeleton, garment=garment, root=root)
     return _Cloth(find_garment(stage, garment), read, rig)
-
-
-def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
-    """Yield the meshes that are bound to a skeleton; what rides on a garment is placed by its cloth."""
-    for prim in Usd.PrimRange(skel.root, PRIMS):
-        if prim.IsA(UsdGeom.Mesh) and bound_skeleton(prim) == skel.prim and not is_rider(prim):
-            yield prim
-
-
-def _same_meshes(
-    there: SkelSource, skel: SkelSource, own: Sequence[Usd.Prim], cloth: _Cloth | None
-) -> dict[Usd.Prim, Usd.Prim]:
-    """Return for meshes of a shot which of a character's own meshes they are.
-
-    They have its path beneath the SkelRoot, its name, or its faces alone: programs add a namespace to names, or a
-    number. Those that follow another Skeleton are meant where no others are, and a garment beside the SkelRoot.
-    """
-
-    def path(mesh: Usd.Prim) -> str:
-        root = skel.root if mesh in own else there.root
-        return str(mesh.GetPath().MakeRelativePath(root.GetPath()))
-
-    every = [prim for prim in Usd.PrimRange.Stage(there.stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
-    within = [prim for prim in every if prim.GetPath().HasPrefix(there.root.GetPath())]
-    bound = [prim for prim in within if bound_skeleton(prim) == there.prim]
-    free = [prim for prim in within if not bound_skeleton(prim)]
-    found: dict[Usd.Prim, Usd.Prim] = {}
-    for meshes in (bound, free):
-        for key in (path, Usd.Prim.GetName):
-            _pair(meshes, own, key, found)
-    others = [prim for prim in within if prim not in bound and prim not in free]
-    _pair([prim for prim in within if prim not in others], own, faces_of, found)
-    for key in (path, Usd.Prim.GetName):
-        _pair(others, own, key, found)
-    if cloth is not None:
-        _pair([prim for prim in every if prim not in within], [cloth.prim], Usd.Prim.GetName, found)
-    return found
-
-
-def _pair(
-    meshes: Sequence[Usd.Prim],
-    own: Sequence[Usd.Prim],
-    key: Callable[[Usd.Prim], Hashable],
-    found: dict[Usd.Prim, Usd.Prim],
-) -> None:
-    """Add to `found` the meshes of a key that as many of a character's own have, in the order of their stages."""
-    missing = [mesh for mesh in own if mesh not in found.values()]
-    left = [mesh for mesh in meshes if missing and mesh not in found]
-    for each in dict.fromkeys(map(key, missing if left else [])):
-        pairs = [[mesh for mesh in some if key(mesh) == each] for some in (left, missing)]
-        if len(pairs[0]) == len(pairs[1]):  # such as two shoes
-            found.update(zip(*pairs))
 
 
 def _body_otherwise(
@@ -282,7 +231,7 @@ def _other_bodies(
         if body not in same.values() or body in guides:
             text = guides.get(body, f"it shows no mesh {body.GetName()} that is the character's")
             yield f"{text}; cloth meets it, and it is seen in what is written"
-    extra = [mesh for mesh in _meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
+    extra = [mesh for mesh in skinned_meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
     for mesh in extra:
         if not is_stand_in(mesh):
             text = f"{mesh.GetName()} follows its skeleton and is not in the character's stage"
