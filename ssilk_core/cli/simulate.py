@@ -28,6 +28,7 @@ from ..delivery.bake.world import ShotSurroundings, asked_world
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
 from ..files import replacing
+from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import Fabric
 from . import options as shared
 
@@ -111,8 +112,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
     read = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
-    motions = [shared.with_shapes(options, motion, path, scene) for motion, path in zip(read, options.motion)]
-    shared.tell_shapes(options, motions, report)
+    shared.tell_shapes(options, read, report)
+    motions = [shared.with_shapes(options, each, path, scene.character) for each, path in zip(read, options.motion)]
+    for motion in motions:
+        if moved := reshaped(scene.character, motion):
+            report(Message(f"{motion.path}: {'; '.join(map(str, moved))}; cloth meets it so, and it is written so"))
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric), str(path), asked)
         for output, motion, path in zip(outputs, motions, options.motion)

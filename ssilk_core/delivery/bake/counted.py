@@ -226,7 +226,7 @@ def _shown(
 
     if bodies is None and part.shapes:
         body_skin = scene.character.merged_body().skin
-        bodies = skin_points(body_at_rest(scene.character, part), body_skin, matrices) + origin
+        bodies = list(skin_points(body_at_rest(scene.character, part), body_skin, matrices) + origin)
     body = None if bodies is None else tensor([points[skin.points.vertices] - origin for points in bodies])
     states = skin.states(tensor([points - origin for points in cloth]), tensor(list(matrices[:, :, :3])), body)
     return ShownCounts.of(states, list(times))

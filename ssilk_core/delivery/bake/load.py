@@ -144,8 +144,10 @@ class LoadedGarment:
 
         character, root, samples = self.deformer.scene.character, request.root, request.samples_per_frame
         garment = self.deformer.scene.garment.mesh.path.rpartition("/")[2]
-        of = {"character": character, "root": root, "garment": garment}
-        shaped = partial(with_body_shapes, request.stage, request.motion, **of)
+
+        def shaped(motion: Motion) -> Motion:
+            return with_body_shapes(request.stage, request.motion, motion, character, root=root, garment=garment)
+
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
         if frames is None:
             source = read_motion(request.motion, character.skeleton, root=root)

@@ -228,10 +228,12 @@ class Refiner:
         for number in range(motions[0].frame_count):
             running = [motion for motion in motions if motion.frame_count > number]
             world = torch.cat([self._next_frames(each, 1) for each in points[: len(running)]], dim=-1)
-            poses = self.simulator.poser.pose(*(
+            rotations, translations = (
                 np.stack([getattr(motion, name)[number] for motion in running])
                 for name in ("rotations", "translations")
-            ), self.simulator.poser.moves((motion, slice(number, number + 1)) for motion in running))  # fmt: skip
+            )
+            moves = self.simulator.poser.moves((motion, slice(number, number + 1)) for motion in running)
+            poses = self.simulator.poser.pose(rotations, translations, moves)
             frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None)
             yield list(frames)
 

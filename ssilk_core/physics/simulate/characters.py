@@ -95,7 +95,7 @@ class PosedCharacters:
         lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
         matrices: skinning matrices of the character's joints, relative to the root, shape (J, 3, 4, N).
         world: what surrounds them, or None where nothing does.
-        moves: of the body's vertices in the bind pose by shapes of their shots [m], shape (B, 3, N); None without any.
+        moves: of the body's vertices in the bind pose by blendshapes of their shots [m], shape (B, 3, N); or None.
     """
 
     root: Tensor
@@ -108,8 +108,9 @@ class PosedCharacters:
     def select(self, frames: Tensor) -> PosedCharacters:
         """Return the poses of the frames with indices (M,)."""
         body, world = self.body.select(frames), self.world and self.world.select(frames)
-        lbs, matrices, moves = (v if v is None else v[..., frames] for v in (self.lbs, self.matrices, self.moves))
-        return PosedCharacters(self.root[:, frames], body, lbs, matrices, world, moves)
+        moves = None if self.moves is None else self.moves[..., frames]
+        own = self.lbs[..., frames], self.matrices[..., frames]
+        return PosedCharacters(self.root[:, frames], body, *own, world, moves)
 
 
 class CharacterPoser:
@@ -136,7 +137,7 @@ class CharacterPoser:
         return self.pose(rotations, translations, self.moves((span.motion, slice(step, step + 1)) for span in spans))
 
     def moves(self, parts: Iterable[tuple[Motion, slice | Ints]]) -> Tensor | None:
-        """Return by how much shapes move the body's vertices in the bind pose [m], shape (B, 3, N); None if none does.
+        """Return by how much shapes move the body's vertices in the bind pose [m], shape (B, 3, N); None without any.
 
         Args:
             parts: motions, each with some of its frames, N in all.
@@ -161,7 +162,7 @@ class CharacterPoser:
         return moved
 
     def between(
-        self, roots: Tensor, matrices: Tensor, moves: Tensor | None, poses: PosedCharacters, share: float
+        self, roots: Tensor, matrices: Tensor, poses: PosedCharacters, share: float, moves: Tensor | None = None
     ) -> PosedCharacters:
         """Return characters a share of the way from others to `poses`, each joint turned about its parent.
 
@@ -170,10 +171,10 @@ class CharacterPoser:
         """
         ends = (self._local(*each) for each in ((roots, matrices), (poses.root, poses.matrices)))
         (turned, placed), (rotations, translations) = ends
-        ways = [part * (1 - share if earlier else share) for part, earlier in ((moves, True), (poses.moves, False))
-                if part is not None]  # fmt: skip
+        ways = [part * weight for part, weight in ((moves, 1 - share), (poses.moves, share)) if part is not None]
+        moved = torch.stack(ways).sum(0) if ways else None
         placed = (1 - share) * placed + share * translations
-        return self.pose(slerp(turned, rotations, np.asarray(share)), placed, sum(ways) if ways else None)
+        return self.pose(slerp(turned, rotations, np.asarray(share)), placed, moved)
 
     def _local(self, roots: Tensor, matrices: Tensor) -> tuple[Floats, Floats]:
         """Return the joints' local rotations (N, J, 4) and translations (N, J, 3) that `pose` takes."""

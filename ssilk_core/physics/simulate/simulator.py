@@ -266,7 +266,7 @@ class Simulator:
         shorter = copy.copy(self)
         shorter.dt, shorter.splits = self.dt / PARTS, self.splits - 1
         assert past.matrices is not None
-        solutions, between = [], partial(self.poser.between, past.root, past.matrices, past.moves, poses)
+        solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses, moves=past.moves)
         if past.before is not None:
             past = replace(past, before=past.last - (past.last - past.before) / PARTS)
         at = between(0.0)

@@ -84,7 +84,7 @@ class Motion:
 
     @property
     def felt(self) -> dict[str, Any]:
-        """What cloth feels of the character's shape and the world around it in each frame, by the attribute's name."""
+        """What cloth feels of the character's shape and of the world in each frame, by the attribute's name."""
         every = {"gravity": self.gravity, "proximity": self.proximity, "shape_weights": self.shape_weights}
         return {name: values for name, values in every.items() if values is not None}
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a shot shapes a character's meshes by blendshapes, in each frame: breathing, correctives, a body of another type.
+"""How a shot shapes a character's meshes by blendshapes, in each frame: breathing, correctives, another body type.
 
-Meshes are read with the blendshapes that are on in the character's stage (`shapes`). Here is what a shot adds to that,
-or takes away, as UsdSkel shows it there. In-betweens and weights beyond one become shapes of their own, whose weights
-are from 0 to 1: they add up to the same.
+Meshes are read with the blendshapes that are on in the character's stage (`shapes`). Here is what a shot adds to
+that, or takes away, as UsdSkel shows it there. In-betweens are shapes of their own, whatever weighs more than one is
+a larger shape, and what weighs less than none a turned one: weights from 0 to 1 add up to the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .motion import find_animation
 from .posed import Skinned, skinning_of
 from .same_meshes import same_meshes, skinned_meshes
 from .shapes import shape_weights
-from .skeleton import find_skeleton
+from .skeleton import bound_skeleton, find_skeleton
 from .skin import match_joints
 from .spaces import SkelSource
 
@@ -124,7 +124,7 @@ class _Shot:
         return self._finite(np.array(rows), mesh)
 
     def named_weights(self, names: list[str], unnamed: Floats) -> Floats:
-        """Return the weights of blendshapes by their names in each frame, others as in `unnamed` (K,), shape (F, K)."""
+        """Return the weights of blendshapes by name in each frame, others as in `unnamed` (K,), shape (F, K)."""
         animation = UsdSkel.Animation(self.animation)
         every = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
         rows = np.tile(unnamed, (len(self.codes), 1))
@@ -151,7 +151,7 @@ class _Shot:
 
 @dataclass(frozen=True, eq=False)
 class _SubShape:
-    """A blendshape or one of its in-betweens: rows (R,), and offsets of these where it weighs one [m], shape (R, 3)."""
+    """A blendshape or one of its in-betweens: rows (R,) and their offsets where it weighs one [m], shape (R, 3)."""
 
     name: str
     rows: Ints
@@ -214,17 +214,17 @@ class _SubShapes:
         return found
 
 
-def _shapes(
-    own: Usd.Prim, mesh: Mesh, number: int, skel: SkelSource, shot: _Shot
-) -> list[tuple[BodyShape, Floats]]:
+def _shapes(own: Usd.Prim, mesh: Mesh, number: int, skel: SkelSource, shot: _Shot) -> list[tuple[BodyShape, Floats]]:
     """Return the shapes by which a shot changes a mesh of the character, with their weights (F,)."""
     home = _SubShapes(own, _to_core(own, skel)[:3, :3])
     given = shape_weights(own, skel)
     weights = np.zeros(len(home.names)) if given is None else np.array(given)
     on = home.weights(weights[None])[0]
     shown = shot.meshes.get(str(own.GetPath()))
+    if shown is not None and not (shot.skel and bound_skeleton(shown) == shot.skel.prim):
+        return []  # it follows something else, or nothing, which is told elsewhere
     if shown is not None and len(value(shown, "points") or []) != mesh.vertex_count:
-        return []  # `shown` tells it
+        return []
     if shown is None or shot.skel is None:
         there, courses = home, home.weights(shot.named_weights(home.names, weights))
     else:

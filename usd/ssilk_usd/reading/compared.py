@@ -10,6 +10,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.scene import kinematics
 from ssilk_core.scene.assets import Character, Floats, Garment, Ints, Mesh, Motion, ProxyRig, SkinWeights
+from ssilk_core.scene.assets.body_shape import shaped
 
 from ..opening.stage import PRIMS, column_matrix, value, world_matrix
 from ..opening.times import change_times
@@ -46,11 +47,15 @@ class Off:
 
 @dataclass(frozen=True, eq=False)
 class _Met:
-    """A mesh at rest, with its weights over the character's joints, then over the joints of `rig`, if any."""
+    """A mesh at rest, with its weights over the character's joints, then over the joints of `rig`, if any.
+
+    `body` is its index among bodies and stand-ins; -1 where it is none.
+    """
 
     mesh: Mesh
     skin: SkinWeights
     rig: ProxyRig | None = None
+    body: int = -1
 
 
 class Compared:
@@ -60,7 +65,8 @@ class Compared:
         self, character: Character, garment: Garment | None, rig: ProxyRig | None, motion: Motion, there: SkelSource
     ) -> None:
         self.met = {
-            _prim_path(body.mesh): _Met(body.mesh, body.skin) for body in (*character.bodies, *character.stand_ins)
+            _prim_path(body.mesh): _Met(body.mesh, body.skin, body=number)
+            for number, body in enumerate((*character.bodies, *character.stand_ins))
         }
         if garment is not None and rig is not None:
             self.met[_prim_path(garment.mesh)] = _Met(garment.mesh, rig.skin, rig)
@@ -87,7 +93,7 @@ class Compared:
         unseen = SAME * float(np.ptp(met.mesh.points, axis=0).max(initial=0))
         found, in_order = Off(0.0, codes[0]), faces_of(own) == faces_of(other)
         for code, frame in zip(codes, frames.tolist()):
-            (points,) = kinematics.skin_points(met.mesh.points, met.skin, self._matrices(met, frame, code))
+            (points,) = kinematics.skin_points(self._at_rest(met, frame), met.skin, self._matrices(met, frame, code))
             seen = self.there.units.points_to_core(shown.points(Usd.TimeCode(code), UsdGeom.XformCache(code)))
             unseen = max(unseen, 1e-6 * float(np.abs(points).max(initial=0)))  # of float32, far from the origin
             paired = len(seen) == len(points)
@@ -101,6 +107,13 @@ class Compared:
             if away > (found.metres or 0.0) * (1 + 1e-6):  # the first of several that are the same
                 found = Off(away, code)
         return found if (found.metres or 0.0) > unseen else None
+
+    def _at_rest(self, met: _Met, frame: int) -> Floats:
+        """Return the points of a mesh in the bind pose as the motion shapes it in a frame [m], shape (V, 3)."""
+        weights = self.motion.shape_weights
+        if weights is None or met.body < 0:
+            return met.mesh.points
+        return shaped(met.mesh.points, self.motion.shapes, weights[frame : frame + 1], met.body)[0]
 
     def _matrices(self, met: _Met, frame: int, code: float) -> Floats:
         """Return what moves what each joint carries at a frame, shape (1, J + P, 4, 4)."""

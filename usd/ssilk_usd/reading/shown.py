@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a shot shows a character's meshes otherwise than the character's stage, which is what cloth meets.
 
-Blendshapes that it weighs otherwise or alone has, points that it has moved, point caches, and parts that it hides.
+Points that it has moved, point caches, and parts that it hides. Blendshapes of bodies are followed (`body_shapes`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +22,11 @@ from ..opening.garment_api import read_garment_record
 from ..opening.stage import PRIMS, USD_SUFFIXES, StageLike, named, needs_whole_files, open_stage, value
 from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
+from .body_shapes import with_body_shapes
 from .character import is_skinned, read_character
 from .compared import Compared, rest_off
 from .garment import find_garment, read_garment
-from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in, kept_faces
+from .mesh import is_body, is_drawn, is_garment, is_stand_in, kept_faces
 from .motion import find_animation, read_motion
 from .rig import read_proxy_rig
 from .same_meshes import same_meshes, skinned_meshes
@@ -77,7 +78,7 @@ def shown_otherwise(
     Args:
         source, motion, root, garment: as for `animated_shapes`.
         bodies: those that cloth meets, as for `read_character`.
-        known: names of meshes whose shape is known to differ.
+        known: names of garments whose shape is known to differ.
 
     Raises:
         SsilkError: as `read_motion` and `read_character`.
@@ -105,6 +106,7 @@ def shown_otherwise(
         own.append(cloth.prim)
     same = same_meshes(there, skel, own, cloth.prim if cloth else None)
     read = read_motion(of_motion, character.skeleton, prim=prim, root=root)
+    read = with_body_shapes(stage, motion, read, character, root=root, garment=garment)
     compared = Compared(character, cloth.garment if cloth else None, cloth.rig if cloth else None, read, there)
     # Cloth that was simulated, in place of the character's, over bodies whose faces may be hidden.
     is_baked = any(_is_baked(mesh) for mesh in Usd.PrimRange.Stage(of_motion, PRIMS) if mesh.IsA(UsdGeom.Mesh))
@@ -112,7 +114,7 @@ def shown_otherwise(
         if cloth is not None and original == cloth.prim:
             found += _garment_otherwise(mesh, original, compared, known)
         elif not is_garment(original) and compared.meets(original):
-            found += _body_otherwise(mesh, original, compared, known, is_baked)
+            found += _body_otherwise(mesh, original, compared, is_baked)
         found.append(_hidden(mesh, there))
     if cloth is not None and cloth.prim not in same.values() and not is_baked:
         found.append(_deactivated(cloth.prim, skel, there))
@@ -147,13 +149,9 @@ def _read_cloth(stage: Usd.Stage, skeleton: Skeleton, garment: str | None, root:
     return _Cloth(find_garment(stage, garment), read, rig)
 
 
-def _body_otherwise(
-    mesh: Usd.Prim, own: Usd.Prim, compared: Compared, known: Iterable[str], is_baked: bool
-) -> Iterator[str]:
-    """Yield in words that a shot has a body of another shape, or with other faces."""
+def _body_otherwise(mesh: Usd.Prim, own: Usd.Prim, compared: Compared, is_baked: bool) -> Iterator[str]:
+    """Yield in words that a shot has a body of another shape than blendshapes make it, or with other faces."""
     name, to = mesh.GetName(), bound_skeleton(mesh)
-    if own.GetName() in known and not _is_cache(mesh, compared.there):
-        return
     off = compared.off(own, mesh)
     if off and _is_cache(mesh, compared.there):
         yield f"{name} is a point cache, which is not followed; cloth meets it as its joints move it, elsewhere {off}"

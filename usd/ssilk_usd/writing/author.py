@@ -15,7 +15,18 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, Motion, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.scene.assets import (
+    Body,
+    Deformer,
+    Floats,
+    Garment,
+    Ints,
+    Mesh,
+    Motion,
+    ProxyRig,
+    Skeleton,
+    SkinWeights,
+)
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, RIDER_JOINTS, RIDES_ON, shape_name
