@@ -149,7 +149,7 @@ class CharacterPoser:
         for motion, frames in parts:
             weights = motion.shape_weights
             rows = np.zeros((len(motion.rotations[frames]), 0)) if weights is None else weights[frames]
-            found.append(self._moved(motion.shapes, torch.as_tensor(rows.copy(), dtype=torch.float32)))
+            found.append(self._moved(motion.shapes, torch.as_tensor(np.array(rows, dtype=np.float32))))
         return torch.cat(found, dim=-1).to(self.rest.device)
 
     def _moved(self, shapes: Sequence[BodyShape], weights: Tensor) -> Tensor:
@@ -157,8 +157,8 @@ class CharacterPoser:
         moved = torch.zeros(int(self.starts[-1]), 3, len(weights))
         for shape, course in zip(shapes, weights.T):
             if shape.body < len(self.starts) - 1 and course.any():  # no cloth meets stand-ins
-                rows = torch.as_tensor(shape.rows + self.starts[shape.body])
-                moved[rows] += torch.as_tensor(shape.offsets, dtype=torch.float32)[:, :, None] * course
+                rows = torch.as_tensor(np.asarray(shape.rows) + self.starts[shape.body])
+                moved[rows] += torch.as_tensor(np.array(shape.offsets, dtype=np.float32))[:, :, None] * course
         return moved
 
     def between(
