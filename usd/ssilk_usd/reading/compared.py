@@ -154,8 +154,8 @@ class Compared:
         if isinstance(shown, SkinnedMesh) and (weights := shown.weights_attribute()):
             times = np.array(change_times([weights]))
             whole = np.abs((times - frames[0]) / rate % 1 - 0.5) > 0.49
-            near = frames[0] + ((times - frames[0]) / rate).round() * rate  # value clips have samples just before cuts
-            times = np.where(whole, near, times)
+            # Value clips have a sample just before the frame of a cut.
+            times = np.where(whole, frames[0] + ((times - frames[0]) / rate).round() * rate, times)
             times = times[(times < frames[0]) | (times > frames[-1]) | whole]
             chosen += [*spread(times, LOOKED_AT), *times[_most_on(shown, times)]]
         return sorted({float(code) for code in chosen})
