@@ -46,17 +46,21 @@ def _changing_modifiers(body: bpy.types.Object) -> bool:
 
 
 def tell_changing_shapes(
-    operator: bpy.types.Operator, garment: bpy.types.Object, motions: Sequence[Source] = ()
+    operator: bpy.types.Operator,
+    garment: bpy.types.Object,
+    motions: Sequence[Source] = (),
+    followed: Sequence[bpy.types.Object] = (),
 ) -> None:
     """Report what cloth does not meet of a garment's bodies, and shapes that change and are not followed.
 
     Args:
+        followed: bodies whose shape keys a bake follows, where it is one.
         motions: those in which bodies are looked at; the timeline without any.
 
     Raises:
         SetupError: a body is being edited.
     """
-    for text in _unmet(garment, motions or [Source(TIMELINE, "Timeline")]):
+    for text in _unmet(garment, motions or [Source(TIMELINE, "Timeline")], followed):
         operator.report({"WARNING"}, text)
 
 
@@ -69,7 +73,9 @@ def _changing_in(
             yield from (f"'{name}' of '{thing.name}'" for thing in things for name in changing_shapes(thing))
 
 
-def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str]:
+def _unmet(
+    garment: bpy.types.Object, motions: Sequence[Source], followed: Sequence[bpy.types.Object]
+) -> Iterator[str]:
     armature = armature_of(garment)
     bodies = bodies_of(garment, armature)
     frame, scale = bpy.context.scene.frame_current, bpy.context.scene.unit_settings.scale_length
@@ -110,7 +116,8 @@ def _unmet(garment: bpy.types.Object, motions: Sequence[Source]) -> Iterator[str
                 f"{text}, by its modifier{'s' if more else ''} {', '.join([first, *more])}. Move what thickens or is "
                 "sculpted above the Armature modifier, with the same levels in viewports as in renders, or apply it."
             )
-    names = list(dict.fromkeys(_changing_in(motions, armature, [*bodies, garment])))
+    left = [thing for thing in (*bodies, garment) if thing not in followed]
+    names = list(dict.fromkeys(_changing_in(motions, armature, left)))
     if names:
         more = f" and {len(names) - 1} more change" if len(names) > 1 else " changes"
         text = f"The shape key {names[0]}{more} over time, which is not followed; the shape of frame {frame} is met"

@@ -35,6 +35,7 @@ from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.bodies import corrected, reshaped
+from ..playback.followed import SampledKeys, followed_bodies
 from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
 from ..playback.overrides import overriding, told
 from ..preferences import interpreter, preferences, unready
@@ -65,6 +66,7 @@ QUALITY_ITEMS = [
     *((name, name.capitalize(), ABOUT.get(name, level.about)) for name, level in QUALITIES.items()),
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
+SHAPED = "shaped.usdc"  # the character with shape keys that change
 RIDDEN = "ridden.usdc"  # the character with what rides on the garment
 
 
@@ -178,7 +180,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
-        tell_changing_shapes(self, garment)
+        self.keys = SampledKeys.of(garment, self.take.frames)
+        followed = followed_bodies(garment)
+        tell_changing_shapes(self, garment, followed=followed)
+        if followed and (self.quality == WHOLE or not (solves or QUALITIES[self.quality].latent_iterations)):
+            names = ", ".join(f"'{body.name}'" for body in followed)
+            text = f"The network does not see that shape keys of {names} change; a bake as Hero meets what is seen"
+            self.report({"WARNING"}, f"{text}.")
         if not self.meets_colliders and (missed := unseen(garment, armature, "The bake")):
             self.report({"WARNING"}, f"{missed}.")
         self.pair = Pair.of(garment, armature)
@@ -244,6 +252,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             read = MetColliders(*self.pair.objects(), self.take.frames)
             yield from read.sample()
             met = read.found
+        yield from self.keys.sample()
         world = world_over(bpy.context.scene, self.take.frames, motion.fps, met)
         write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
         garment, _ = self.pair.objects()
@@ -252,7 +261,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold)
         stage = self.model.parent / STAGE
         garment, _ = self.pair.objects()
-        self.reshaped = reshaped(garment, self.character, stage) if stage.exists() else ""
+        followed = followed_bodies(garment)
+        self.reshaped = reshaped(garment, self.character, stage, followed) if stage.exists() else ""
         if self.to_usd and stage.exists():
             self.reshaped += corrected(garment, self.character, stage)
 
@@ -273,6 +283,9 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             given = hand_over(self.scene, self.pair, inputs)
             self.words |= {f"{inputs.name}/{made}": name for made, name in given.words.items()}
             stage = inputs / STAGE
+        if self.keys.bodies and self.keys.write(inputs / SHAPED, stage, inputs / MOTION, garment, self.character):
+            self.words[f"{inputs.name}/{SHAPED}"] = "the character"
+            stage = inputs / SHAPED
         if self.riders:
             from ssilk_usd.writing.riders import write_riders
 

@@ -14,6 +14,7 @@ from ssilk_core.scene.assets import Character, Mesh
 from ..arrays.joints import Joints, identifiers
 from ..scene.garment import armature_of, bodies_of, rest_world
 from ..scene.gather import SKELETON, evaluated, read_body
+from ..scene.meshes import rest_points
 from ..scene.modifiers import reshapes
 from ..scene.objects import scene_units
 from ..scene.shapes import mixed_points
@@ -42,7 +43,30 @@ def corrected(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
     return f" (shape keys that correct '{garment.name}' by up to {1000 * away:.0f} mm in Blender are not in the shot)"
 
 
-def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
+def trained_meshes(
+    garment: bpy.types.Object, joints: Joints, stage: Path
+) -> tuple[dict[str, Mesh], np.ndarray | None]:
+    """Return the bodies of a stage by the names of their prims, and what moves the scene to where it was then.
+
+    Args:
+        joints, stage: as for `reshaped`.
+    """
+    trained, back = _trained(garment, joints, stage)
+    return {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}, back
+
+
+def at_rest_without_keys(thing: bpy.types.Object, back: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the points of an object are at rest without shape keys [m], (V, 3), and what turns offsets in its
+    own space into such ones, (3, 3); both moved by `back`, as `trained_meshes` returns it."""
+    world, units = np.array(rest_world(thing)), scene_units()
+    linear = back[:3, :3] @ units.points_to_core(np.eye(3)).T @ world[:3, :3]
+    placed = units.points_to_core(rest_points(thing) @ world[:3, :3].T + world[:3, 3])
+    return placed @ back[:3, :3].T + back[:3, 3], linear
+
+
+def reshaped(
+    garment: bpy.types.Object, joints: Joints, stage: Path, followed: Sequence[bpy.types.Object] = ()
+) -> str:
     """Return in words which body has another shape now than in the stage that was trained; empty if none has.
 
     Bodies that the stage lacks are not compared. In a Blender that has read USD.
@@ -50,15 +74,15 @@ def reshaped(garment: bpy.types.Object, joints: Joints, stage: Path) -> str:
     Args:
         joints: the character's, by the paths that the garment knows.
         stage: what was handed over for the training.
+        followed: bodies whose shape is followed, which are not compared.
     """
-    trained, back = _trained(garment, joints, stage)
+    meshes, back = trained_meshes(garment, joints, stage)
     if back is None:
         return ""
-    meshes = {body.mesh.path.rpartition("/")[2]: body.mesh for body in trained.bodies}
     armature = armature_of(garment)
     things = [garment, *bodies_of(garment, armature)]
     with evaluated(things):
-        return _first_off(things, armature, joints, meshes, back)
+        return _first_off(things, armature, joints, meshes, back, followed)
 
 
 def _trained(garment: bpy.types.Object, joints: Joints, stage: Path) -> tuple[Character, np.ndarray | None]:
@@ -86,10 +110,11 @@ def _first_off(
     joints: Joints,
     meshes: Mapping[str, Mesh],
     back: np.ndarray,
+    followed: Sequence[bpy.types.Object],
 ) -> str:
     for thing, name in list(zip(things, identifiers((each.name for each in things), taken=(SKELETON,))))[1:]:
         mesh = meshes.get(name)
-        if mesh is None:
+        if mesh is None or thing in followed:
             continue
         if reshapes(thing):
             points = read_body(thing, armature, joints, thing.name).mesh.points

@@ -51,6 +51,12 @@ def shape_bytes(thing: bpy.types.Object) -> bytes:
     )
 
 
+def key_offsets(thing: bpy.types.Object, keys: Sequence[bpy.types.ShapeKey]) -> list[np.ndarray]:
+    """Return by how much each key moves the points where its value is one, in the object's own space, (V, 3) each."""
+    masks = _masks(thing, keys)
+    return [masks.get(key.vertex_group, 1.0) * (_points_of(key) - _points_of(key.relative_key)) for key in keys]
+
+
 def _mixes(thing: bpy.types.Object, *, baked: bool) -> Iterator[np.ndarray]:
     """Yield the points without keys, with the first that is on, with two, and so on; or as one is pinned."""
     mixed, keys, pinned = rest_points(thing), thing.data.shape_keys, thing.active_shape_key

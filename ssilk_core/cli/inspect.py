@@ -79,7 +79,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     character, garment, rig = shared.read(options, report)
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
-    shared.tell_shapes(options, motions, report)
+    shared.tell_shapes(options, motions, report, trained=character)
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,

@@ -28,6 +28,7 @@ from ..events import Message, Reporter
 from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
+from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 
@@ -382,13 +383,34 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
-def tell_shapes(options: argparse.Namespace, motions: Iterable[Motion], report: Reporter) -> None:
-    """Warn of motions that show the character's meshes otherwise than its stage; options as `load_scene`."""
+def tell_shapes(
+    options: argparse.Namespace, motions: Iterable[Motion], report: Reporter, *, trained: Character | None = None
+) -> None:
+    """Warn of motions that show the character's meshes otherwise than its stage; options as `load_scene`.
+
+    Args:
+        trained: the character in a training, which has one shape whatever the motions' blendshapes are.
+    """
     from ssilk_usd.reading.shown import tell_shown_otherwise
 
-    paths = [motion.path for motion in motions]
+    motions = list(motions)
     chosen = {"root": options.root, "garment": options.garment, "bodies": options.body}
-    tell_shown_otherwise(options.stage, paths, report, **chosen)
+    tell_shown_otherwise(options.stage, [motion.path for motion in motions], report, **chosen)
+    if trained is None:
+        return
+    for motion in motions:
+        found = reshaped(trained, with_shapes(options, motion, motion.path, trained))
+        if found:
+            text = f"{motion.path}: {'; '.join(map(str, found))}"
+            report(Message(f"{text}; training sees the shape of the character's stage alone", "warning"))
+
+
+def with_shapes(options: argparse.Namespace, motion: Motion, source: str | Path, character: Character) -> Motion:
+    """Return a motion with the blendshapes of the character that its file weighs; options as `load_scene`."""
+    from ssilk_usd.reading.body_shapes import with_body_shapes
+
+    chosen = {"root": options.root, "garment": options.garment}
+    return with_body_shapes(options.stage, str(source), motion, character, **chosen)
 
 
 def load_scene(

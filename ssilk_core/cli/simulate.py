@@ -28,6 +28,7 @@ from ..delivery.bake.world import ShotSurroundings, asked_world
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
 from ..files import replacing
+from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import Fabric
 from . import options as shared
 
@@ -110,8 +111,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    motions = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
-    shared.tell_shapes(options, motions, report)
+    read = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
+    shared.tell_shapes(options, read, report)
+    motions = [shared.with_shapes(options, each, path, scene.character) for each, path in zip(read, options.motion)]
+    for motion in motions:
+        if moved := reshaped(scene.character, motion):
+            report(Message(f"{motion.path}: {'; '.join(map(str, moved))}; cloth meets it so, and it is written so"))
     shots = [
         _Shot(output, motion, _provenance(options, path, fabric), str(path), asked)
         for output, motion, path in zip(outputs, motions, options.motion)

@@ -73,6 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     points = MeshTrajectories(options.cache, mesh.vertex_count, mesh.faces)
     skeleton = deformer.scene.character.skeleton
     motion = motion_at(read_motion(where, skeleton, root=options.root), skeleton, points, options.cache)
+    motion = shared.with_shapes(options, motion, where, deformer.scene.character)
     shared.tell_shapes(options, [motion], report)
     report(Started("skin", motion.frame_count, {"output": str(options.output)}))
     stage = open_stage(options.stage)

@@ -178,7 +178,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
-    shared.tell_shapes(options, (*motions, *held), report)
+    shared.tell_shapes(options, (*motions, *held), report, trained=scene.character)
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))

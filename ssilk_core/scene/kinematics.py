@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .assets import Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, Skeleton, SkinWeights
+from .assets import Character, Deformer, Floats, GarmentPose, Ints, Motion, ProxyRig, Scene, Skeleton, SkinWeights
+from .assets.body_shape import shaped
 
 POSES_AT_ONCE = 256  # frames in each chunk of LBS poses
 
@@ -196,7 +197,7 @@ def run_up(motion: Motion, seconds: float) -> Motion:
     rotations = slerp(first.rotations, second.rotations, -away[:, None])
     translations = first.translations - away[:, None, None] * (second.translations - first.translations)
     felt = {name: values.repeat(count, axis=0) for name, values in first.felt.items()}
-    return Motion(motion.path, motion.fps, rotations, translations, **felt)
+    return Motion(motion.path, motion.fps, rotations, translations, shapes=motion.shapes, **felt)
 
 
 CUT_SPEED = 25.0  # [m/s] deviation from the median velocity above which the hub was teleported, not animated
@@ -250,7 +251,7 @@ def sample_motion(motion: Motion, position: Floats) -> tuple[Floats, Floats]:
 
 
 def sample_felt(motion: Motion, position: Floats) -> dict[str, Any]:
-    """Return `Motion.felt` at fractional frames (N,), linear between frames."""
+    """Return `Motion.felt` at fractional frames (N,), linear between frames, and the shapes that it weighs."""
     low = np.minimum(position.astype(int), motion.frame_count - 1)
     high = np.minimum(low + 1, motion.frame_count - 1)
 
@@ -258,7 +259,14 @@ def sample_felt(motion: Motion, position: Floats) -> dict[str, Any]:
         t = (position - low).reshape(-1, *[1] * (values.ndim - 1))
         return values[low] * (1 - t) + values[high] * t
 
-    return {name: between(values) for name, values in motion.felt.items()}
+    felt: dict[str, Any] = {name: between(values) for name, values in motion.felt.items()}
+    return {**felt, "shapes": motion.shapes} if motion.shapes else felt
+
+
+def sample_shapes(motion: Motion, position: Floats) -> dict[str, Any]:
+    """Return of `sample_felt` the character's shapes and their weights alone; nothing where it has none."""
+    felt = sample_felt(motion, position) if motion.shapes else {}
+    return {name: values for name, values in felt.items() if name in ("shapes", "shape_weights")}
 
 
 def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
@@ -278,6 +286,19 @@ def skin_points(points: Floats, skin: SkinWeights, matrices: Floats) -> Floats:
         joint = matrices[:, index]
         posed += weight[:, None] * ((joint[..., :3, :3] @ points[..., None])[..., 0] + joint[..., :3, 3])
     return posed
+
+
+def body_at_rest(character: Character, motion: Motion, frames: slice | Ints = slice(None)) -> Floats:
+    """Return the points of `Character.merged_body` in the bind pose [m]: as its stage has them, shape (B, 3), or as a
+    motion shapes them in some frames, shape (F, B, 3)."""
+    points = character.merged_body().mesh.points
+    if motion.shape_weights is None:
+        return points
+    parts = [
+        shaped(body.mesh.points, motion.shapes, motion.shape_weights[frames], number)
+        for number, body in enumerate(character.bodies)
+    ]
+    return np.concatenate(parts, axis=1)
 
 
 def sorted_influences(skin: SkinWeights) -> tuple[Ints, Floats]:

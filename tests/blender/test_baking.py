@@ -16,10 +16,30 @@ from blender_addon.playback.models import model_of
 
 from .conftest import activate, add_mesh, tube
 from .scenes import decoded, proxies_of, shown
-from .test_shapes import fuller
+from .test_shapes import fuller, keyed
 
 EXACT = 1e-5  # [m]
 FRAMES = range(1, 41)
+
+
+def a_driver_of_its_bone(pillar) -> None:
+    """A corrective, as riggers make them."""
+    driver = fuller(pillar).driver_add("value").driver
+    driver.type = "AVERAGE"
+    variable = driver.variables.new()
+    variable.type = "TRANSFORMS"
+    variable.targets[0].id, variable.targets[0].bone_target = pillar.find_armature(), "Head"
+    variable.targets[0].transform_type, variable.targets[0].transform_space = "LOC_Z", "WORLD_SPACE"
+
+
+def a_masked_key(pillar) -> None:
+    """A key that shapes a part of the body, and that begins to weigh less than none, over another that is still."""
+    fuller(pillar, 0.3, name="Still", amount=0.1)
+    pillar.vertex_groups.new(name="Mask").add(list(range(0, len(pillar.data.vertices), 2)), 0.5, "REPLACE")
+    key = fuller(pillar)
+    key.vertex_group = "Mask"
+    for frame, key.value in ((1, -0.5), (6, 1.5)):
+        key.keyframe_insert("value", frame=frame)
 
 
 def bake(bpy, garment, **options) -> None:
@@ -302,6 +322,34 @@ def test_usd_lies_beside_the_blend_file(ready, trained, folder, ssilk_python):
     verified = subprocess.run([ssilk_python, "-m", "ssilk_core", "verify", str(shot)], capture_output=True, text=True)
     assert verified.returncode == 0, verified.stderr
     assert model_of(trained).parent.joinpath("bake", "motion.usdc").exists()
+
+
+@pytest.mark.parametrize("change", [keyed, a_driver_of_its_bone, a_masked_key])
+def test_a_body_whose_shape_keys_change_is_written_as_blender_shows_it(ready, trained, folder, change, capfd):
+    from ssilk_usd.shots.play import Shot
+
+    pillar, frames = ready.data.objects["Pillar"], range(1, 7)
+    ready.context.scene.frame_end = 6
+    change(pillar)
+    body = shown(ready, pillar, frames)[..., [0, 2, 1]] * [1, 1, -1]
+    bake(ready, trained, to_usd=True)
+    told = capfd.readouterr().out
+    assert "The network does not see that shape keys of 'Pillar' change; a bake as Hero meets what is seen." in told
+    shot = Shot(str(folder / "Skirt.usdc"))
+    index = next(index for index, mesh in enumerate(shot.meshes) if mesh.name == "Pillar")
+    np.testing.assert_allclose([shot.mesh_points(index, time) for time in shot.frame_times], body, atol=EXACT)
+
+
+def test_hero_meets_a_body_whose_shape_keys_change(ready, trained, capfd):
+    ready.context.scene.frame_end = 4
+    bake(ready, trained, quality="hero")
+    plain = shown(ready, trained, range(1, 5))
+    keyed(ready.data.objects["Pillar"])
+    capfd.readouterr()
+    bake(ready, trained, quality="hero")
+    told = capfd.readouterr().out
+    assert "which is not followed" not in told and "does not see" not in told and "off its shape" not in told
+    assert np.abs(shown(ready, trained, range(1, 5)) - plain).max() > 5e-3  # it gives way
 
 
 def test_what_usd_does_not_get_of_a_look_is_named(ready, trained, capfd):

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
+from ssilk_usd.reading.body_shapes import with_body_shapes
+from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.reading.shapes import AnimatedShape, animated_shapes, tell_animated_shapes
 from ssilk_usd.reading.shown import shown_otherwise, tell_shown_otherwise
 
 from ssilk_core.scene import kinematics
+from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.assets.reshaped import reshaped
 
 BIND = kinematics.rigid(Rotation.from_euler("z", [[10], [-20]], degrees=True).as_matrix(), [[0, 1, 0], [0, 1.4, 0]])
 POINTS = np.array([[0, 1.0, 0.1], [0.1, 1, 0], [0, 1.5, 0], [0.1, 0.9, 0]])
@@ -112,21 +116,19 @@ def test_what_a_motion_makes_of_shapes_is_told(tmp_path):
     moving = tmp_path / "shot"
     moving.mkdir()
     shot = dressed(moving, {1: [0.0, 0.25], 5: [0.0, 1.0]})
-    assert [str(found) for found in animated_shapes(path, shot)] == [
-        "'Full' of Body, from 0.25 to 1 where the character's stage has 1",
-        "'Full' of Cape, from 0.25 to 1 where the character's stage has 1",
+    assert [str(found) for found in animated_shapes(path, shot, garment="Cape")] == [
+        "'Full' of Cape, from 0.25 to 1 where the character's stage has 1"
     ]
     (tmp_path / "without").mkdir()
     without = dressed(tmp_path / "without", [0.0], order=("Other",))
     np.testing.assert_allclose(seen(without, "/Hero/Body", 1), (POINTS * 2 + [0, 0.001, 0]), atol=2e-6)
-    assert [str(found) for found in animated_shapes(path, without)] == [
-        "'Full' of Body, 0 where the character's stage has 1",
-        "'Full' of Cape, 0 where the character's stage has 1",
+    assert [str(found) for found in animated_shapes(path, without, garment="Cape")] == [
+        "'Full' of Cape, 0 where the character's stage has 1"
     ]
     alone = Usd.Stage.CreateNew(str(tmp_path / "clip.usda"))  # which leaves the shape as it is
     Sdf.CopySpec(Sdf.Layer.FindOrOpen(without), "/Hero/Rig/Look", alone.GetRootLayer(), "/Look")
     alone.Save()
-    assert animated_shapes(path, str(tmp_path / "clip.usda")) == []
+    assert animated_shapes(path, str(tmp_path / "clip.usda"), garment="Cape") == []
 
 
 def test_a_shape_of_a_body_that_a_joint_carries_is_read(tmp_path):
@@ -226,16 +228,46 @@ def over(folder: Path) -> tuple[str, Usd.Stage]:
     return hero, stage
 
 
-@pytest.mark.parametrize("change", [sculpted, breathing, sculpted_shape, twitching])
-def test_a_body_of_another_shape_in_a_shot_is_told_with_how_far_it_is_off(tmp_path, change):
+def test_a_body_of_other_points_in_a_shot_is_told_with_how_far_it_is_off(tmp_path):
+    hero, stage = over(tmp_path)
+    sculpted(stage)
+    stage.Save()
+    shot = str(tmp_path / "shot.usda")
+    off = np.linalg.norm(seen(shot, "/Hero/Body", 1) - seen(hero, "/Hero/Body", 1), axis=1).max()
+    (told,) = shown_otherwise(hero, shot, garment="Cape")
+    assert told.startswith(f"it shapes Body otherwise, by up to {mm(off)} mm")
+
+
+def met(hero: str, shot: str) -> tuple[Motion, dict[float, np.ndarray]]:
+    """A shot's motion with the shapes of the body, and where cloth meets this [m], by time code."""
+    character = read_scene(hero, garment="Cape")[0]
+    motion = with_body_shapes(hero, shot, read_motion(shot, character.skeleton), character, garment="Cape")
+    matrices = kinematics.skinning_matrices(
+        kinematics.motion_transforms(motion, character.skeleton.parents), character.skeleton.bind_transforms
+    )
+    posed = kinematics.skin_points(kinematics.body_at_rest(character, motion), character.bodies[0].skin, matrices)
+    return motion, {motion.start + frame: points for frame, points in enumerate(posed)}
+
+
+FOLLOWED = [breathing, sculpted_shape, twitching]
+
+
+@pytest.mark.parametrize("change", FOLLOWED)
+def test_a_body_that_a_shot_shapes_is_met_as_it_is_seen(tmp_path, change):
     hero, stage = over(tmp_path)
     change(stage)
     stage.Save()
     shot = str(tmp_path / "shot.usda")
+    motion, body = met(hero, shot)
     rest = seen(hero, "/Hero/Body", 1)
-    off = max(np.linalg.norm(seen(shot, "/Hero/Body", code) - rest, axis=1).max() for code in (1, 5, 151))
-    (told,) = shown_otherwise(hero, shot, garment="Cape")
-    assert told.startswith(f"it shapes Body otherwise, by up to {mm(off)} mm")
+    off = 0.0
+    for code in [code for code in (1, 5, 149, 151, 153) if code in body] or body:
+        now = seen(shot, "/Hero/Body", code)
+        np.testing.assert_allclose(body[code], now, atol=2e-6)
+        off = max(off, float(np.linalg.norm(now - rest, axis=1).max()))
+    (told,) = reshaped(read_scene(hero, garment="Cape")[0], motion)
+    assert off > 0.01 and told.metres == pytest.approx(off, abs=2e-6)
+    assert shown_otherwise(hero, shot, garment="Cape") == []
 
 
 def reweighed(stage: Usd.Stage) -> None:
@@ -426,11 +458,16 @@ def exported(stage: Usd.Stage, names: dict[str, str], folder: Path) -> str:
     return layer.realPath
 
 
-@pytest.mark.parametrize("change", [sculpted, breathing, sculpted_shape, unbound_cache])
+@pytest.mark.parametrize("change", [sculpted, *FOLLOWED, unbound_cache])
 def test_a_body_that_a_shot_calls_otherwise_is_known_by_its_faces(tmp_path, change):
     hero, stage = over(tmp_path)
     change(stage)
     shot = exported(stage, {"Body": "ann_Body", "Cape": "Cape_001"}, tmp_path)
+    if change in FOLLOWED:
+        for code, points in list(met(hero, shot)[1].items())[::75]:
+            np.testing.assert_allclose(points, seen(shot, "/Hero/ann_Body", code), atol=2e-6)
+        assert shown_otherwise(hero, shot, garment="Cape") == []
+        return
     (told,) = shown_otherwise(hero, shot, garment="Cape")
     if change is unbound_cache:
         assert told.startswith("ann_Body is a point cache, which is not followed; ")
@@ -446,7 +483,7 @@ def test_a_shape_that_is_told_by_its_name_is_told_once(tmp_path):
     stage.Save()
     told: list[str] = []
     tell_shown_otherwise(hero, [str(tmp_path / "shot.usda")], lambda event: told.append(str(event)), garment="Cape")
-    assert len(told) == 1 and "'Full' of Body" in told[0]
+    assert len(told) == 1 and "'Full' of Cape" in told[0]
 
 
 @pytest.mark.parametrize("name", ["Body", "Cape"])

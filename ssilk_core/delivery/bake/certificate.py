@@ -24,7 +24,7 @@ from ...errors import VerificationError, fail
 from ...events import Countdown, Message, Reporter, silent
 from ...physics.intersections.pairs import need_predicates
 from ...scene.assets import Floats, GarmentPose
-from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices, split_at_cuts
+from ...scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from .opened import add_provenance, open_shot, provenance_of
 from .result import CertificateSummary, FrameSpan
 from .rollout import BakeRollout, Certificate
@@ -174,7 +174,10 @@ def _frames(rollout: BakeRollout, poses: Sequence[GarmentPose], points: Sequence
     starts = np.array([pose.start for pose in poses])
 
     def body_at(frame: int) -> Floats | None:
-        return None if body is None else skin_points(body.mesh.points, body.skin, joints[frame : frame + 1])[0]
+        if body is None:
+            return None
+        rest = body_at_rest(scene.character, motion, slice(frame, frame + 1))
+        return skin_points(rest, body.skin, joints[frame : frame + 1])[0]
 
     def turns_at(frame: int) -> Floats:
         pose = poses[int(np.searchsorted(starts, frame, side="right")) - 1]
@@ -297,7 +300,8 @@ def _faults_in(
         if bodies is not None:
             body = np.concatenate([posed[number] for number in bodies])
         elif merged is not None:
-            body = skin_points(merged.mesh.points, merged.skin, joints[frame : frame + 1])[0]
+            rest = body_at_rest(scene.character, motion, slice(frame, frame + 1))
+            body = skin_points(rest, merged.skin, joints[frame : frame + 1])[0]
         faults = certifier.finder.find(posed[garment], certifier.finder.place(body))
         if faults.count:
             yield frame, faults

@@ -23,7 +23,7 @@ from ...physics.skin.figures import ShownSkin
 from ...physics.world.colliders import voting_points
 from ...physics.world.sunk import SunkCloth, SunkCounter
 from ...scene.assets import Floats, Ints, Motion, Scene, ShotWorld
-from ...scene.kinematics import centred_matrices
+from ...scene.kinematics import body_at_rest, centred_matrices, skin_points
 from ...scene.plain import from_plain
 from ...scene.riders import Rider
 from ..targets import GLB
@@ -224,6 +224,9 @@ def _shown(
     def tensor(frames: Sequence[Floats]) -> torch.Tensor:
         return torch.as_tensor(np.stack(frames, axis=-1), dtype=torch.float32, device=device)
 
+    if bodies is None and part.shapes:
+        body_skin = scene.character.merged_body().skin
+        bodies = list(skin_points(body_at_rest(scene.character, part), body_skin, matrices) + origin)
     body = None if bodies is None else tensor([points[skin.points.vertices] - origin for points in bodies])
     states = skin.states(tensor([points - origin for points in cloth]), tensor(list(matrices[:, :, :3])), body)
     return ShownCounts.of(states, list(times))

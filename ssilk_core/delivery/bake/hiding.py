@@ -11,7 +11,7 @@ import numpy as np
 from ...events import Countdown, Message, Reporter, silent
 from ...physics.skin.hidden_faces import HiddenFaces, hidden_polygons
 from ...scene.assets import Floats
-from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
+from ...scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices
 from .rollout import BakeRollout
 
 if TYPE_CHECKING:
@@ -58,4 +58,4 @@ def _posed_bodies(rollout: BakeRollout) -> Iterator[Floats]:
     for start in range(0, motion.frame_count, CHUNK):
         part = motion.clip(start, min(start + CHUNK, motion.frame_count))
         matrices = skinning_matrices(motion_transforms(part, skeleton.parents), skeleton.bind_transforms)
-        yield from np.asarray(skin_points(body.mesh.points, body.skin, matrices))
+        yield from np.asarray(skin_points(body_at_rest(character, part), body.skin, matrices))

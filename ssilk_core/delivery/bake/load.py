@@ -137,16 +137,22 @@ class LoadedGarment:
         )
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
+        from ssilk_usd.reading.body_shapes import with_body_shapes
         from ssilk_usd.reading.frame_range import read_frame_range
         from ssilk_usd.reading.motion import read_motion
         from ssilk_usd.reading.visibility import read_hidden
 
         character, root, samples = self.deformer.scene.character, request.root, request.samples_per_frame
+        garment = self.deformer.scene.garment.mesh.path.rpartition("/")[2]
+
+        def shaped(motion: Motion) -> Motion:
+            return with_body_shapes(request.stage, request.motion, motion, character, root=root, garment=garment)
+
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
         if frames is None:
             source = read_motion(request.motion, character.skeleton, root=root)
             sampled, begun, handles = _sampled(source, (request.fps or source.fps) * samples, np.zeros(1)), 0, 0
-            whole = sampled
+            whole = sampled = shaped(sampled)
         else:
             fps = (request.fps or frames.fps) * samples
             rate, handles = fps / frames.fps, frames.before * samples
@@ -159,9 +165,10 @@ class LoadedGarment:
             within = (frames.first - earlier * frames.step, frames.first + later * frames.step)
             source = read_motion(request.motion, character.skeleton, root=root, within=within)
             whole = _sampled(source, fps, earlier + np.arange(-begun, last + 1) / rate)
-            whole = replace(whole, start=frames.first / frames.step * fps / frames.fps - begun)
+            whole = shaped(replace(whole, start=frames.first / frames.step * fps / frames.fps - begun))
             sampled = whole.clip(begun - handles, whole.frame_count)
         hidden = read_hidden(request.motion, sampled, root=root)
+        source = shaped(source) if request.latent_iterations else source  # networks do not see it
         return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
 
     def _felt(self, around: ShotSurroundings, sight: Sight) -> Motion:

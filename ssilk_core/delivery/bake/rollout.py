@@ -13,6 +13,7 @@ import numpy as np
 from ...events import Countdown, Event, Message, Reporter, silent
 from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
+from ...scene.assets.reshaped import reshaped
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import (
     deform,
@@ -316,6 +317,22 @@ class BakeRollout:
         if self.frames.chosen or self.request.handles:
             report(Message(f"{name}: {self.frames}"))
 
+    @property
+    def _meets_shapes(self) -> bool:
+        """Whether cloth meets bodies as the shot shapes them, where it meets any."""
+        return bool(self.request.lbs or self.request.refine or self.request.latent_iterations)
+
+    @property
+    def _shape_sight(self) -> str:
+        if self.request.lbs:
+            return "it is written so"
+        if self._meets_shapes:
+            return "the solver meets it so, and it is written so"
+        return (
+            "it is written so, but the network was trained on one shape and does not see it change: "
+            "--refine N or --quality hero solve for it"
+        )
+
     def warn(self, report: Reporter) -> None:
         """Report where the motion jumps, and at which frames the rollout was lost."""
         from ssilk_usd.reading.shown import tell_shown_otherwise
@@ -332,6 +349,10 @@ class BakeRollout:
         garment = self.deformer.scene.garment.mesh.path.rpartition("/")[2]
         stage, root = self.request.stage, self.request.root
         tell_shown_otherwise(stage, [self.source.path], report, root=root, garment=garment)
+        if moved := reshaped(self.deformer.scene.character, self.motion):
+            code = self.start + moved[0].frame / self.request.samples_per_frame
+            text = f"{self.request.motion}: {'; '.join(map(str, moved))}, most at time code {code:.9g}"
+            report(Message(f"{text}; {self._shape_sight}", "info" if self._meets_shapes else "warning"))
         if self.held_off:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -109,20 +110,22 @@ def write_glb(
     offsets = {labels.shapes[index]: deformer.shapes[index] for index in shapes}
     worn = scene.garment.mesh
     drawn = [_add_mesh(glb, labels.garment, worn, deformer.skin, offsets=offsets, at=weights[0], kind=GARMENT)]
+    morphed = [(drawn[0], weights)] if weights.shape[1] else []
     if include_body:
         bodies = scene.character.bodies
         masks: Sequence[NDArray[np.bool_] | None] = hidden_polygons or [None] * len(bodies)
-        for name, body, mask in zip(labels.bodies, bodies, masks, strict=True):
+        for number, (name, body, mask) in enumerate(zip(labels.bodies, bodies, masks, strict=True)):
             if mask is None or not mask.all():
-                drawn.append(_add_mesh(glb, name, body.mesh, body.skin, hidden=mask))
-    morphed = [drawn[0]]
+                targets, course = _body_targets(motion, number, body.mesh.vertex_count)
+                drawn.append(_add_mesh(glb, name, body.mesh, body.skin, offsets=targets, at=course[0], hidden=mask))
+                morphed += [(drawn[-1], course)] if targets else []
     for name, rider, own in zip(labels.riders, riders, rider_shapes, strict=True):
         moved = None if own is None else {labels.shapes[index]: own[index] for index in shapes}
         drawn.append(_add_mesh(glb, name, rider.mesh, rider.skin, offsets=moved, at=weights[0], kind=RIDER))
-        morphed += [drawn[-1]] if moved else []
+        morphed += [(drawn[-1], weights)] if moved else []
     glb.add("scenes", {"nodes": [ARMATURE, *drawn]})
     glb.document["scene"] = 0
-    _animate(glb, labels.character, motion.fps, (rotations, translations, weights), hidden, morphed)
+    _animate(glb, labels.character, motion.fps, (rotations, translations), hidden, morphed)
     timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
               "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
     glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
@@ -154,6 +157,20 @@ def _sampled(
     return turns, places, weights
 
 
+def _body_targets(motion: Motion, body: int, points: int) -> tuple[dict[str, Floats], Floats]:
+    """Return the morph targets (V, 3) [m] by which a motion shapes a body, and their weights (F, K)."""
+    targets: dict[str, Floats] = {}
+    own = [index for index, shape in enumerate(motion.shapes) if shape.body == body]
+    for index in own:
+        shape = motion.shapes[index]
+        copies = chain([shape.name], (f"{shape.name}_{copy}" for copy in count(2)))
+        name = next(name for name in copies if name not in targets)
+        targets[name] = np.zeros((points, 3))
+        targets[name][shape.rows] = shape.offsets
+    weights = np.zeros((motion.frame_count, 0)) if motion.shape_weights is None else motion.shape_weights
+    return targets, weights[:, own].astype(np.float32)
+
+
 def _add_mesh(
     glb: GlbBuilder,
     name: str,
@@ -168,7 +185,7 @@ def _add_mesh(
     """Add a skinned mesh and its node; return the node's index.
 
     Args:
-        offsets: of each morph target [m], by name; only a garment and soft riders have them, or none.
+        offsets: of each morph target [m], by name; none by default.
         at: weights of the targets where no animation plays.
     """
     drawn, normals = drawn_mesh(mesh, hidden), ShapeNormals(mesh.points, mesh.faces)
@@ -215,12 +232,17 @@ def _animate(
     glb: GlbBuilder,
     name: str,
     fps: float,
-    samples: tuple[Floats, Floats, Floats],
+    samples: tuple[Floats, Floats],
     hidden: Sequence[tuple[int, bool]],
-    morphed: Sequence[int],
+    morphed: Sequence[tuple[int, Floats]],
 ) -> None:
-    """Add one animation of what moves, and of the first joint's path, so that it always lasts as long."""
-    rotations, translations, weights = samples
+    """Add one animation of what moves, and of the first joint's path, so that it always lasts as long.
+
+    Args:
+        samples: rotations and translations of the joints.
+        morphed: nodes whose morph targets move, each with their weights (F, K).
+    """
+    rotations, translations = samples
     samplers: list[dict[str, object]] = []
     channels: list[dict[str, object]] = []
     times = glb.array((np.arange(len(rotations)) / fps).astype(np.float32), "SCALAR", bounds=True)
@@ -234,9 +256,8 @@ def _animate(
             add(1 + joint, "rotation", rotations[:, joint], "VEC4")
         if joint == 0 or _moves(translations[:, joint]):
             add(1 + joint, "translation", translations[:, joint], "VEC3")
-    if weights.shape[1]:
-        for node in morphed:
-            add(node, "weights", weights.reshape(-1), "SCALAR")
+    for node, weights in morphed:
+        add(node, "weights", weights.reshape(-1), "SCALAR")
     if hidden:
         when = glb.array(np.array([frame / fps for frame, _ in hidden], dtype=np.float32), "SCALAR", bounds=True)
         scales = np.array([[0.0 if gone else 1.0] * 3 for _, gone in hidden], dtype=np.float32)

@@ -122,10 +122,11 @@ class LatentShots:
         kept = [spread_evenly(motion.frame_count, share) for motion in motions]
         rolled = [self._rolled(motion)[torch.as_tensor(rows)] for motion, rows in zip(motions, kept)]
         z = torch.cat(rolled).to(self.solver.potential.dtype).clamp(-self.solver.bound, self.solver.bound)
-        poses = self.simulator.poser.pose(*(
+        rotations, translations = (
             np.concatenate([getattr(motion, name)[rows] for motion, rows in zip(motions, kept)])
             for name in ("rotations", "translations")
-        ))  # fmt: skip
+        )
+        poses = self.simulator.poser.pose(rotations, translations, self.simulator.poser.moves(zip(motions, kept)))
         scene = self.model.scene
         cubature = choose_elements(scene, self.simulator, self.solver, z, poses)
         simulator = self.simulator.sampled(scene, cubature)
@@ -190,9 +191,11 @@ class LatentShots:
             running = [motion for motion in motions if motion.frame_count > start]
             spans = [motion.clip(start, start + POSED) for motion in running]
             counts = torch.tensor([span.frame_count for span in spans], device=device)
-            posed = simulator.poser.pose(*(
+            rotations, translations = (
                 np.concatenate([getattr(span, name) for span in spans]) for name in ("rotations", "translations")
-            ))  # fmt: skip
+            )
+            moves = simulator.poser.moves((span, slice(None)) for span in spans)
+            posed = simulator.poser.pose(rotations, translations, moves)
             rows = counts.cumsum(0) - counts
             for frame in range(max(first - start, 0), spans[0].frame_count):
                 yield posed.select(rows[counts > frame] + frame)

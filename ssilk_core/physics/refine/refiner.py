@@ -198,7 +198,8 @@ class Refiner:
         tail: _Tail | None = None
         for start, stop in _blocks(span.frame_count, 1 if self.options.feedback else self.options.batch):
             world = self._next_frames(network, stop - start)
-            poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop])
+            moves = self.simulator.poser.moves([(span, slice(start, stop))])
+            poses = self.simulator.poser.pose(span.rotations[start:stop], span.translations[start:stop], moves)
             if surroundings is not None:
                 places = [(0, (first + frame) / span.fps) for frame in range(start, stop)]
                 poses = replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
@@ -227,10 +228,12 @@ class Refiner:
         for number in range(motions[0].frame_count):
             running = [motion for motion in motions if motion.frame_count > number]
             world = torch.cat([self._next_frames(each, 1) for each in points[: len(running)]], dim=-1)
-            poses = self.simulator.poser.pose(*(
+            rotations, translations = (
                 np.stack([getattr(motion, name)[number] for motion in running])
                 for name in ("rotations", "translations")
-            ))  # fmt: skip
+            )
+            moves = self.simulator.poser.moves((motion, slice(number, number + 1)) for motion in running)
+            poses = self.simulator.poser.pose(rotations, translations, moves)
             frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None)
             yield list(frames)
 

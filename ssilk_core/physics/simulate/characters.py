@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import Floats, Ints, Motion, Scene, Skeleton
+from ...scene.assets import BodyShape, Floats, Ints, Motion, Scene, Skeleton
 from ...scene.kinematics import (
     frames_at,
     local_transforms,
@@ -19,6 +19,7 @@ from ...scene.kinematics import (
     quaternion_from_matrix,
     rigid,
     sample_motion,
+    sample_shapes,
     skinning_matrices,
     slerp,
     split_at_cuts,
@@ -65,9 +66,10 @@ def split_into_spans(
             count = (min(most, stop - start) - 1) * substeps + 1
             position = (start + np.arange(count) / substeps) * motion.fps / fps - source
             position = position.clip(0, part.frame_count - 1)
-            poses = sample_motion(part, position)
+            poses, shapes = sample_motion(part, position), sample_shapes(part, position)
             seconds = (source + position) / motion.fps
-            spans.append(MotionSpan(shot, start, substeps, Motion(motion.path, fps * substeps, *poses), seconds))
+            sampled = Motion(motion.path, fps * substeps, *poses, **shapes)
+            spans.append(MotionSpan(shot, start, substeps, sampled, seconds))
         first, source = stop, source + part.frame_count
     return spans
 
@@ -78,7 +80,9 @@ def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
     parts = [span.motion for span in spans]
     rotations = np.concatenate([part.rotations[::substeps] for part in parts])
     translations = np.concatenate([part.translations[::substeps] for part in parts])
-    return Motion(motion.path, fps, rotations, translations, motion.start * fps / motion.fps)
+    weights = [part.shape_weights[::substeps] for part in parts if part.shape_weights is not None]
+    shaped = {"shapes": motion.shapes, "shape_weights": np.concatenate(weights)} if weights else {}
+    return Motion(motion.path, fps, rotations, translations, motion.start * fps / motion.fps, **shaped)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +95,7 @@ class PosedCharacters:
         lbs: the garment under linear blend skinning, relative to the root, shape (V, 3, N).
         matrices: skinning matrices of the character's joints, relative to the root, shape (J, 3, 4, N).
         world: what surrounds them, or None where nothing does.
+        moves: of the body's vertices in the bind pose by blendshapes of their shots [m], shape (B, 3, N); or None.
     """
 
     root: Tensor
@@ -98,11 +103,14 @@ class PosedCharacters:
     lbs: Tensor
     matrices: Tensor
     world: PosedWorld | None = None
+    moves: Tensor | None = None
 
     def select(self, frames: Tensor) -> PosedCharacters:
         """Return the poses of the frames with indices (M,)."""
         body, world = self.body.select(frames), self.world and self.world.select(frames)
-        return PosedCharacters(self.root[:, frames], body, self.lbs[..., frames], self.matrices[..., frames], world)
+        moves = None if self.moves is None else self.moves[..., frames]
+        own = self.lbs[..., frames], self.matrices[..., frames]
+        return PosedCharacters(self.root[:, frames], body, *own, world, moves)
 
 
 class CharacterPoser:
@@ -114,6 +122,7 @@ class CharacterPoser:
         self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limb_axes(scene), device=device)
         self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
         self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
+        self.starts = np.cumsum([0, *(body.mesh.vertex_count for body in scene.character.bodies)])
 
     def only(self, vertices: Ints) -> CharacterPoser:
         """Return a poser of the same character with some of the garment's vertices alone."""
@@ -124,17 +133,48 @@ class CharacterPoser:
     def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
         """Return the poses of all spans at a step."""
         rotations = np.stack([span.motion.rotations[step] for span in spans])
-        return self.pose(rotations, np.stack([span.motion.translations[step] for span in spans]))
+        translations = np.stack([span.motion.translations[step] for span in spans])
+        return self.pose(rotations, translations, self.moves((span.motion, slice(step, step + 1)) for span in spans))
 
-    def between(self, roots: Tensor, matrices: Tensor, poses: PosedCharacters, share: float) -> PosedCharacters:
+    def moves(self, parts: Iterable[tuple[Motion, slice | Ints]]) -> Tensor | None:
+        """Return by how much shapes move the body's vertices in the bind pose [m], shape (B, 3, N); None without any.
+
+        Args:
+            parts: motions, each with some of its frames, N in all.
+        """
+        parts = list(parts)
+        if not any(motion.shapes for motion, _ in parts):
+            return None
+        found = []
+        for motion, frames in parts:
+            weights = motion.shape_weights
+            rows = np.zeros((len(motion.rotations[frames]), 0)) if weights is None else weights[frames]
+            found.append(self._moved(motion.shapes, torch.as_tensor(np.array(rows, dtype=np.float32))))
+        return torch.cat(found, dim=-1).to(self.rest.device)
+
+    def _moved(self, shapes: Sequence[BodyShape], weights: Tensor) -> Tensor:
+        """Return the moves (B, 3, N) of shapes with weights (N, K)."""
+        moved = torch.zeros(int(self.starts[-1]), 3, len(weights))
+        for shape, course in zip(shapes, weights.T):
+            if shape.body < len(self.starts) - 1 and course.any():  # no cloth meets stand-ins
+                rows = torch.as_tensor(np.asarray(shape.rows) + self.starts[shape.body])
+                moved[rows] += torch.as_tensor(np.array(shape.offsets, dtype=np.float32))[:, :, None] * course
+        return moved
+
+    def between(
+        self, roots: Tensor, matrices: Tensor, poses: PosedCharacters, share: float, moves: Tensor | None = None
+    ) -> PosedCharacters:
         """Return characters a share of the way from others to `poses`, each joint turned about its parent.
 
         Args:
-            roots, matrices: of the others, (3, N) and (J, 3, 4, N), as in `PosedCharacters`.
+            roots, matrices, moves: of the others, as in `PosedCharacters`.
         """
         ends = (self._local(*each) for each in ((roots, matrices), (poses.root, poses.matrices)))
         (turned, placed), (rotations, translations) = ends
-        return self.pose(slerp(turned, rotations, np.asarray(share)), (1 - share) * placed + share * translations)
+        ways = [part * weight for part, weight in ((moves, 1 - share), (poses.moves, share)) if part is not None]
+        moved = torch.stack(ways).sum(0) if ways else None
+        placed = (1 - share) * placed + share * translations
+        return self.pose(slerp(turned, rotations, np.asarray(share)), placed, moved)
 
     def _local(self, roots: Tensor, matrices: Tensor) -> tuple[Floats, Floats]:
         """Return the joints' local rotations (N, J, 4) and translations (N, J, 3) that `pose` takes."""
@@ -145,8 +185,9 @@ class CharacterPoser:
         local = local_transforms(world, self.skeleton.parents)
         return quaternion_from_matrix(local[..., :3, :3]), local[..., :3, 3]
 
-    def pose(self, rotations: Floats, translations: Floats) -> PosedCharacters:
-        """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3)."""
+    def pose(self, rotations: Floats, translations: Floats, moves: Tensor | None = None) -> PosedCharacters:
+        """Return characters with local joint rotations (N, J, 4) and translations (N, J, 3), and bodies that are
+        moved in the bind pose as `moves` says."""
         world = world_transforms(rigid(matrix_from_quaternion(rotations), translations), self.skeleton.parents)
         root = world[:, self.skeleton.hub, :3, 3].copy()
         world[:, :, :3, 3] -= root[:, None]
@@ -155,7 +196,8 @@ class CharacterPoser:
         lbs = transform_points(blend_matrices(self.weights, character), self.rest)
         return PosedCharacters(
             torch.as_tensor(root.T.copy(), device=self.rest.device),
-            self.body.pose(character.float(), exact=True),
+            self.body.pose(character.float(), exact=True, moves=moves),
             lbs,
             character,
+            moves=moves,
         )

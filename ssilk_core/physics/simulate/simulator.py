@@ -122,7 +122,8 @@ class StepHistory:
         neighbours: which cloth may touch which, where that is looked at.
         friction: of what presses at the last positions, for the next step; None without.
         matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
-            body is posed in shorter steps; None where no step is to be split.
+            body is posed in shorter steps; None where no step is to be split. `moves` likewise
+            (`PosedCharacters.moves`).
         pierced: the cloth that limbs were through at the last positions, which a shorter step holds on to.
     """
 
@@ -134,6 +135,7 @@ class StepHistory:
     friction: Friction | None = None
     matrices: Tensor | None = None
     pierced: PiercedCloth | None = None
+    moves: Tensor | None = None
 
     def first(self, count: int) -> StepHistory:
         """Return the history of the first `count` shots."""
@@ -141,11 +143,14 @@ class StepHistory:
 
     def select(self, shots: Tensor) -> StepHistory:
         """Return the history of the shots with indices (M,), in ascending order."""
-        before, matrices = (v if v is None else v[..., shots] for v in (self.before, self.matrices))
+        before, matrices, moves = (
+            v if v is None else v[..., shots] for v in (self.before, self.matrices, self.moves)
+        )
         neighbours, friction = self.neighbours and self.neighbours.select(shots), self.friction
         friction, pierced = friction and friction.select(shots), self.pierced and self.pierced.select(shots)
         root, lbs = self.root[:, shots], self.lbs[..., shots]
-        return StepHistory(self.last[..., shots], before, root, lbs, neighbours, friction, matrices, pierced)
+        known = neighbours, friction, matrices, pierced, moves
+        return StepHistory(self.last[..., shots], before, root, lbs, *known)
 
     @property
     def local(self) -> Tensor:
@@ -261,7 +266,7 @@ class Simulator:
         shorter = copy.copy(self)
         shorter.dt, shorter.splits = self.dt / PARTS, self.splits - 1
         assert past.matrices is not None
-        solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses)
+        solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses, moves=past.moves)
         if past.before is not None:
             past = replace(past, before=past.last - (past.last - past.before) / PARTS)
         at = between(0.0)
@@ -286,7 +291,7 @@ class Simulator:
         friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
         world = solution.x.double() + poses.root
         known = solution.neighbours, friction, poses.matrices
-        return StepHistory(world, before, poses.root, poses.lbs, *known)
+        return StepHistory(world, before, poses.root, poses.lbs, *known, moves=poses.moves)
 
     def _first(self, spans: Sequence[MotionSpan], surroundings: Surroundings | None) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
@@ -300,6 +305,7 @@ class Simulator:
             translations,
             Countdown(most, self.report),
             lambda poses: _surrounded(poses, surroundings, spans, 0),
+            self.poser.moves((span.motion, slice(0, 1)) for span in spans),
         )
         return self._history(solution, poses, None), solution
 
@@ -309,6 +315,7 @@ class Simulator:
         translations: Floats,
         advanced: Callable[[], object] = lambda: None,
         surrounded: Callable[[PosedCharacters], PosedCharacters] = lambda poses: poses,
+        moves: Tensor | None = None,
     ) -> tuple[PosedCharacters, Solution]:
         """Return poses with their quasi-static states, to which the garment is carried from the bind pose.
 
@@ -318,6 +325,7 @@ class Simulator:
             rotations, translations: of the joints, local, shapes (N, J, 4) and (N, J, 3).
             advanced: called after each iteration.
             surrounded: puts what surrounds the characters around the last poses; on the way there nothing does.
+            moves: of the bodies' vertices in the last poses, as `PosedCharacters` has them.
         """
         turned, placed = bind_pose(self.poser.skeleton)
         poses = self.poser.pose(np.broadcast_to(turned, rotations.shape), np.broadcast_to(placed, translations.shape))
@@ -325,7 +333,9 @@ class Simulator:
         known: ClothNeighbours | None = None
         for share in np.arange(1, POSES + 1) / POSES:
             lbs = poses.lbs
-            poses = self.poser.pose(slerp(turned, rotations, share), (1 - share) * placed + share * translations)
+            moved = None if moves is None else float(share) * moves
+            turns, places = slerp(turned, rotations, share), (1 - share) * placed + share * translations
+            poses = self.poser.pose(turns, places, moved)
             poses = surrounded(poses) if share == 1 else poses
             x, inputs = self._carried(x, x + poses.lbs - lbs, self.inputs(poses, None), known)
             solver = last if share == 1 else replace(last, iterations=min(ON_THE_WAY, last.iterations))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...scene.assets import Collider, Floats, Motion, Scene
-from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
+from ...scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices
 from .colliders import voting_points
 from .surface import CollisionSurface, PosedSurface, Search, boxes
 
@@ -61,7 +61,7 @@ class OwnShapes:
             motion, scene = self._motion.picked(np.array([frame])), self._scene
             body, skeleton = scene.character.merged_body(), scene.character.skeleton
             matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-            points = skin_points(body.mesh.points, body.skin, matrices)[0]
+            points = skin_points(body_at_rest(scene.character, motion), body.skin, matrices)[0]
             self._posed[frame] = points, voting_points(motion, scene)[0]
         return self._posed[frame]
 

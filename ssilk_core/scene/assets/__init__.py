@@ -7,6 +7,7 @@ triangles counter-clockwise from outside. Readers convert to these conventions, 
 """
 
 from .arrays import UP, Floats, Ints
+from .body_shape import BodyShape
 from .character import Body, Character
 from .deformer import Deformer, GarmentPose
 from .garment import CLASS_NAMES, LOOSE, PINNED, TIGHT, Garment, classes_at
@@ -28,6 +29,7 @@ __all__ = [
     "UP",
     "Air",
     "Body",
+    "BodyShape",
     "Character",
     "Collider",
     "Deformer",

@@ -10,6 +10,7 @@ import numpy as np
 
 from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
+from .body_shape import BodyShape
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +26,8 @@ class Motion:
         gravity: acceleration that cloth feels, wind included [m/s2], shape (F, 3); None for the usual one.
         proximity: to colliders at M points of a garment, as its network sees them (`network.proximity`), shape
             (F, M, 5); None where it sees none.
+        shapes: K blendshapes of the character's meshes that are on otherwise than in its stage.
+        shape_weights: how much of each is on, from 0 to 1, shape (F, K); None where there are none.
     """
 
     path: str
@@ -34,6 +37,8 @@ class Motion:
     start: float = 0.0
     gravity: Floats | None = None
     proximity: Floats | None = None
+    shapes: tuple[BodyShape, ...] = ()
+    shape_weights: Floats | None = None
 
     def __post_init__(self) -> None:
         rotations, translations = frozen(self.rotations, np.float64), frozen(self.translations, np.float64)
@@ -65,6 +70,13 @@ class Motion:
                 fail(self.path, f"proximity of shape {proximity.shape}", f"({len(rotations)}, points, 5) is needed")
             need_finite(proximity, self.path, "frames of proximity")
             assign(self, proximity=proximity)
+        if self.shapes or self.shape_weights is not None:
+            weights = frozen(np.zeros((0, 0)) if self.shape_weights is None else self.shape_weights, np.float64)
+            if weights.shape != (len(rotations), len(self.shapes)):
+                needed = f"({len(rotations)}, {len(self.shapes)}) is needed"
+                fail(self.path, f"weights of blendshapes of shape {weights.shape}", needed)
+            need_finite(weights, self.path, "frames of weights of blendshapes")
+            assign(self, shapes=tuple(self.shapes), shape_weights=weights)
 
     @property
     def frame_count(self) -> int:
@@ -72,14 +84,16 @@ class Motion:
 
     @property
     def felt(self) -> dict[str, Any]:
-        """What cloth feels of the world around the character in each frame, by the name of its attribute."""
-        both = {"gravity": self.gravity, "proximity": self.proximity}
-        return {name: values for name, values in both.items() if values is not None}
+        """What cloth feels of the character's shape and of the world in each frame, by the attribute's name."""
+        every = {"gravity": self.gravity, "proximity": self.proximity, "shape_weights": self.shape_weights}
+        return {name: values for name, values in every.items() if values is not None}
 
     def same_frames(self, other: Motion) -> int:
         """Return in how many frames, from the first one on, another motion is the same; in none at another rate."""
         count = min(self.frame_count, other.frame_count)
         if self.fps != other.fps or self.rotations.shape[1] != other.rotations.shape[1]:
+            return 0
+        if self.shapes != other.shapes:
             return 0
         if {name: each.shape[1:] for name, each in self.felt.items()} != {
             name: each.shape[1:] for name, each in other.felt.items()

@@ -10,12 +10,14 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.scene import kinematics
 from ssilk_core.scene.assets import Character, Floats, Garment, Ints, Mesh, Motion, ProxyRig, SkinWeights
+from ssilk_core.scene.assets.body_shape import shaped
 
 from ..opening.stage import PRIMS, column_matrix, value, world_matrix
 from ..opening.times import change_times
 from ..units import StageUnits
 from .clips import spread
 from .posed import SkinnedMesh, posed_mesh, skinning_of
+from .same_meshes import faces_of
 from .skin import match_joints
 from .spaces import SkelSource, similarity_scale
 
@@ -45,11 +47,15 @@ class Off:
 
 @dataclass(frozen=True, eq=False)
 class _Met:
-    """A mesh at rest, with its weights over the character's joints, then over the joints of `rig`, if any."""
+    """A mesh at rest, with its weights over the character's joints, then over the joints of `rig`, if any.
+
+    `body` is its index among bodies and stand-ins; -1 where it is none.
+    """
 
     mesh: Mesh
     skin: SkinWeights
     rig: ProxyRig | None = None
+    body: int = -1
 
 
 class Compared:
@@ -59,7 +65,8 @@ class Compared:
         self, character: Character, garment: Garment | None, rig: ProxyRig | None, motion: Motion, there: SkelSource
     ) -> None:
         self.met = {
-            _prim_path(body.mesh): _Met(body.mesh, body.skin) for body in (*character.bodies, *character.stand_ins)
+            _prim_path(body.mesh): _Met(body.mesh, body.skin, body=number)
+            for number, body in enumerate((*character.bodies, *character.stand_ins))
         }
         if garment is not None and rig is not None:
             self.met[_prim_path(garment.mesh)] = _Met(garment.mesh, rig.skin, rig)
@@ -86,7 +93,7 @@ class Compared:
         unseen = SAME * float(np.ptp(met.mesh.points, axis=0).max(initial=0))
         found, in_order = Off(0.0, codes[0]), faces_of(own) == faces_of(other)
         for code, frame in zip(codes, frames.tolist()):
-            (points,) = kinematics.skin_points(met.mesh.points, met.skin, self._matrices(met, frame, code))
+            (points,) = kinematics.skin_points(self._at_rest(met, frame), met.skin, self._matrices(met, frame, code))
             seen = self.there.units.points_to_core(shown.points(Usd.TimeCode(code), UsdGeom.XformCache(code)))
             unseen = max(unseen, 1e-6 * float(np.abs(points).max(initial=0)))  # of float32, far from the origin
             paired = len(seen) == len(points)
@@ -100,6 +107,13 @@ class Compared:
             if away > (found.metres or 0.0) * (1 + 1e-6):  # the first of several that are the same
                 found = Off(away, code)
         return found if (found.metres or 0.0) > unseen else None
+
+    def _at_rest(self, met: _Met, frame: int) -> Floats:
+        """Return the points of a mesh in the bind pose as the motion shapes it in a frame [m], shape (V, 3)."""
+        weights = self.motion.shape_weights
+        if weights is None or met.body < 0:
+            return met.mesh.points
+        return shaped(met.mesh.points, self.motion.shapes, weights[frame : frame + 1], met.body)[0]
 
     def _matrices(self, met: _Met, frame: int, code: float) -> Floats:
         """Return what moves what each joint carries at a frame, shape (1, J + P, 4, 4)."""
@@ -140,6 +154,8 @@ class Compared:
         if isinstance(shown, SkinnedMesh) and (weights := shown.weights_attribute()):
             times = np.array(change_times([weights]))
             whole = np.abs((times - frames[0]) / rate % 1 - 0.5) > 0.49
+            # Value clips have a sample just before the frame of a cut.
+            times = np.where(whole, frames[0] + ((times - frames[0]) / rate).round() * rate, times)
             times = times[(times < frames[0]) | (times > frames[-1]) | whole]
             chosen += [*spread(times, LOOKED_AT), *times[_most_on(shown, times)]]
         return sorted({float(code) for code in chosen})
@@ -166,13 +182,6 @@ def _most_on(shown: SkinnedMesh, times: Floats) -> Ints:
 def _prim_path(mesh: Mesh) -> str:
     """Return the path of the prim that a mesh was read from."""
     return "/" + mesh.path.rpartition(":/")[2]
-
-
-def faces_of(prim: Usd.Prim) -> tuple[bytes, bytes]:
-    """Return the faces of a mesh, to be compared."""
-    values = (value(prim, name) for name in ("faceVertexCounts", "faceVertexIndices"))
-    counts, indices = (np.array(each or [], dtype=np.int32).tobytes() for each in values)
-    return counts, indices
 
 
 def rest_off(own: Usd.Prim, other: Usd.Prim) -> Off | None:

@@ -274,10 +274,23 @@ def frame_rate(stage: Usd.Stage) -> tuple[float, float]:
 
 
 def sampled_span(animation: Usd.Prim, placed: Usd.Prim | None) -> tuple[float, float] | None:
-    """Return the time codes of the first and last sample of a motion and its placement; None where there is none."""
+    """Return the time codes of the first and last sample of a motion and its placement; None where there is none.
+
+    Samples of blendshape weights count as far as these change: a body may breathe while its joints are still.
+    """
     attributes = [animation.GetAttribute(name) for name in ("rotations", "translations")]
     times = change_times([*attributes, *(xform_attributes(placed) if placed else ())])
+    weights = animation.GetAttribute("blendShapeWeights")
+    more = change_times([weights])
+    if more and (not times or more[0] < times[0] or more[-1] > times[-1]) and _changes(weights, more):
+        times = sorted([*times, *more])
     return (times[0], times[-1]) if times else None
+
+
+def _changes(attribute: Usd.Attribute, times: list[float]) -> bool:
+    """Return whether an attribute has other values at some of these time codes than at the first."""
+    first = attribute.Get(times[0])
+    return any(attribute.Get(time) != first for time in times[1:])
 
 
 def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Blendshapes that are on: a mesh is read in the shape that UsdSkel shows at the earliest time of its stage.
 
-Blendshapes make body types, and the shape that a garment was fitted to. Shots may animate them: cloth meets the shape
-of the character's stage throughout, and `animated_shapes` says which ones a motion changes.
+Blendshapes make body types, and the shape that a garment was fitted to. Shots may animate them: those of bodies are
+followed (`body_shapes`). Garments keep the shape of the character's stage, and `animated_shapes` says which ones a
+motion changes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, needs_whole_files, open_stage, value
+from ..opening.stage import EARLIEST, PRIMS, StageLike, named, needs_whole_files, open_stage, value
+from .mesh import is_garment
 from .motion import find_animation
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource
@@ -27,7 +29,7 @@ SAME = 1e-3  # difference of weights that nobody sees
 
 def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> Floats | None:
     """Return how far the blendshapes that are on move a mesh's points in its own space, (V, 3); None without any."""
-    weights = _weights(prim, skel, code)
+    weights = shape_weights(prim, skel, code)
     if weights is None or not np.any(weights):
         return None
     shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
@@ -39,7 +41,7 @@ def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIES
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
-def _weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:
+def shape_weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:
     """Return the weight of each blendshape of a mesh at a time; None where nothing weighs them."""
     cache = UsdSkel.Cache()
     cache.Populate(UsdSkel.Root(skel.root), PRIMS)
@@ -56,7 +58,7 @@ def _weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) ->
 
 @dataclass(frozen=True)
 class AnimatedShape:
-    """A blendshape of a character whose weight in a motion is another one than that it was read with.
+    """A blendshape of a garment whose weight in a motion is another one than that it was read with.
 
     Attributes:
         mesh: name of its mesh.
@@ -77,21 +79,21 @@ class AnimatedShape:
 
 
 def tell_animated_shapes(motion: str, found: Sequence[AnimatedShape], report: Reporter) -> None:
-    """Report the blendshapes that a motion changes, in which cloth does not meet the character's meshes."""
+    """Report the blendshapes of garments that a motion changes and that are not followed."""
     if found:
-        named: dict[str, AnimatedShape] = {}
+        firsts: dict[str, AnimatedShape] = {}
         for each in found:
-            named.setdefault(each.mesh, each)  # those of a face hide no body's
-        text = f"{motion}: it weighs blendshapes that are not followed: {'; '.join(map(str, named.values()))}"
-        more = f", and {len(found) - len(named)} more" if len(found) > len(named) else ""
-        report(Message(f"{text}{more}; cloth meets the shape of the character's stage throughout", "warning"))
+            firsts.setdefault(each.mesh, each)  # those of one hide no other's
+        text = f"{motion}: it weighs blendshapes that are not followed: {'; '.join(map(str, firsts.values()))}"
+        more = f", and {len(found) - len(firsts)} more" if len(found) > len(firsts) else ""
+        report(Message(f"{text}{more}; what is written has the garment of the character's stage", "warning"))
 
 
 @needs_whole_files
 def animated_shapes(
     source: StageLike, motion: str, *, root: str | None = None, garment: str | None = None
 ) -> list[AnimatedShape]:
-    """Return the blendshapes of a character's meshes that a motion weighs otherwise than its stage does.
+    """Return the blendshapes of a character's garments that a motion weighs otherwise than its stage does.
 
     A shape that a shot's animation does not name is off in that shot; a clip that stands alone leaves it as it is.
 
@@ -99,7 +101,7 @@ def animated_shapes(
         source: the character's stage.
         motion: "file[:/Prim/Path]", as for `read_motion`.
         root: the character, if there are several.
-        garment: its mesh, whose skeleton is not the character's.
+        garment: a mesh that is not marked as one, by path or name.
 
     Raises:
         SsilkError: as `read_motion` and `read_character`.
@@ -121,8 +123,10 @@ def animated_shapes(
     for mesh in Usd.PrimRange(skel.root, PRIMS):
         if not (len(rows) and mesh.IsA(UsdGeom.Mesh) and bound_skeleton(mesh) == skel.prim):
             continue
+        if not (is_garment(mesh) or (garment and named([mesh], garment))):
+            continue
         own = [str(name) for name in UsdSkel.BindingAPI(mesh).GetBlendShapesAttr().Get() or ()]
-        weights = _weights(mesh, skel) or [0.0] * len(own)
+        weights = shape_weights(mesh, skel) or [0.0] * len(own)
         for name, weight in zip(own, weights):
             unnamed = weight if placed is None else 0.0
             course = rows[:, names.index(name)] if name in names else np.array([unnamed])

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a shot shows a character's meshes otherwise than the character's stage, which is what cloth meets.
 
-Blendshapes that it weighs otherwise or alone has, points that it has moved, point caches, and parts that it hides.
+Points that it has moved, point caches, and parts that it hides. Blendshapes of bodies are followed (`body_shapes`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,12 +22,14 @@ from ..opening.garment_api import read_garment_record
 from ..opening.stage import PRIMS, USD_SUFFIXES, StageLike, named, needs_whole_files, open_stage, value
 from ..opening.times import change_times, visibility_attributes
 from .animation import animation_source
+from .body_shapes import with_body_shapes
 from .character import is_skinned, read_character
-from .compared import Compared, faces_of, rest_off
+from .compared import Compared, rest_off
 from .garment import find_garment, read_garment
-from .mesh import is_body, is_drawn, is_garment, is_rider, is_stand_in, kept_faces
+from .mesh import is_body, is_drawn, is_garment, is_stand_in, kept_faces
 from .motion import find_animation, read_motion
 from .rig import read_proxy_rig
+from .same_meshes import same_meshes, skinned_meshes
 from .shapes import animated_shapes, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource
@@ -76,14 +78,14 @@ def shown_otherwise(
     Args:
         source, motion, root, garment: as for `animated_shapes`.
         bodies: those that cloth meets, as for `read_character`.
-        known: names of meshes whose shape is known to differ.
+        known: names of garments whose shape is known to differ.
 
     Raises:
         SsilkError: as `read_motion` and `read_character`.
     """
     stage, (file, prim) = open_stage(source), split_location(motion)
     skel = find_skeleton(stage, root=root, garment=garment)
-    own = [mesh for mesh in _meshes(skel) if is_drawn(mesh)]
+    own = [mesh for mesh in skinned_meshes(skel) if is_drawn(mesh)]
     found = [_hidden(mesh, skel, " of its own stage") for mesh in own]
     _, placed = find_animation(of_motion := open_stage(file), prim, root)
     if placed is None:
@@ -102,8 +104,9 @@ def shown_otherwise(
         found.append(f"its garment is not compared with the character's: {error}")
     if cloth is not None and cloth.prim not in own:
         own.append(cloth.prim)
-    same = _same_meshes(there, skel, own, cloth)
+    same = same_meshes(there, skel, own, cloth.prim if cloth else None)
     read = read_motion(of_motion, character.skeleton, prim=prim, root=root)
+    read = with_body_shapes(stage, motion, read, character, root=root, garment=garment)
     compared = Compared(character, cloth.garment if cloth else None, cloth.rig if cloth else None, read, there)
     # Cloth that was simulated, in place of the character's, over bodies whose faces may be hidden.
     is_baked = any(_is_baked(mesh) for mesh in Usd.PrimRange.Stage(of_motion, PRIMS) if mesh.IsA(UsdGeom.Mesh))
@@ -111,7 +114,7 @@ def shown_otherwise(
         if cloth is not None and original == cloth.prim:
             found += _garment_otherwise(mesh, original, compared, known)
         elif not is_garment(original) and compared.meets(original):
-            found += _body_otherwise(mesh, original, compared, known, is_baked)
+            found += _body_otherwise(mesh, original, compared, is_baked)
         found.append(_hidden(mesh, there))
     if cloth is not None and cloth.prim not in same.values() and not is_baked:
         found.append(_deactivated(cloth.prim, skel, there))
@@ -146,65 +149,9 @@ def _read_cloth(stage: Usd.Stage, skeleton: Skeleton, garment: str | None, root:
     return _Cloth(find_garment(stage, garment), read, rig)
 
 
-def _meshes(skel: SkelSource) -> Iterator[Usd.Prim]:
-    """Yield the meshes that are bound to a skeleton; what rides on a garment is placed by its cloth."""
-    for prim in Usd.PrimRange(skel.root, PRIMS):
-        if prim.IsA(UsdGeom.Mesh) and bound_skeleton(prim) == skel.prim and not is_rider(prim):
-            yield prim
-
-
-def _same_meshes(
-    there: SkelSource, skel: SkelSource, own: Sequence[Usd.Prim], cloth: _Cloth | None
-) -> dict[Usd.Prim, Usd.Prim]:
-    """Return for meshes of a shot which of a character's own meshes they are.
-
-    They have its path beneath the SkelRoot, its name, or its faces alone: programs add a namespace to names, or a
-    number. Those that follow another Skeleton are meant where no others are, and a garment beside the SkelRoot.
-    """
-
-    def path(mesh: Usd.Prim) -> str:
-        root = skel.root if mesh in own else there.root
-        return str(mesh.GetPath().MakeRelativePath(root.GetPath()))
-
-    every = [prim for prim in Usd.PrimRange.Stage(there.stage, PRIMS) if prim.IsA(UsdGeom.Mesh)]
-    within = [prim for prim in every if prim.GetPath().HasPrefix(there.root.GetPath())]
-    bound = [prim for prim in within if bound_skeleton(prim) == there.prim]
-    free = [prim for prim in within if not bound_skeleton(prim)]
-    found: dict[Usd.Prim, Usd.Prim] = {}
-    for meshes in (bound, free):
-        for key in (path, Usd.Prim.GetName):
-            _pair(meshes, own, key, found)
-    others = [prim for prim in within if prim not in bound and prim not in free]
-    _pair([prim for prim in within if prim not in others], own, faces_of, found)
-    for key in (path, Usd.Prim.GetName):
-        _pair(others, own, key, found)
-    if cloth is not None:
-        _pair([prim for prim in every if prim not in within], [cloth.prim], Usd.Prim.GetName, found)
-    return found
-
-
-def _pair(
-    meshes: Sequence[Usd.Prim],
-    own: Sequence[Usd.Prim],
-    key: Callable[[Usd.Prim], Hashable],
-    found: dict[Usd.Prim, Usd.Prim],
-) -> None:
-    """Add to `found` the meshes of a key that as many of a character's own have, in the order of their stages."""
-    missing = [mesh for mesh in own if mesh not in found.values()]
-    left = [mesh for mesh in meshes if missing and mesh not in found]
-    for each in dict.fromkeys(map(key, missing if left else [])):
-        pairs = [[mesh for mesh in some if key(mesh) == each] for some in (left, missing)]
-        if len(pairs[0]) == len(pairs[1]):  # such as two shoes
-            found.update(zip(*pairs))
-
-
-def _body_otherwise(
-    mesh: Usd.Prim, own: Usd.Prim, compared: Compared, known: Iterable[str], is_baked: bool
-) -> Iterator[str]:
-    """Yield in words that a shot has a body of another shape, or with other faces."""
+def _body_otherwise(mesh: Usd.Prim, own: Usd.Prim, compared: Compared, is_baked: bool) -> Iterator[str]:
+    """Yield in words that a shot has a body of another shape than blendshapes make it, or with other faces."""
     name, to = mesh.GetName(), bound_skeleton(mesh)
-    if own.GetName() in known and not _is_cache(mesh, compared.there):
-        return
     off = compared.off(own, mesh)
     if off and _is_cache(mesh, compared.there):
         yield f"{name} is a point cache, which is not followed; cloth meets it as its joints move it, elsewhere {off}"
@@ -282,7 +229,7 @@ def _other_bodies(
         if body not in same.values() or body in guides:
             text = guides.get(body, f"it shows no mesh {body.GetName()} that is the character's")
             yield f"{text}; cloth meets it, and it is seen in what is written"
-    extra = [mesh for mesh in _meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
+    extra = [mesh for mesh in skinned_meshes(there) if mesh not in same and is_drawn(mesh) and is_body(mesh)]
     for mesh in extra:
         if not is_stand_in(mesh):
             text = f"{mesh.GetName()} follows its skeleton and is not in the character's stage"

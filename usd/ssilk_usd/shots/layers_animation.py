@@ -19,7 +19,7 @@ from ..names import shape_name
 from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
 from ..units import StageUnits
-from ..writing.author import Asset, define_blendshapes, define_rider_shapes, extent_array
+from ..writing.author import Asset, define_blendshapes, define_body_shapes, define_rider_shapes, extent_array
 from ..writing.body_faces import HiddenPolygons, hide_polygons
 from ..writing.export import save
 from .layers import DEFORMATION, QUALITY, Layout, define_path, variant
@@ -54,7 +54,7 @@ def write_animation(
 ) -> ShotSummary:
     """Write what moves in one shot as a layer that references its asset.
 
-    Blendshapes of the deformer that the asset lacks are the shot's own, and are written with it.
+    Blendshapes of the deformer that the asset lacks are the shot's own, and so are those by which it shapes bodies.
 
     Args:
         motion, poses, start, samples_per_frame, hidden: as `shot.write_shot` takes them.
@@ -74,6 +74,7 @@ def write_animation(
         _define_animation(stage, asset, layout, deformer)
         asset = replace(asset, rider_shapes=riders.shapes if riders else asset.rider_shapes)
         asset = _define_own_shapes(stage, asset, deformer, units)
+        asset = define_body_shapes(stage, asset, motion, units, before=list(map(shape_name, asset.shapes)))
         set_metadata(stage, span, units)
         if lean:
             define_path(stage.GetPrimAtPath(asset.root))

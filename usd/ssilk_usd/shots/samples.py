@@ -11,6 +11,7 @@ from pxr import Gf, Sdf, UsdSkel, Vt
 
 from ssilk_core.errors import fail
 from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion, SkinWeights
+from ssilk_core.scene.assets.body_shape import shaped
 from ssilk_core.scene.kinematics import (
     combined_transforms,
     continuous,
@@ -77,8 +78,13 @@ class Samples:
             self._write(self.asset.root, PATH_OP, times, _vectors(self.units.points_from_core(origins)))
         self.moves |= pose.translations is not None
         self._write_joints(times, world)
-        if len(self.asset.shapes):
-            weights = np.ascontiguousarray(pose.weights[:, self.asset.shapes])
+        if len(self.asset.shapes) or self.asset.body_shapes:
+            weights = pose.weights[:, self.asset.shapes]
+            if self.asset.body_shapes and self.motion.shape_weights is not None:
+                frames = slice(pose.start, pose.start + pose.frame_count)
+                own = self.motion.shape_weights[frames][:, list(self.asset.body_shapes)]
+                weights = np.concatenate([weights, own], axis=1).astype(np.float32)
+            weights = np.ascontiguousarray(weights)
             self._write(self.asset.animation, "blendShapeWeights", times, map(Vt.FloatArray.FromNumpy, weights))
         self._write(self.asset.root, "extent", times, self._extents(pose, world))
         self.unsaved_count += pose.frame_count
@@ -105,14 +111,25 @@ class Samples:
         scene = self.deformer.scene
         matrices = skinning_matrices(world, scene.bind_transforms)
         bodies = [body.mesh.points for body in self.others]
-        for weights, joints in zip(pose.weights, matrices):
+        moved = self._moved_bodies()
+        for frame, (weights, joints) in enumerate(zip(pose.weights, matrices), pose.start):
             garment = scene.garment.mesh.points + np.tensordot(weights, self.deformer.shapes, 1)
             rest = [garment, *bodies]
             for at, shapes in self.soft:
                 rest[1 + at] = bodies[at] + np.tensordot(weights, shapes, 1)
+            for at in moved:
+                rest[1 + at] = shaped(bodies[at], self.motion.shapes, self._shape_weights(frame), at)[0]
             posed = np.concatenate([surface.skin(points, joints) for surface, points in zip(self.surfaces, rest)])
             posed = self.units.points_from_core(posed)
             yield extent_array(posed.min(axis=0), posed.max(axis=0))
+
+    def _moved_bodies(self) -> list[int]:
+        """Return the bodies that the motion shapes."""
+        return sorted({shape.body for shape in self.motion.shapes if shape.body < len(self.asset.bodies)})
+
+    def _shape_weights(self, frame: int) -> Floats:
+        assert self.motion.shape_weights is not None
+        return self.motion.shape_weights[frame : frame + 1]
 
     def save(self, name: str | Path) -> None:
         """Write pending changes to the file; messages call it `name`."""

@@ -15,10 +15,11 @@ from ssilk_core.errors import fail
 from ssilk_core.files import replacing
 from ssilk_core.scene.assets import Deformer, GarmentPose, Motion
 
+from ..names import shape_name
 from ..opening.garment_api import GarmentRecord
 from ..units import StageUnits
 from ..writing.asset_info import AssetInfo
-from ..writing.author import define_asset
+from ..writing.author import define_asset, define_body_shapes
 from ..writing.body_faces import HiddenPolygons
 from ..writing.export import need_layer_suffix, save
 from .samples import Samples
@@ -73,7 +74,7 @@ def write_shot(
         units: units and up axis of the written stage.
         start: time code of the first frame; each next frame is one time code later.
         samples_per_frame: how many of the motion's frames make one of the shot's, for motion blur.
-        include_body: write the character's body meshes as well.
+        include_body: write the character's body meshes as well, with the blendshapes of the motion.
         riders: what rides on the garment; deformer and poses have its joints.
         hidden: from which frames of the motion on the garment is hidden (True) or seen (False).
         hidden_polygons: polygons of the bodies to hide.
@@ -97,6 +98,7 @@ def write_shot(
             stage, deformer, bodies, units, riders=riders, record=record, info=info, hidden_polygons=hiding,
             output=path,
         )  # fmt: skip
+        asset = define_body_shapes(stage, asset, motion, units, before=list(map(shape_name, asset.shapes)))
         set_visibility(stage, asset.root, span, hidden)
         del stage  # nobody has to hear of each sample
         samples = Samples(layer, asset, deformer, motion, units, start=start, step=span.step)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,18 @@ from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Body, Deformer, Floats, Garment, Ints, Mesh, ProxyRig, Skeleton, SkinWeights
+from ssilk_core.scene.assets import (
+    Body,
+    Deformer,
+    Floats,
+    Garment,
+    Ints,
+    Mesh,
+    Motion,
+    ProxyRig,
+    Skeleton,
+    SkinWeights,
+)
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, RIDER_JOINTS, RIDES_ON, shape_name
@@ -44,6 +55,7 @@ class Asset:
         riders, rider_paths: likewise what rides on the garment.
         rider_shapes: of each rider, offsets by the deformer's blendshapes [m], shape (K, M, 3), or None.
         shapes: the blendshapes that were written, as indices into the deformer's; others move nothing.
+        body_shapes: those of bodies, as indices into the motion's shapes, in the animation behind `shapes`.
         left_out: what the meshes lose of their looks, and the character of its parts, for messages; empty where
             nothing.
     """
@@ -58,6 +70,7 @@ class Asset:
     riders: tuple[Body, ...] = ()
     rider_paths: tuple[Sdf.Path, ...] = ()
     rider_shapes: tuple[Floats | None, ...] = ()
+    body_shapes: tuple[int, ...] = ()
 
 
 def define_asset(
@@ -126,6 +139,48 @@ def define_asset(
         root.GetPath(), paths[2], paths[1], bodies, tuple(body_paths), shapes, str(left), ridden,
         tuple(rider_paths), riders.shapes if riders else (),
     )  # fmt: skip
+
+
+def define_body_shapes(
+    stage: Usd.Stage, asset: Asset, motion: Motion, units: StageUnits, *, before: Sequence[str] = ()
+) -> Asset:
+    """Define the blendshapes by which a motion shapes the bodies of an asset, and let its SkelAnimation weigh them.
+
+    Shapes of one name and course have one weight, such as those of a body and its lashes.
+
+    Args:
+        before: blendshapes that the animation weighs, in front.
+
+    Returns:
+        The asset with what the animation weighs of the motion's shapes.
+    """
+    courses: dict[str, int] = {}
+    for body, path in enumerate(asset.body_paths):
+        own: dict[str, Floats] = {}
+        prim = stage.OverridePrim(path) if any(shape.body == body for shape in motion.shapes) else None
+        there = {child.GetName() for child in prim.GetAllChildren()} if prim else set()
+        for index, shape in enumerate(motion.shapes):
+            if shape.body != body or motion.shape_weights is None:
+                continue
+            name, course = _identifier(shape.name), motion.shape_weights[:, index]
+            known = courses.get(name)
+            if name in {*there, *own} or known is None or (course != motion.shape_weights[:, known]).any():
+                name = free_name(name, {*before, *courses, *there, *own})
+                courses[name] = index
+            own[name] = np.zeros((asset.bodies[body].mesh.vertex_count, 3))
+            own[name][shape.rows] = shape.offsets
+        if prim:
+            define_blendshapes(UsdGeom.Mesh(prim), list(own), np.array(list(own.values())), units)
+    if courses:
+        animation = UsdSkel.Animation(stage.GetPrimAtPath(asset.animation))
+        animation.CreateBlendShapesAttr(Vt.TokenArray([*before, *courses]))
+        animation.CreateBlendShapeWeightsAttr()
+    return replace(asset, body_shapes=tuple(courses.values()))
+
+
+def _identifier(name: str) -> str:
+    """Return a name as prims may have it."""
+    return re.sub(r"^(\d|$)", r"_\1", re.sub(r"\W", "_", name))
 
 
 def prim_names(paths: Sequence[str]) -> list[str]:
