@@ -22,6 +22,7 @@ from ..errors import SsilkError, fail
 from ..files import is_usd, replacing
 from ..scene.assets import Character, Floats, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from ..scene.fabrics import Fabric
+from ..scene.family import BodyFamily
 from .bodies import SeenBodies, parted
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
@@ -36,7 +37,7 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
-    "family": (),
+    "family": (), "body_meshes": (),
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
@@ -133,9 +134,13 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
-        **({} if model.bodies is None else {"family": model.bodies.family.bodies.names}),
+        **({} if model.bodies is None else _names(model.bodies.family.bodies)),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
+
+
+def _names(bodies: BodyFamily) -> dict[str, tuple[str, ...]]:
+    return {"family": bodies.names, "body_meshes": bodies.meshes}
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -214,8 +219,8 @@ def _need_header(document: dict[str, Any]) -> None:
     _need_types(document, HEADER)
     _need_types(document["config"], vars(ModelConfig()))
     _need_types(document["fabric"], vars(Fabric("")))
-    members = document.get("family", [])
-    for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members):
+    members, meshes = (document.get(name, []) for name in ("family", "body_meshes"))
+    for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members, meshes):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
@@ -249,7 +254,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         )
     parameters, bodies = _parameters(tensors, scene.garment.mesh.path), None
     if "family" in document:
-        bodies = SeenBodies.of(tensors, tuple(document["family"]))
+        bodies = SeenBodies.of(tensors, tuple(document["family"]), tuple(document["body_meshes"]))
         bodies.need_fit(skeleton, scene.garment.mesh.vertex_count, scene.rig.proxy_count, parameters)
     return ModelFile(
         scene,

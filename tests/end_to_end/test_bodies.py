@@ -274,6 +274,58 @@ def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
     assert "train for the family anew" in capsys.readouterr().err
 
 
+def with_hat(path: str) -> None:
+    """Give a hero a second mesh, which one of its joints carries; it is no body unless it is named."""
+    stage = Usd.Stage.Open(path)
+    hat = UsdGeom.Mesh.Define(stage, "/Hero/Hat")
+    hat.CreatePointsAttr([(0.1, 1.7, 0), (-0.1, 1.7, 0), (0, 1.8, 0.1)])
+    hat.CreateFaceVertexCountsAttr([3])
+    hat.CreateFaceVertexIndicesAttr([0, 1, 2])
+    skin = UsdSkel.BindingAPI.Apply(hat.GetPrim())
+    skin.CreateJointIndicesPrimvar(True, 1).Set([2])
+    skin.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    stage.Save()
+
+
+@pytest.mark.parametrize("named", ["--body Body", "--body Hat --body Body"])
+def test_a_family_of_some_meshes_is_dressed_on_its_own_stages(world, toy, capsys, named):
+    for path in ("rigged.usda", "taller.usda"):
+        with_hat(path)
+    train = f"{TRAIN} --family taller.usda {named} -o some.safetensors"
+    assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    shot = "bake some.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage rigged.usda -o own.usda") == 0
+    capsys.readouterr()
+    assert run(f"{shot} --stage taller.usda -o its.usda") == 0
+    told = capsys.readouterr()
+    assert "a body of the model's family" in told.out + told.err
+    assert {"Body", "Hat", "Skirt"} <= shown("its.usda", 3).keys()
+
+
+def test_a_family_is_not_dressed_where_its_mesh_has_other_points(world, capsys):
+    stage = Usd.Stage.Open("taller.usda")
+    body = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body"))
+    body.GetPointsAttr().Set([*body.GetPointsAttr().Get(), (0, 2, 0)])
+    for name, weight in (("jointIndices", 2), ("jointWeights", 1.0)):
+        values = UsdGeom.PrimvarsAPI(body).GetPrimvar(f"skel:{name}")
+        values.Set([*values.Get(), weight])
+    stage.Save()
+    assert run(f"{BAKE} --stage taller.usda -o out.usda") == 2
+    told = capsys.readouterr().err
+    assert "'Body' with" in told and "the model's family of bodies has 'Body' with" in told
+    assert not Path("out.usda").exists()
+
+
+def test_bodies_that_are_alike_in_three_digits_are_two(world, capsys):
+    write_member(world / "one.usda", lambda points: points * [1.15, 1, 1.15])
+    write_member(world / "other.usda", lambda points: points * [1.15003, 1, 1.15003])
+    shot = "bake family.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage one.usda -o shots/") == 0
+    capsys.readouterr()
+    assert run(f"{shot} --stage other.usda --shot-name second -o shots/") == 2
+    assert "another body of its model's family" in capsys.readouterr().err
+
+
 def test_in_a_folder_of_layers_a_name_stays_with_its_body(world, capsys):
     shot = "bake family.safetensors --motion clip.usda"
     assert run(f"{shot} --stage heavier.usda -o shots/") == 0

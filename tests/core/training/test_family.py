@@ -21,6 +21,7 @@ from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
 from ssilk_core.training.family_bank import build_family_bank
+from ssilk_core.training.job import TrainJob
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
@@ -181,6 +182,23 @@ def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_
     for number in (3, 4, 3):
         DrawnBodies(bodies, [Seen()], 7, CPU).draw(number)
     assert torch.equal(seen[0], seen[2]) and not torch.equal(seen[0], seen[1])
+
+
+def test_a_run_does_not_go_on_with_another_family_of_the_same_coordinates(scene, members, toy_motion, tmp_path):
+    """Two members are always at zero and one."""
+    motion = toy_motion(scene, 12)
+
+    def identity(member):
+        family = dressed_family(scene, BodyFamily.of([members[0], member]), [member])[0]
+        return TrainJob(
+            scene=scene, motions=[motion], held_out=[motion], model=CONFIG, train=TrainConfig(), fabric=Fabric("toy"),
+            output=tmp_path / "model.safetensors", family=family,
+        ).identity()  # fmt: skip
+
+    taller, heavier = (identity(member) for member in members[1:])
+    assert taller["family"] != heavier["family"] and identity(members[1]) == taller
+    moved = shaped(members[1], lambda points: points * (1 + 1e-12), "/taller")
+    assert identity(moved)["family"] == taller["family"]
 
 
 def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(model, family, scene):
