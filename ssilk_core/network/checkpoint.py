@@ -69,13 +69,39 @@ class ModelFile:
 
         Args:
             seen: what the networks see as such (K,), where bodies so far off were not trained for.
+
+        Raises:
+            SsilkError: these are no coordinates of its family.
         """
-        if self.bodies is None or not np.any(coordinates):
-            return replace(self, bodies=None)
+        where, coordinates = self.scene.garment.mesh.path, np.asarray(coordinates, np.float64)
+        if self.bodies is None:
+            fail(where, "a model of one body, put on one of a family", "it has no other", "leave coordinates out")
+        size = self.bodies.family.bodies.size
+        if coordinates.shape != (size,) or not np.isfinite(coordinates).all():
+            found = f"coordinates {np.array2string(coordinates, precision=3, threshold=8)} of a body"
+            fail(where, found, f"bodies of its family have {size} finite numbers each")
+        if not coordinates.any():
+            return self.on_base()
         scene = self.bodies.family.scene_at(self.scene, coordinates)
         biases = self.bodies.biases(self.parameters, coordinates if seen is None else seen)
         parameters = {**self.parameters, **biases}
         return replace(self, scene=scene, parameters=parameters, bodies=None)
+
+
+    def on_base(self) -> ModelFile:
+        """Return the model for the first body of its family."""
+        return replace(self, bodies=None)
+
+    def need_body(self) -> None:
+        """Raise `SsilkError` for a model of a family that was put on no body: nothing plays it as it is."""
+        if self.bodies is not None:
+            names = self.bodies.family.bodies.names
+            fail(
+                self.scene.garment.mesh.path,
+                f"a model of a family of bodies ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})",
+                "what plays a model plays it on one body",
+                "name a stage with that body, or from Python take ModelFile.on_body or on_base",
+            )
 
 
 def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
@@ -347,11 +373,16 @@ def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) 
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
-    """Build the network of a model file, on the file's scene or on one that also has the character's body."""
+    """Build the network of a model file, on the file's scene or on one that also has the character's body.
+
+    Raises:
+        SsilkError: it is one of a family that was put on no body.
+    """
     import torch
 
     from .model.network import GarmentModel
 
+    file.need_body()
     model = GarmentModel(scene or file.scene, file.config, file.joints)
     model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
     return model.eval()

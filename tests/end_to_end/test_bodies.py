@@ -264,6 +264,38 @@ def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
     assert run("bake small.safetensors --motion clip.usda --stage heavier.usda -o small.usda") == 0
 
 
+def test_a_level_of_quality_of_a_member_is_fitted_to_it(world, monkeypatch):
+    from ssilk_core.delivery.bake import sizing
+
+    reduced, original = [], sizing.Reducer
+    monkeypatch.setattr(sizing, "Reducer", lambda file, motions: reduced.append(file) or original(file, motions))
+    assert run(f"{BAKE} --stage heavier.usda --budget 1MB -o small.usda") == 0
+    (file,) = reduced
+    points = file.scene.garment.mesh.points
+    base = load_model("family.safetensors").scene.garment.mesh.points
+    assert np.abs(points - base).max() > 0.04
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["stress family.safetensors --quick --only rate:", "trade family.safetensors --motions clips --frames 4"],
+)
+def test_what_there_is_to_say_of_a_body_is_said_by_all_that_measure_it(world, capsys, command):
+    (world / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
+    run(f"{command} --stage large.usda")
+    told = capsys.readouterr()
+    assert "beyond the bodies of the training" in told.out + told.err
+
+
+def test_which_body_a_network_is_exported_for_is_told(world, capsys):
+    pytest.importorskip("onnx")
+    assert run("export family.safetensors -o base.onnx") == 0
+    told = capsys.readouterr()
+    assert "for the first of them" in told.out + told.err
+
+
 def test_a_character_without_a_stage_is_no_body_to_export_for(world, capsys):
     assert run("export family.safetensors --root /Hero -o hero.onnx") == 2
     assert "a SkelRoot without a stage" in capsys.readouterr().err and not Path("hero.onnx").exists()

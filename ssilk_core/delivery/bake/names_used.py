@@ -43,7 +43,9 @@ class GarmentUse:
     body: tuple[float, ...] | None = None
 
     @classmethod
-    def of(cls, task: BakeTask, model: RecordedInput, folder: Path, body: tuple[float, ...] | None = None) -> GarmentUse:
+    def of(
+        cls, task: BakeTask, model: RecordedInput, folder: Path, body: tuple[float, ...] | None = None
+    ) -> GarmentUse:
         """Return what a task uses its garment's name for in a folder: what it does not say of the asset stays, as
         long as the model is the same."""
         before = _stated(_place(folder, task.garment))

@@ -21,6 +21,7 @@ from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
 from ssilk_core.training.family_bank import build_family_bank
+from ssilk_core.training.inner_garments import InnerModel
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.settings import TrainConfig
@@ -132,6 +133,25 @@ def test_bodies_make_a_difference_to_all_three_networks(scene, family, model):
         seen.append((model.initialiser(static), model.stepper(inputs), model.output(z)))
     model.wear(torch.zeros(family.bodies.size))
     assert all((one - other).abs().max() > 1e-3 for one, other in zip(*seen))
+
+
+@torch.no_grad()
+def test_nothing_plays_a_family_that_was_put_on_no_body(model, members, family, tmp_path, toy_motion, scene):
+    path, motion = tmp_path / "family.safetensors", toy_motion(scene, 6)
+    save_model(path, model_file(model, Fabric("toy"), {}))
+    for play in (lambda: Player.load(path), lambda: network(load_model(path)), lambda: InnerModel.load(path)):
+        with pytest.raises(SsilkError, match="a model of a family of bodies"):
+            play()
+    heavier = Player.load(path, family.bodies.members[2])
+    np.testing.assert_allclose(heavier.skeleton.bind_transforms, members[2].skeleton.bind_transforms, atol=1e-6)
+    own = [Player.load(path, at).play(motion).vertices(3) for at in family.bodies.members[[0, 2]]]
+    assert np.abs(own[0] - own[1]).max() > 0.05
+    for wrong in (np.zeros(3), [np.nan, 0.0]):
+        with pytest.raises(SsilkError, match="bodies of its family have 2 finite numbers each"):
+            Player.load(path, wrong)
+    save_model(path, load_model(path).on_base())
+    with pytest.raises(SsilkError, match="a model of one body"):
+        Player.load(path, np.zeros(2))
 
 
 def test_at_the_base_the_file_is_as_one_of_that_body(model, tmp_path, scene):
