@@ -24,6 +24,7 @@ from .assets.arrays import assign, frozen, need_finite
 from .kinematics import bind_pose, local_transforms
 
 SAME_DIRECTION = 1e-6  # of the largest principal value, up to which members do not span a direction
+SAME_PLACE = 1e-4  # [m], root mean square, within which a body of a family was not moved as a whole
 SAME_ROTATION = 1e-3  # between entries of bind rotations, as for bakes
 STORED_POINTS = 512  # of a body, in model files
 MOST_DIRECTIONS = 64
@@ -179,7 +180,7 @@ class BodyFamily:
         """Return a character with those of its meshes alone that this knows: it may have been made of some.
 
         They are those of the same names. Where one of these is missing, as in a program that renamed it, they are all
-        body meshes, if these have as many points, in their order.
+        body meshes, if these have as many points, in their order, else those that alone have as many.
 
         Raises:
             SsilkError: it has them not.
@@ -189,6 +190,8 @@ class BodyFamily:
         if tuple(each.mesh.vertex_count for each in found) != self.counts:
             found = character.bodies
         counts = tuple(each.mesh.vertex_count for each in found)
+        if counts != self.counts and all(counts.count(each) == self.counts.count(each) == 1 for each in self.counts):
+            found, counts = tuple(found[counts.index(count)] for count in self.counts), self.counts
         if counts != self.counts:
             wanted = ", ".join(f"'{name}' with {count}" for name, count in zip(self.meshes, self.counts))
             told = ", ".join(f"'{_leaf(each.mesh.path)}' with {each.mesh.vertex_count}" for each in found)
@@ -196,6 +199,27 @@ class BodyFamily:
             allowed = f"the model's family of bodies has {wanted} points"
             fail(character.path, what, allowed, "take a body of the same topology, and name its meshes so")
         return replace(character, bodies=found, stand_ins=())
+
+    def displacement(self, joints: Floats, points: Floats) -> Floats:
+        """Return by how much a body is to be moved as a whole for this family to have it best [m], shape (3,).
+
+        It is nothing for a body that the family has where it is. Arguments are those of `place`.
+        """
+        there = self.place(joints, points)
+        if max(there.joints_off, there.points_off) < SAME_PLACE:
+            return np.zeros(3)
+        axes = np.eye(3)[:, None]
+        wanted, moves = (
+            np.concatenate([_scaled(of_joints), _scaled(of_points)], axis=1)
+            for of_joints, of_points in (
+                ((joints - self.joints)[None], (points - self.points)[None]),
+                (
+                    np.concatenate([self.joint_moves, np.repeat(axes, len(self.joints), axis=1)]),
+                    np.concatenate([self.point_moves, np.repeat(axes, len(self.points), axis=1)]),
+                ),
+            )
+        )
+        return -np.linalg.lstsq(moves.T, wanted[0], rcond=None)[0][self.size :]
 
     def beyond(self, coordinates: Floats) -> float:
         """Return how far coordinates (K,) are beyond the members, as `BodyPlace.beyond`."""
