@@ -87,7 +87,6 @@ class ModelFile:
         parameters = {**self.parameters, **biases}
         return replace(self, scene=scene, parameters=parameters, bodies=None)
 
-
     def on_base(self) -> ModelFile:
         """Return the model for the first body of its family."""
         return replace(self, bodies=None)

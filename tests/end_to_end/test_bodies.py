@@ -129,6 +129,13 @@ def test_a_family_is_learned_and_the_model_file_holds_it(world):
     assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
 
 
+def test_a_training_tells_the_figures_of_each_body_and_the_worst(world, toy, capsys):
+    run(f"{TRAIN} --family taller.usda heavier.usda -o new.safetensors", *toy.training)
+    told = capsys.readouterr()
+    told = told.out + told.err
+    assert "taller.usda:/Hero [J]" in told and "heavier.usda:/Hero [J]" in told and "worst body" in told
+
+
 def test_a_family_needs_members(world, capsys, toy):
     stage = Usd.Stage.Open("taller.usda")
     stage.GetPrimAtPath("/Hero/Rig").GetAttribute("joints").Set(["Hips", "Hips/Spine", "Hips/Spine/Skull"])

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training for a family of bodies, and a model of one put on a body."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime.player import Player
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody, limb_axes
+from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
@@ -24,8 +26,11 @@ from ssilk_core.training.family_bank import build_family_bank
 from ssilk_core.training.inner_garments import InnerModel
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.motion_bank import build_bank
+from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
+from ssilk_core.training.validation import BodyScore, Score, Validator
+from ssilk_core.training.verdict import worse_bodies, worst_body
 
 CPU = torch.device("cpu")
 CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
@@ -219,6 +224,41 @@ def test_a_run_does_not_go_on_with_another_family_of_the_same_coordinates(scene,
     assert taller["family"] != heavier["family"] and identity(members[1]) == taller
     moved = shaped(members[1], lambda points: points * (1 + 1e-12), "/taller")
     assert identity(moved)["family"] == taller["family"]
+
+
+@torch.no_grad()
+def test_validation_measures_members_as_models_of_these_alone(scene, members, family, toy_motion, tmp_path):
+    motion, base = toy_motion(scene, 40), members[0].skeleton
+    job = TrainJob(
+        scene=scene, motions=[motion], held_out=[motion], model=CONFIG, train=TrainConfig(valid_frames=20),
+        fabric=Fabric("toy"), output=tmp_path / "model.safetensors", family=family,
+    )  # fmt: skip
+    parts = build_parts(job, CPU)
+    generator = torch.Generator().manual_seed(1)
+    for value in parts.model.parameters():
+        value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    score = parts.validator.score(parts.model)
+    assert [body.name for body in score.bodies] == ["/taller", "/heavier"]
+    file = model_file(parts.model, Fabric("toy"), {})
+    for body, member, coordinates in zip(score.bodies, members[1:], family.bodies.members[1:]):
+        own = family.scene_at(scene, coordinates)
+        its = motion_on(motion, base, member.skeleton, 1 + float(family.bodies.taller @ coordinates))
+        bank = build_bank([its], own.character.skeleton, parts.model.joints, 30.0, CPU)
+        energy = GarmentEnergy(own.garment.sewn_mesh, job.fabric, own.classes, device=CPU)
+        touched = CollisionBody(member.merged_body(), 3, limbs=limb_axes(own), device=CPU)
+        rest = torch.tensor(own.garment.mesh.points, dtype=torch.float32)
+        alone = Validator(bank, energy, touched, own, rest, 30.0, 10)
+        one = alone.score(network(file.on_body(coordinates), own))
+        assert body.total == pytest.approx(one.total, rel=1e-3) and not one.bodies
+        assert body.lbs == pytest.approx(alone.lbs_score().total, rel=1e-3)
+        assert body.collisions == pytest.approx(one.collisions, abs=1e-3)
+    assert not any(module.place.any() for module in parts.model.modules() if isinstance(module, SeenBody))
+    again = Score.of(json.loads(json.dumps(asdict(score))))
+    assert again.bodies == score.bodies and parts.validator.lbs_score().bodies == ()
+    worst = worst_body(replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), BodyScore("/b", 3.0, 2.9, 0.0))))
+    assert worst.name == "/b"
+    (told,) = worse_bodies("m", replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), worst)))
+    assert "on /b the model is worse than none" in told.text
 
 
 def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(model, family, scene):
