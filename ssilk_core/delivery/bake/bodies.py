@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -49,24 +48,15 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     Raises:
         SsilkError: the stage's character is none that the model dresses, or it cannot be read.
     """
-    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
     names = file.bodies.family.bodies.meshes if file.bodies else ()
     known = character
-    if not names_of(character).issuperset(names) and _has_meshes(stage, root, names):
+    if not names_of(character).issuperset(names) and has_meshes(stage, root, names):
         # Meshes that a joint carries are read where they are named alone, as `--body` may have named them.
         known = read_character(stage, root=root, bodies=names)
     return worn_by(file, character, known)
-
-
-def _has_meshes(stage: Usd.Stage, root: str | None, names: Sequence[str]) -> bool:
-    from pxr import Usd, UsdGeom
-    from ssilk_usd.opening.stage import PRIMS
-    from ssilk_usd.reading.skeleton import find_skeleton
-
-    beneath = Usd.PrimRange(find_skeleton(stage, root=root).root, PRIMS)
-    return {prim.GetName() for prim in beneath if prim.IsA(UsdGeom.Mesh)}.issuperset(names)
 
 
 def worn_by(file: ModelFile, character: Character, known: Character) -> WornModel:
