@@ -139,6 +139,32 @@ def model_of_training(garment: Any) -> Path:
     return stage.relative_to(Path(garment.ssilk.model).parents[1])
 
 
+def test_solved_frames_shots_in_usd_and_the_plain_copy_are_on_that_body(
+    ready, wearing, folder, tmp_path, ssilk_python
+):
+    from pxr import Usd, UsdGeom
+
+    from blender_addon.playback import playing
+
+    make_heavier(ready)
+    ready.context.scene.frame_end = 4
+    slim = np.array([vertex.co for vertex in wearing.data.vertices])
+    shot = tmp_path / "heavy.usdc"
+    assert ready.ops.ssilk.bake(to_timeline=False, to_usd=True, filepath=str(shot)) == {"FINISHED"}
+    stage = Usd.Stage.Open(str(shot))
+    pillar = next(prim for prim in stage.Traverse() if prim.GetName() == "Pillar")
+    across = np.ptp(np.array(UsdGeom.Mesh(pillar).GetPointsAttr().Get()), axis=0)
+    assert sorted(across.round(3))[0] == pytest.approx(2 * 0.15 * 1.3, abs=0.01)
+    assert ready.ops.ssilk.toggle_lbs() == {"FINISHED"}
+    copy = np.array([vertex.co for vertex in ready.data.objects["Skirt LBS"].data.vertices])
+    assert np.linalg.norm(copy - slim, axis=1).max() > 0.02
+    wearing.ssilk.live_quality = "latent_few"
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    played = playing.live(wearing)
+    assert not played.wrong and played.solved == 4
+    assert np.abs(shown(ready, wearing, range(1, 5))).max() < 5
+
+
 def test_on_the_first_body_it_plays_as_a_model_of_that_body(ready, trained, wearing):
     family = wearing.ssilk.model
     wearing.ssilk.model = ""
