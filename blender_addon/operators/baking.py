@@ -21,7 +21,7 @@ from ssilk_core.quality.levels import QUALITIES
 from ssilk_core.scene.assets import Collider
 
 from ..arrays.joints import Joints, joint_order
-from ..arrays.renamed import TrainedJoints
+from ..arrays.renamed import TrainedJoints, known_as
 from ..errors import SetupError
 from ..motions.colliders import MetColliders, unseen
 from ..motions.freedom import freedom, is_held
@@ -35,8 +35,16 @@ from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.bodies import corrected, reshaped
+from ..playback.family import BodyModel, on_its_body
 from ..playback.followed import SampledKeys, followed_bodies
-from ..playback.models import joints_known_to, model_of, no_model, told_renames, trainings_folder
+from ..playback.models import (
+    chosen_bones,
+    joints_known_to,
+    model_of,
+    no_model,
+    told_renames,
+    trainings_folder,
+)
 from ..playback.overrides import overriding, told
 from ..preferences import interpreter, preferences, unready
 from ..scene.armature import read_joints
@@ -78,9 +86,11 @@ class TimelineOperator(tasks.OutsideOperator):
         shot: the file to read.
         take: the frames.
         simulated: whether modifiers may simulate the garment until the shot is on the timeline.
+        on: the model on the body of its family that the character has; None without a family.
     """
 
     simulated = False
+    on: BodyModel | None = None
     pair: Pair
     shot: Path
     take: SampledTake
@@ -111,9 +121,12 @@ class TimelineOperator(tasks.OutsideOperator):
             )
         skinned = self.baked.garment
         trained = TrainedJoints(skinned.joint_names, skinned.bind_transforms)
-        joints = joints_known_to(garment, armature, joints, trained)
+        if self.on:
+            joints = known_as(joints, trained, chosen_bones(garment))
+        else:
+            joints = joints_known_to(garment, armature, joints, trained)
         playing.stop(garment)
-        apply_bake(garment, armature, joints, self.baked)
+        apply_bake(garment, armature, joints, self.baked, self.on.base if self.on else None)
         order = joint_order(joints, self.baked.garment.joint_names, fewer_proxies=True)
         left = int(np.count_nonzero(order < 0))
         still = f" ({left} proxies are not in it and stay at rest)" if left else ""
@@ -179,7 +192,11 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if self.to_timeline and (solves or is_held(garment)):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
-        self.scene = None if (self.model.parent / STAGE).exists() else gather(garment, joints=joints)
+        self.scene = None
+        if self.on:
+            self.scene = self.on.moved(gather(garment, joints=joints))
+        elif not (self.model.parent / STAGE).exists():
+            self.scene = gather(garment, joints=joints)
         self.keys = SampledKeys.of(garment, self.take.frames)
         followed = followed_bodies(garment)
         tell_changing_shapes(self, garment, followed=followed)
@@ -225,11 +242,17 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             file = load_model(self.model)
         except SsilkError as error:
             raise SetupError(reworded(str(error), self.model.parent, recall(self.model.parent))) from error
+        self.on, joints = None, read_joints(armature, garment)
+        if file.bodies:
+            self.on = on_its_body(file, garment, armature, joints, chosen_bones(garment))
+            file = self.on.worn.file
         scene, self.sees = file.scene, file.config.proximity_points > 0
         self.trained = scene.garment.mesh
         self.prim = split_location(scene.garment.mesh.path)[1]
+        if self.on:
+            return self.on.joints
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
-        joints = joints_known_to(garment, armature, read_joints(armature, garment), trained)
+        joints = joints_known_to(garment, armature, joints, trained)
         joint_order(joints, scene.joint_names, fewer_proxies=True)
         return joints
 
@@ -262,8 +285,10 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         stage = self.model.parent / STAGE
         garment, _ = self.pair.objects()
         followed = followed_bodies(garment)
-        self.reshaped = reshaped(garment, self.character, stage, followed) if stage.exists() else ""
-        if self.to_usd and stage.exists():
+        self.reshaped = f" ({self.on.told})" if self.on and self.on.told else ""
+        if self.on is None and stage.exists():
+            self.reshaped = reshaped(garment, self.character, stage, followed)
+        if self.on is None and self.to_usd and stage.exists():
             self.reshaped += corrected(garment, self.character, stage)
 
     @property

@@ -45,13 +45,14 @@ def live_line(garment: bpy.types.Object) -> str:
     if played.done is not None:
         return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
     if played.behind:
-        return "The frames, Free, Hold Frames or what surrounds it changed since the motion was read"
+        return "The frames, Free, Hold Frames, a body or what surrounds it changed since the motion was read"
     if played.unkeyed:
         return f"Renders lack it: {played.unkeyed}"
     solved = solved_line(played)
     if played.stale:
         return f"The motion changed since it was read{solved and '. '}{solved}"
-    return playing.warning(garment) or solved or "Follows the armature"
+    line = playing.warning(garment) or solved or "Follows the armature"
+    return f"{line}. {played.told}" if played.told else line
 
 
 def unseen_line(garment: bpy.types.Object) -> str:

@@ -28,9 +28,9 @@ from ..scene.modifiers import need_plain_modifiers
 from ..scene.objects import scene_units
 from ..scene.shapes import earlier_shapes
 from ..scene.weights import put_trained_weights, restore_own_weights
+from .laying import MOVED, Laid, away, lay, moved_back, need_same_count, size
 
-MOVED = 1e-4  # how far rest points may be from those that were trained on, as a share of the garment's size
-TURNED = 1e-3  # how far the axes and places of bones may be
+LAID = "body"  # the shape key that lays a garment of a family on its body
 
 
 def need_bakeable(
@@ -69,13 +69,20 @@ def animated(garment: bpy.types.Object, armature: bpy.types.Object) -> list[obje
     return [armature, keys] if keys else [armature]
 
 
-def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, baked: BakedGarment) -> None:
+def apply_bake(
+    garment: bpy.types.Object,
+    armature: bpy.types.Object,
+    joints: Joints,
+    baked: BakedGarment,
+    base: np.ndarray | None = None,
+) -> None:
     """Put a bake in place of what was baked for a garment before. In object mode.
 
     Proxies that it lacks stay at rest and move nothing.
 
     Args:
         joints: of the armature, as `read_joints` returns them.
+        base: where the garment lies on the first body of its model's family [m], shape (V, 3); None without a family.
 
     Raises:
         SetupError: garment or bones are not those that it was trained with.
@@ -83,10 +90,11 @@ def apply_bake(garment: bpy.types.Object, armature: bpy.types.Object, joints: Jo
     order = joint_order(joints, baked.garment.joint_names, fewer_proxies=True)
     proxies = order[joints.character_count :] - joints.character_count
     there = proxies >= 0
-    if baked.pose.translations is not None:  # before anything changes
+    laid = None if base is None else lay(garment, armature, joints, baked.garment, order, base)
+    if baked.pose.translations is not None or (laid and laid.moves_proxies):  # before anything changes
         need_movable(armature, [joints.proxies[index] for index in np.flatnonzero(there)])
-    shapes = apply_deformation(garment, armature, joints, baked.garment, order)
-    put_keys(garment, armature, joints, proxies, shapes, baked.pose, round(baked.start))
+    shapes = apply_deformation(garment, armature, joints, baked.garment, order, laid)
+    put_keys(garment, armature, joints, proxies, shapes, baked.pose, round(baked.start), laid=laid)
 
 
 def put_keys(
@@ -99,6 +107,7 @@ def put_keys(
     start: int,
     *,
     live: bool = False,
+    laid: Laid | None = None,
 ) -> None:
     """Put poses of a garment as keys onto its proxies and shape keys.
 
@@ -107,18 +116,37 @@ def put_keys(
         shapes: the shape keys, as the poses weigh them.
         start: the first frame.
         live: whether they stand for live playback.
+        laid: as for `proxy_places`.
     """
     there = proxies >= 0
     rotations = np.tile(rest_rotations(joints), (pose.frame_count, 1, 1))
     rotations[:, there] = pose.rotations[:, proxies[there]]
     turns = continuous(turns_from_rest(joints, rotations))
     channels = _channels(joints.proxies, "rotation_quaternion", turns)
-    if pose.translations is not None:
-        places = np.tile(_rest_places(joints), (pose.frame_count, 1, 1))
-        places[:, there] = pose.translations[:, proxies[there]]
+    places = proxy_places(joints, rotations, pose, proxies, laid)
+    if places is not None:
         channels += _channels(joints.proxies, "location", shifts_from_rest(armature, joints, places))
     moved = [(armature, channels), (garment.data.shape_keys, _weight_channels(shapes, pose.weights))]
     bake_keys(garment, start, [(thing, channels) for thing, channels in moved if thing], live=live)
+
+
+def proxy_places(
+    joints: Joints, rotations: np.ndarray, pose: GarmentPose, proxies: np.ndarray, laid: Laid | None
+) -> np.ndarray | None:
+    """Return where proxies are in their parents' axes [m], shape (F, P, 3); None where they only turn.
+
+    Args:
+        rotations: of each proxy to its parent, shape (F, P, 4).
+        proxies: where each stands among those of the pose, -1 for none, shape (P,).
+        laid: how a garment of a family is brought to its body.
+    """
+    if laid and laid.moves_proxies:
+        return laid.places(rotations, pose, proxies)
+    if pose.translations is None:
+        return None
+    places, there = np.tile(_rest_places(joints), (pose.frame_count, 1, 1)), proxies >= 0
+    places[:, there] = pose.translations[:, proxies[there]]
+    return places
 
 
 def apply_deformation(
@@ -127,20 +155,34 @@ def apply_deformation(
     joints: Joints,
     skinned: SkinnedGarment,
     order: np.ndarray,
+    laid: Laid | None = None,
 ) -> list[str]:
-    """Give a garment trained shapes and weights, its proxies at rest; return its shape keys. In object mode.
+    """Give a garment trained shapes and weights, its proxies at rest; return the shape keys that move it.
+
+    In object mode.
 
     Args:
         order: where each joint stands among the trained ones, -1 for none, shape (J,).
+        laid: how a garment of a family is brought to its body.
 
     Raises:
         SetupError: as `apply_bake` does.
     """
-    to_trained = _moved_back(armature, joints, skinned, order) @ scene_units().matrix @ np.array(garment.matrix_world)
-    _need_same_points(garment, to_trained, skinned)
+    if laid:
+        back = moved_back(armature, joints.character, skinned, order[: joints.character_count])
+    else:
+        back = moved_back(armature, joints, skinned, order)
+    to_trained = back @ scene_units().matrix @ np.array(garment.matrix_world)
+    if not laid:
+        _need_same_points(garment, to_trained, skinned)
     give_own_mesh(garment)
     mute_inherited(garment, animated(garment, armature))
-    shapes = write_shapes(garment, skinned.shapes @ np.linalg.inv(to_trained[:3, :3]).T, skinned.shape_names)
+    offsets, names = skinned.shapes @ np.linalg.inv(to_trained[:3, :3]).T, list(skinned.shape_names)
+    if laid and laid.offsets is not None:
+        offsets, names = np.concatenate([offsets, laid.offsets[None]]), [*names, LAID]
+    shapes = write_shapes(garment, offsets, names)
+    if len(shapes) > len(skinned.shape_names):
+        garment.data.shape_keys.key_blocks[shapes.pop()].value = 1.0
     weights = np.where(order >= 0, skinned.skin.dense(len(skinned.joint_names))[:, order], 0)
     put_trained_weights(armature, garment, weights.astype(np.float32), joints.names)
     _free(armature, joints.proxies)
@@ -193,50 +235,20 @@ def remove_bake(garment: bpy.types.Object, armature: bpy.types.Object) -> None:
     bring_back(armature, garment)
 
 
-def _moved_back(armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarment, order: np.ndarray) -> np.ndarray:
-    """Return how the armature has moved as an object [m], back to where it was when the garment was trained, (4, 4).
-
-    Raises:
-        SetupError: bones have moved.
-    """
-    there = np.flatnonzero(order >= 0)
-    now, trained = joints.binds[there], skinned.bind_transforms[order[there]]
-    back = trained[0] @ np.linalg.inv(now[0])
-    away = np.abs(back @ now - trained)
-    away[:, :3, 3] /= _size(skinned)
-    worst = int(away.max(axis=(1, 2)).argmax())
-    if not away[worst].max() <= TURNED:
-        raise SetupError(
-            f"The bone '{joints.names[there[worst]]}' of '{armature.name}' was moved since the garment was trained; "
-            "undo that, or train again."
-        )
-    return back
-
-
 def _need_same_points(garment: bpy.types.Object, to_trained: np.ndarray, skinned: SkinnedGarment) -> None:
     """Check a garment's points at rest, given its own space to where it was trained [m].
 
     Shape keys that were added since the training correct what was baked.
     """
-    count = len(garment.data.vertices)
-    if count != len(skinned.points):
-        raise SetupError(
-            f"'{garment.name}' had {len(skinned.points)} vertices when it was trained and has {count} now; train it "
-            "again."
-        )
-    away = min(
-        float(np.abs(points @ to_trained[:3, :3].T + to_trained[:3, 3] - skinned.points).max())
-        for points in earlier_shapes(garment)
+    need_same_count(garment, skinned)
+    off = min(
+        away(points @ to_trained[:3, :3].T + to_trained[:3, 3], skinned.points) for points in earlier_shapes(garment)
     )
-    if not away <= MOVED * _size(skinned):
+    if not off <= MOVED * size(skinned):
         raise SetupError(
             f"'{garment.name}' has another shape or place at rest than when it was trained; undo that, or train "
             "again."
         )
-
-
-def _size(skinned: SkinnedGarment) -> float:
-    return max(float(np.ptp(skinned.points, axis=0).max()), 1e-9)
 
 
 def _free(armature: bpy.types.Object, proxies: Sequence[str]) -> None:

@@ -50,10 +50,13 @@ from .bake import (
     apply_deformation,
     need_bakeable,
     need_movable,
+    proxy_places,
     put_keys,
     shifts_from_rest,
     turns_from_rest,
 )
+from .family import shape_of
+from .laying import Laid
 from .models import TrainedGarment
 from .solving import SOLVED, Solving, need_solver
 
@@ -95,6 +98,8 @@ class Live:
         self.playback, self.first, self.placed = None, 0, np.zeros((0, 0, 4, 4))
         self.free, self.hold, self.world = None, 1, None
         self.colliders: MetColliders | None = None
+        self._laid: Laid | None = None  # how a garment of a family is brought to its body
+        self._shape: tuple[object, ...] | None = None  # of the bodies when it was; None for a model of one body
         self._sight: ColliderSight | None = None
         self._near: np.ndarray | None = None  # how near colliders are, (F, M, 5); None where there are none
         self._frames = range(0)
@@ -130,7 +135,7 @@ class Live:
     def behind(self) -> bool:
         """Whether the scene's frames, its rate, or how the garment is held are others by now than was read."""
         try:
-            return self.times != self._asked() or self._meets_others()
+            return self.times != self._asked() or self._meets_others() or self._has_another_body()
         except SetupError:  # it was deleted, which is told where it is shown
             return False
 
@@ -143,6 +148,15 @@ class Live:
     def _meets_others(self) -> bool:
         """Return whether the scene has other colliders than were read."""
         return self.colliders is not None and self.colliders.signature != met(*self.objects())
+
+    def _has_another_body(self) -> bool:
+        """Return whether the artist has given the character another body since a model of a family was put on it."""
+        return self._shape is not None and self._shape != shape_of(*self.objects())
+
+    @property
+    def told(self) -> str:
+        """What there is to say of the body that it is played on; empty where nothing is."""
+        return self.trained.told if self.trained else ""
 
     def meets_otherwise(
         self, scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph, things: Sequence[bpy.types.Object] | None = None
@@ -245,11 +259,13 @@ class Live:
         if not self.stale and not self.unkeyed and not self._keyed <= index < self.solved:
             return
         pose = self.solving.frames[index] if index < self.solved else self._pose(index)
-        turns = turns_from_rest(self.joints, pose.rotations[:, self.trained.proxies])[0]
+        rotations = pose.rotations[:, self.trained.proxies]
+        turns = turns_from_rest(self.joints, rotations)[0]
         for name, turn in zip(self.joints.proxies, turns.tolist()):
             armature.pose.bones[name].rotation_quaternion = turn
-        if pose.translations is not None:
-            shifts = shifts_from_rest(armature, self.joints, pose.translations[:, self.trained.proxies])[0]
+        places = proxy_places(self.joints, rotations, pose, self.trained.proxies, self._laid)
+        if places is not None:
+            shifts = shifts_from_rest(armature, self.joints, places)[0]
             for name, shift in zip(self.joints.proxies, shifts.tolist()):
                 armature.pose.bones[name].location = shift
         blocks = garment.data.shape_keys.key_blocks if self.shapes else ()
@@ -305,7 +321,8 @@ class Live:
         solved = self.solving.frames if self.solving else []
         after = [pose.part(slice(max(self._keyed - pose.start, 0), None)) for pose in poses]
         shown = GarmentPose.joined([*solved, *after])
-        put_keys(garment, armature, self.joints, self.trained.proxies, self.shapes, shown, first, live=True)
+        proxies, laid = self.trained.proxies, self._laid
+        put_keys(garment, armature, self.joints, proxies, self.shapes, shown, first, live=True, laid=laid)
 
     def key_again(self) -> None:
         """Let keys show what is known by now, as after an undo, which may have brought back those of before."""
@@ -353,7 +370,7 @@ class Live:
 
     def _reading(self, take: SampledTake) -> Iterator[float]:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
-        if self.trained is None or self.renewed:
+        if self.trained is None or self.renewed or self._has_another_body():
             yield from self._dressing()
         _, armature = self.objects()
         yield from (READING * done for done in sample(armature, self.joints.character, [take]))
@@ -456,7 +473,9 @@ class Live:
         if len(moved):
             near = self._near_again(trained, near, moved, sight)
             playback = playback.with_motion(self._motion(trained, self.placed, near), int(moved[0]))
-        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
+        laid = trained.lay(garment, armature, self.joints, skinned)
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order, laid)
+        self._laid, self._shape = laid, shape_of(garment, armature) if trained.on else None
         self.trained, self.playback, self._written = trained, playback, written
         self._near, self._sight = near, sight
         self._prepare_solver()
@@ -474,7 +493,9 @@ class Live:
         if not self.ready():
             raise SetupError(f"'{garment.name}' left Object Mode while its model was read; play it again.")
         self.joints = self._joints_now()
-        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order)
+        laid = trained.lay(garment, armature, self.joints, skinned)
+        self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order, laid)
+        self._laid, self._shape = laid, shape_of(garment, armature) if trained.on else None
         self.trained, self.playback = trained, None
         self._prepare_solver()
         yield 0.0

@@ -16,6 +16,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model
@@ -31,6 +32,9 @@ from ..errors import SetupError
 from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
 from ..outside.wording import recall, reworded
 from ..scene.linked import absolute, home, origin
+from .bake import need_movable
+from .family import on_its_body
+from .laying import Laid, lay
 
 FIRST = "wait for its training, or resume it"
 FOLDER = "ssilk"  # of trainings, beside the blend file
@@ -267,10 +271,11 @@ def sees_colliders(garment: bpy.types.Object) -> bool:
 
 
 class TrainedGarment:
-    """A model on an armature.
+    """A model on an armature. One of a family of bodies is put on the body that the character has in this frame.
 
     Attributes:
         player: plays it.
+        on: the model of a family on that body; None for one of one body.
         joints: of the armature, under the names that the model knows.
         own: joints of the armature in the order of the model's character, shape (J,).
         order: joints of the model in the order of the armature, proxies included, shape (J + P,).
@@ -281,12 +286,14 @@ class TrainedGarment:
 
     def __init__(self, path: Path, garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints) -> None:
         try:
-            self.player = Player.load(path)
+            file = load_model(path)
         except SsilkError as error:
             raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
+        self.on = on_its_body(file, garment, armature, joints, chosen_bones(garment)) if file.bodies else None
+        self.player = Player(self.on.worn.file if self.on else file)
         scene = self.player.file.scene
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
-        self.joints = joints = joints_known_to(garment, armature, joints, trained)
+        self.joints = joints = self.on.joints if self.on else joints_known_to(garment, armature, joints, trained)
         self.order = joint_order(joints, scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
 
@@ -298,6 +305,26 @@ class TrainedGarment:
     def sight(self, world: ShotWorld, search: Search) -> ColliderSight:
         """Return what the network sees of the colliders around it; `search` finds nearest points on triangles."""
         return collider_sight(self.player, world, search)
+
+    @property
+    def told(self) -> str:
+        """What there is to say of the body of a family that it plays on, in sentences; empty where nothing is."""
+        return self.on.told if self.on else ""
+
+    def lay(
+        self, garment: bpy.types.Object, armature: bpy.types.Object, joints: Joints, skinned: SkinnedGarment
+    ) -> Laid | None:
+        """Return how a garment of a family is brought to its body; None for a model of one body.
+
+        Raises:
+            SetupError: as `laying.lay` does, or proxies that rest elsewhere cannot move by themselves.
+        """
+        if self.on is None:
+            return None
+        laid = lay(garment, armature, joints, skinned, self.order, self.on.base)
+        if laid.moves_proxies:
+            need_movable(armature, joints.proxies)
+        return laid
 
     @property
     def proxies(self) -> np.ndarray:

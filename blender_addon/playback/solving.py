@@ -64,7 +64,11 @@ class Solving:
         need_solver(level)
         self._model, self._bones, self._words = model, trained.joints.bones, dict[str, str]()
         stage = model.parent / STAGE
-        scene = None if stage.exists() else gather(garment, joints=trained.joints)
+        scene = None
+        if trained.on:
+            scene = trained.on.moved(gather(garment, joints=trained.joints))
+        elif not stage.exists():
+            scene = gather(garment, joints=trained.joints)
         self._temporary = tempfile.TemporaryDirectory(prefix="ssilk-", dir=bpy.app.tempdir or None)
         if scene:
             given = hand_over(scene, Pair.of(garment, armature), self.folder)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ..arrays.classes import COLOR_ATTRIBUTE
 from ..playback.models import TrainedGarment, model_of
@@ -37,7 +38,9 @@ def show_copy(garment: bpy.types.Object) -> None:
     need_relative(garment)
     armature = armature_of(garment)
     joints = read_joints(armature, garment)
-    copy = _lbs_copy(garment, TrainedGarment(model_of(garment), garment, armature, joints))
+    trained = TrainedGarment(model_of(garment), garment, armature, joints)
+    laid = trained.lay(garment, armature, joints, SkinnedGarment.of(trained.player.deformer()))
+    copy = _lbs_copy(garment, trained, laid.offsets if laid else None)
     collection = bpy.data.collections.new(f"{garment.name} LBS")
     collection.objects.link(copy)
     shown = bpy.data.objects.new(f"{garment.name} LBS, beside", None)
@@ -76,7 +79,7 @@ def _clear_shapes(copy: bpy.types.Object) -> None:
         bpy.data.batch_remove([left])
 
 
-def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment) -> bpy.types.Object:
+def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment, laid: np.ndarray | None) -> bpy.types.Object:
     copy = local_copy(garment)
     copy.data, copy.name = own_copy(garment.data), f"{garment.name} LBS"
     copy[OWNER] = garment
@@ -85,6 +88,8 @@ def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment) -> bpy.types.O
     _clear_colors(copy.data)
     _clear_shapes(copy)
     copy.vertex_groups.clear()
+    if laid is not None:
+        copy.data.vertices.foreach_set("co", (worn_points(copy) + laid).astype(np.float32).reshape(-1))
     skin, names = trained.player.file.scene.lbs_skin, trained.joints.names
     write_groups(copy, skin.dense(len(names))[:, trained.order].astype(np.float32), names, ())
     return copy

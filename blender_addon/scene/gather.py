@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -55,6 +55,27 @@ class GatheredScene:
     garment: Garment
     rig: ProxyRig | None
     meshes: dict[str, Mesh]
+
+    def moved(self, matrix: np.ndarray) -> GatheredScene:
+        """Return this moved rigidly as a whole [m], by a matrix (4, 4)."""
+        joints = replace(self.joints, binds=matrix @ self.joints.binds)
+        bodies = tuple(replace(body, mesh=moved_mesh(body.mesh, matrix)) for body in self.character.bodies)
+        mesh = moved_mesh(self.garment.mesh, matrix)
+        skeleton = joints.skeleton(self.character.skeleton.path, bodies)
+        proxies = joints.binds[joints.character_count :]
+        return replace(
+            self,
+            joints=joints,
+            character=replace(self.character, skeleton=skeleton, bodies=bodies),
+            garment=replace(self.garment, mesh=mesh),
+            rig=None if self.rig is None else replace(self.rig, bind_transforms=proxies),
+            meshes=dict(zip(self.meshes, (mesh, *(body.mesh for body in bodies)))),
+        )
+
+
+def moved_mesh(mesh: Mesh, matrix: np.ndarray) -> Mesh:
+    """Return a mesh moved by a matrix (4, 4) [m]."""
+    return replace(mesh, points=mesh.points @ matrix[:3, :3].T + matrix[:3, 3])
 
 
 def gather(

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result
+from ..events import Message, Reporter, Result
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -56,6 +56,10 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     file = load_model(options.model)
     if options.stage:
         file = _on_body(options, file, report)
+    elif file.bodies:
+        text = "a model of a family of bodies: it is exported for the first of them; --stage names another one"
+        report(Message(f"{options.model}: {text}"))
+    file = file.on_base()
     model = network(file)
     export_onnx(model, output)
     static, rates = descriptor_sizes(file.scene, file.joints, file.config)

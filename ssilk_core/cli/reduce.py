@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result
+from ..events import Message, Reporter, Result
 from ..files import split_location
 from ..quality.levels import SizeReduction, size_at, spend
 from . import options as shared
@@ -53,6 +53,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
     shared.check_output(options.output, options.model, *motion_files(options.motions))
     file = load_model(options.model)
+    if file.bodies:
+        text = "a model of a family of bodies: what is kept is the best for the first of them, and is kept for all"
+        report(Message(f"{options.model}: {text}"))
     motions = _motions(file, options)
     reducer = Reducer(file, motions)
     found = _chosen(options, reducer, motions, report)

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     if options.output:
         check_output(options.output, options.model, options.stage)
-    subject, cases = _subject(options), [case for case in CASES if case.matches(options.only)]
+    subject, cases = _subject(options, report), [case for case in CASES if case.matches(options.only)]
     if not cases:
         fail(
             "--only",
@@ -87,7 +87,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_VERIFICATION if faults else EXIT_OK
 
 
-def _subject(options: argparse.Namespace) -> StressSubject:
+def _subject(options: argparse.Namespace, report: Reporter) -> StressSubject:
     """Load the model, its character and the motion."""
     from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
@@ -97,6 +97,8 @@ def _subject(options: argparse.Namespace) -> StressSubject:
     from ..quality.stress.subject import FULL, QUICK, StressSubject
 
     on = worn(load_model(options.model), open_stage(options.stage), options.root)
+    for event in on.told:
+        report(event)
     clip = read_motion(str(options.motion), on.scene.character.skeleton) if options.motion else None
     return StressSubject(on.file, on.scene, clip, QUICK if options.quick else FULL)
 

@@ -73,7 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models)
     need_predicates()
-    bench = Bench(options)
+    bench = Bench(options, report)
     results = Results(options.output, bench.asked)
     results.resume(report)
     report(Started("trade", 0, {"clips": list(bench.clips), "frames": bench.frames}))
@@ -117,7 +117,7 @@ class Bench:
         asked: what distinguishes one sweep from another.
     """
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: argparse.Namespace, report: Reporter) -> None:
         from ssilk_usd.opening.stage import open_stage
 
         from ..delivery.bake import worn
@@ -129,7 +129,10 @@ class Bench:
         self.files: dict[Path, ModelFile] = {path: load_model(path) for path in options.models}
         for path, file in self.files.items():
             if file.bodies:
-                self.files[path] = worn(file, open_stage(options.stage), options.root).file
+                on = worn(file, open_stage(options.stage), options.root)
+                self.files[path] = on.file
+                for event in on.told:
+                    report(event)
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]
         if len(set(names)) != len(names):

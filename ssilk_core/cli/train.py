@@ -109,7 +109,15 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..training.parallel import join_process_group
     from ..training.run import train
     from ..training.signals import PATIENCE, stop_on_signals
-    from ..training.verdict import is_worse, lower_by, percent, shortcomings, worse_message
+    from ..training.verdict import (
+        is_worse,
+        lower_by,
+        percent,
+        shortcomings,
+        worse_bodies,
+        worse_message,
+        worst_body,
+    )
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
@@ -124,10 +132,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
     share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
-    missed = trained.score.step_errors
+    missed, worst = trained.score.step_errors, worst_body(trained.score)
     worse = is_worse(trained.score, trained.lbs)
     if worse:
         report(worse_message(str(options.output), trained.score, trained.lbs))
+    for message in worse_bodies(str(options.output), trained.score):
+        report(message)
     report(
         Result(
             "train",
@@ -142,6 +152,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 "collisions": f"{trained.score.collisions:.2%}",
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
+                **({f"{body.name} [J]": round(body.total, 5) for body in trained.score.bodies}),
+                **({"worst body": f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
                 **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
@@ -155,6 +167,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if lacking and job.is_trainable and group.size == 1:  # several processes take no minutes
         report(lacking)
     return EXIT_OK if trained.moves and not worse else EXIT_WORSE
+
+
+def _compared(total: float, lbs: float) -> str:
+    """Return in words how an energy compares with that of linear blend skinning."""
+    from ..training.verdict import percent, share_below
+
+    share = share_below(total, lbs)
+    return f"{percent(share)} {'below' if share >= 0 else 'above'} linear blend skinning"
 
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy

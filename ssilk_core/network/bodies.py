@@ -52,18 +52,18 @@ class SeenBodies:
             # Coordinates and places keep their precision, moves need none.
             **{f"family.{name}": getattr(bodies, name) for name in TENSORS[:4]},
             **{f"family.{name}": np.float32(getattr(bodies, name)) for name in TENSORS[4:]},
-            "family.vertex_count": np.array(bodies.vertex_count, np.int64),
+            "family.counts": np.array(bodies.counts, np.int64),
             "family.cloth_moves": np.float32(self.family.cloth_moves),
             "family.proxy_moves": np.float32(self.family.proxy_moves),
             **{f"family.{name}": values for name, values in self.columns.items()},
         }
 
     @classmethod
-    def of(cls, tensors: Mapping[str, Any], names: tuple[str, ...]) -> SeenBodies:
-        """Return what the tensors of a file hold; `names` are those of the members."""
+    def of(cls, tensors: Mapping[str, Any], names: tuple[str, ...], meshes: tuple[str, ...]) -> SeenBodies:
+        """Return what the tensors of a file hold; the names are those of the members, and of their body meshes."""
         found = {name: tensors[f"family.{name}"] for name in TENSORS}
         dressed = DressedFamily(
-            BodyFamily(names, vertex_count=int(np.ravel(tensors["family.vertex_count"])[0]), **found),
+            BodyFamily(names, meshes=meshes, counts=tuple(np.ravel(tensors["family.counts"]).tolist()), **found),
             tensors["family.cloth_moves"],
             tensors["family.proxy_moves"],
         )

@@ -22,6 +22,7 @@ from ..errors import SsilkError, fail
 from ..files import is_usd, replacing
 from ..scene.assets import Character, Floats, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
 from ..scene.fabrics import Fabric
+from ..scene.family import BodyFamily
 from .bodies import SeenBodies, parted
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
@@ -36,7 +37,7 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
-    "family": (),
+    "family": (), "body_meshes": (),
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
@@ -68,13 +69,38 @@ class ModelFile:
 
         Args:
             seen: what the networks see as such (K,), where bodies so far off were not trained for.
+
+        Raises:
+            SsilkError: these are no coordinates of its family.
         """
-        if self.bodies is None or not np.any(coordinates):
-            return replace(self, bodies=None)
+        where, coordinates = self.scene.garment.mesh.path, np.asarray(coordinates, np.float64)
+        if self.bodies is None:
+            fail(where, "a model of one body, put on one of a family", "it has no other", "leave coordinates out")
+        size = self.bodies.family.bodies.size
+        if coordinates.shape != (size,) or not np.isfinite(coordinates).all():
+            found = f"coordinates {np.array2string(coordinates, precision=3, threshold=8)} of a body"
+            fail(where, found, f"bodies of its family have {size} finite numbers each")
+        if not coordinates.any():
+            return self.on_base()
         scene = self.bodies.family.scene_at(self.scene, coordinates)
         biases = self.bodies.biases(self.parameters, coordinates if seen is None else seen)
         parameters = {**self.parameters, **biases}
         return replace(self, scene=scene, parameters=parameters, bodies=None)
+
+    def on_base(self) -> ModelFile:
+        """Return the model for the first body of its family."""
+        return replace(self, bodies=None)
+
+    def need_body(self) -> None:
+        """Raise `SsilkError` for a model of a family that was put on no body: nothing plays it as it is."""
+        if self.bodies is not None:
+            names = self.bodies.family.bodies.names
+            fail(
+                self.scene.garment.mesh.path,
+                f"a model of a family of bodies ({', '.join(names[:3])}{', ...' if len(names) > 3 else ''})",
+                "what plays a model plays it on one body",
+                "name a stage with that body, or from Python take ModelFile.on_body or on_base",
+            )
 
 
 def save_model(path: str | Path, model: ModelFile, *, pack: bool = False) -> None:
@@ -133,9 +159,13 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
-        **({} if model.bodies is None else {"family": model.bodies.family.bodies.names}),
+        **({} if model.bodies is None else _names(model.bodies.family.bodies)),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
+
+
+def _names(bodies: BodyFamily) -> dict[str, tuple[str, ...]]:
+    return {"family": bodies.names, "body_meshes": bodies.meshes}
 
 
 def _packed(tensors: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -214,8 +244,8 @@ def _need_header(document: dict[str, Any]) -> None:
     _need_types(document, HEADER)
     _need_types(document["config"], vars(ModelConfig()))
     _need_types(document["fabric"], vars(Fabric("")))
-    members = document.get("family", [])
-    for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members):
+    members, meshes = (document.get(name, []) for name in ("family", "body_meshes"))
+    for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members, meshes):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
@@ -249,7 +279,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         )
     parameters, bodies = _parameters(tensors, scene.garment.mesh.path), None
     if "family" in document:
-        bodies = SeenBodies.of(tensors, tuple(document["family"]))
+        bodies = SeenBodies.of(tensors, tuple(document["family"]), tuple(document["body_meshes"]))
         bodies.need_fit(skeleton, scene.garment.mesh.vertex_count, scene.rig.proxy_count, parameters)
     return ModelFile(
         scene,
@@ -342,11 +372,16 @@ def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) 
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:
-    """Build the network of a model file, on the file's scene or on one that also has the character's body."""
+    """Build the network of a model file, on the file's scene or on one that also has the character's body.
+
+    Raises:
+        SsilkError: it is one of a family that was put on no body.
+    """
     import torch
 
     from .model.network import GarmentModel
 
+    file.need_body()
     model = GarmentModel(scene or file.scene, file.config, file.joints)
     model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in file.parameters.items()})
     return model.eval()

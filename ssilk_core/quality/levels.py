@@ -225,7 +225,7 @@ def spend(
     budget = parse_budget(text)
 
     def cost(file: ModelFile) -> float:
-        return size_bytes(file) if budget.unit == "bytes" else play_time(Player(file), motion).median
+        return size_bytes(file) if budget.unit == "bytes" else play_time(Player(file.on_base()), motion).median
 
     choice = best_within(reducer, budget, cost, most)
     kept = choice.reduced.size

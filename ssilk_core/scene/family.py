@@ -24,6 +24,7 @@ from .assets.arrays import assign, frozen, need_finite
 from .kinematics import bind_pose, local_transforms
 
 SAME_DIRECTION = 1e-6  # of the largest principal value, up to which members do not span a direction
+SAME_PLACE = 1e-4  # [m], root mean square, within which a body of a family was not moved as a whole
 SAME_ROTATION = 1e-3  # between entries of bind rotations, as for bakes
 STORED_POINTS = 512  # of a body, in model files
 MOST_DIRECTIONS = 64
@@ -54,26 +55,29 @@ class BodyFamily:
     Attributes:
         names: of the members, the base first, length M.
         members: their coordinates, the base's zero, shape (M, K).
-        vertex_count: of the base's merged body.
-        rows: which of its points this knows, shape (V',).
+        rows: which points of the base's merged body this knows, shape (V',).
         joints, points: of the base in the bind pose [m], shapes (J, 3) and (V', 3).
         joint_moves, point_moves: how far a unit along each direction moves these [m], shapes (K, J, 3), (K, V', 3).
         taller: how much a unit along each direction adds to the height of the hub over the lowest point, relative to
             that of the base, shape (K,).
+        meshes: names of the prims of the base's body meshes, in the order in which they were merged.
+        counts: how many points each of these has.
     """
 
     names: tuple[str, ...]
     members: Floats
-    vertex_count: int
     rows: Ints
     joints: Floats
     points: Floats
     joint_moves: Floats
     point_moves: Floats
     taller: Floats
+    meshes: tuple[str, ...]
+    counts: tuple[int, ...]
 
     def __post_init__(self) -> None:
         assign(self, names=tuple(self.names), rows=frozen(self.rows, np.int64))
+        assign(self, meshes=tuple(self.meshes), counts=tuple(map(int, self.counts)))
         for name in ("members", "joints", "points", "joint_moves", "point_moves", "taller"):
             assign(self, **{name: frozen(getattr(self, name), np.float64)})
             need_finite(getattr(self, name), "body family", name.replace("_", " "))
@@ -85,6 +89,9 @@ class BodyFamily:
         for name, shape in shapes.items():
             if (found := getattr(self, name).shape) != shape:
                 fail("body family", f"{name} of shape {found}", f"{shape} is needed")
+        if len(self.meshes) != len(self.counts) or min(self.counts, default=0) < 1:
+            found = f"meshes {', '.join(self.meshes)} of {', '.join(map(str, self.counts))} points"
+            fail("body family", found, "one count for each mesh is needed")
         if not ((self.rows >= 0) & (self.rows < self.vertex_count)).all():
             fail("body family", "points that the body does not have", f"they lie in 0 to {self.vertex_count - 1}")
         if not (1 <= size <= MOST_DIRECTIONS and len(self.names) > 1):
@@ -96,6 +103,11 @@ class BodyFamily:
     def size(self) -> int:
         """The number K of directions."""
         return int(self.members.shape[-1])
+
+    @property
+    def vertex_count(self) -> int:
+        """The number of points of the base's merged body."""
+        return sum(self.counts)
 
     @classmethod
     def of(cls, characters: Sequence[Character]) -> BodyFamily:
@@ -131,7 +143,11 @@ class BodyFamily:
         taller = (joint_moves[:, base.hub, 1] - point_moves[:, lowest, 1]) / height if height > 0 else 0 * farthest
         names = tuple(character.path for character in characters)
         rows = np.arange(count)
-        return cls(names, along / farthest, count, rows, places[0], bodies[0], joint_moves, point_moves, taller)
+        meshes = [body.mesh for body in characters[0].bodies]
+        return cls(
+            names, along / farthest, rows, places[0], bodies[0], joint_moves, point_moves, taller,
+            meshes=tuple(_leaf(mesh.path) for mesh in meshes), counts=tuple(mesh.vertex_count for mesh in meshes),
+        )  # fmt: skip
 
     def place(self, joints: Floats, points: Floats) -> BodyPlace:
         """Return where a body is in this space.
@@ -155,13 +171,55 @@ class BodyFamily:
         """Return where a character with these joints and this topology is.
 
         Raises:
-            SsilkError: its body has another number of points.
+            SsilkError: it has not the body meshes of the family.
         """
-        mesh = character.merged_body().mesh
-        if mesh.vertex_count != self.vertex_count:
-            allowed = f"bodies of the family have {self.vertex_count}"
-            fail(mesh.path, f"{mesh.vertex_count} body points", allowed, "take a body of the same topology")
+        mesh = self.known_meshes(character).merged_body().mesh
         return self.place(character.skeleton.bind_transforms[:, :3, 3], mesh.points[self.rows])
+
+    def known_meshes(self, character: Character) -> Character:
+        """Return a character with those of its meshes alone that this knows: it may have been made of some.
+
+        They are those of the same names. Where one of these is missing, as in a program that renamed it, they are all
+        body meshes, if these have as many points, in their order, else those that alone have as many.
+
+        Raises:
+            SsilkError: it has them not.
+        """
+        named = {_leaf(each.mesh.path): each for each in (*character.stand_ins, *character.bodies)}
+        found = tuple(named[name] for name in self.meshes if name in named)
+        if tuple(each.mesh.vertex_count for each in found) != self.counts:
+            found = character.bodies
+        counts = tuple(each.mesh.vertex_count for each in found)
+        if counts != self.counts and all(counts.count(each) == self.counts.count(each) == 1 for each in self.counts):
+            found, counts = tuple(found[counts.index(count)] for count in self.counts), self.counts
+        if counts != self.counts:
+            wanted = ", ".join(f"'{name}' with {count}" for name, count in zip(self.meshes, self.counts))
+            told = ", ".join(f"'{_leaf(each.mesh.path)}' with {each.mesh.vertex_count}" for each in found)
+            what = f"body meshes {told} points" if told else "no body mesh"
+            allowed = f"the model's family of bodies has {wanted} points"
+            fail(character.path, what, allowed, "take a body of the same topology, and name its meshes so")
+        return replace(character, bodies=found, stand_ins=())
+
+    def displacement(self, joints: Floats, points: Floats) -> Floats:
+        """Return by how much a body is to be moved as a whole for this family to have it best [m], shape (3,).
+
+        It is nothing for a body that the family has where it is. Arguments are those of `place`.
+        """
+        there = self.place(joints, points)
+        if max(there.joints_off, there.points_off) < SAME_PLACE:
+            return np.zeros(3)
+        axes = np.eye(3)[:, None]
+        wanted, moves = (
+            np.concatenate([_scaled(of_joints), _scaled(of_points)], axis=1)
+            for of_joints, of_points in (
+                ((joints - self.joints)[None], (points - self.points)[None]),
+                (
+                    np.concatenate([self.joint_moves, np.repeat(axes, len(self.joints), axis=1)]),
+                    np.concatenate([self.point_moves, np.repeat(axes, len(self.points), axis=1)]),
+                ),
+            )
+        )
+        return -np.linalg.lstsq(moves.T, wanted[0], rcond=None)[0][self.size :]
 
     def beyond(self, coordinates: Floats) -> float:
         """Return how far coordinates (K,) are beyond the members, as `BodyPlace.beyond`."""
@@ -294,6 +352,15 @@ class DressedFamily:
             replace(scene.garment, mesh=replace(mesh, points=points), sewn=scene.garment.sewn_mesh.points),
             replace(rig, bind_transforms=binds),
         )
+
+
+def names_of(character: Character) -> set[str]:
+    """Return the names of the prims of a character's meshes."""
+    return {_leaf(each.mesh.path) for each in (*character.stand_ins, *character.bodies)}
+
+
+def _leaf(path: str) -> str:
+    return path.rpartition("/")[2]
 
 
 def spread_points(points: Floats, count: int) -> Ints:

@@ -49,10 +49,19 @@ class InnerModel:
 
     @classmethod
     def load(cls, path: Path) -> InnerModel:
-        """Read one from a file; raise `SsilkError` as `load_model` does."""
+        """Read one from a file.
+
+        Raises:
+            SsilkError: as `load_model` does, or it is a model of a family of bodies, of which this does not know the
+                one that it is worn on.
+        """
         from ..files import sha256
 
-        return cls(path.stem, sha256(path) if path.is_file() else "", load_model(path))
+        file = load_model(path)
+        if file.bodies:
+            found = "a model of a family of bodies"
+            fail(f"--over {path}", found, "a garment is trained over models of one body", "train it for that body")
+        return cls(path.stem, sha256(path), file)
 
 
 def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None:

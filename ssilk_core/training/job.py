@@ -22,7 +22,7 @@ from .inner_garments import InnerModel, need_wearable
 from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .settings import TrainConfig
-from .state import json_round_trip, scene_digest
+from .state import family_digest, json_round_trip, scene_digest
 
 STEPPER_SETTINGS = (
     "scheme", "descriptors", "max_latent_step", "feedback_points", "feedback_proxies", "stiffness",
@@ -175,7 +175,7 @@ class TrainJob:
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
-                **({"family": self.family.bodies.members.tolist()} if self.family else {}),
+                **({"family": family_digest(self.family)} if self.family else {}),
             }
         )
 

@@ -23,7 +23,7 @@ from ..physics.intersections.cloth import ClothIntersections
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
 from ..scene.assets import Floats, Ints, Motion
-from ..scene.family import motion_on
+from ..scene.family import motion_on, spread_points
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .bodies import BodyWearer, DrawnBodies, FamilyBody
 from .family_bank import FamilyBank, build_family_bank
@@ -37,10 +37,11 @@ from .parallel import SINGLE_PROCESS, ProcessGroup
 from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
 from .step import Stepper
-from .validation import Validator
+from .validation import ValidatedBody, Validator
 from .windows import WindowSampler
 
 FIRST_WEIGHT = "stepper.0.weight"
+VALIDATED = 4  # members of a family, beside its first, that models are validated on
 POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 
 
@@ -174,7 +175,8 @@ def build_parts(
         samples, beside = energy.cloth.samples, (bank, held, joints, kind)
         found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
         inner = found if len(found) else None
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner)
+    members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
+    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner, members)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
@@ -196,6 +198,33 @@ def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
         reach = reachable_body(other, [motion_on(motion, base, skeleton, ratio) for motion in motions])
         vertices, joints = np.union1d(vertices, reach.vertices), np.logical_or(joints, reach.joints)
     return vertices, joints
+
+
+def _validated_members(
+    job: TrainJob, energy: GarmentEnergy, joints: Ints, frames: int, device: torch.device, group: ProcessGroup
+) -> list[ValidatedBody]:
+    """Return those members of a family, its first left out, that models are validated on as well.
+
+    They are the ones farthest apart, and together they have as many frames as the first.
+    """
+    assert job.family
+    bodies, base, found = job.family.bodies, job.scene.character.skeleton, []
+    chosen = [row for row in spread_points(bodies.members, 1 + VALIDATED) if row]
+    for row in chosen:
+        coordinates = bodies.members[row]
+        scene = job.family.scene_at(job.scene, coordinates)
+        skeleton, ratio = scene.character.skeleton, 1 + float(bodies.taller @ coordinates)
+        motions = [motion_on(motion, base, skeleton, ratio) for motion in job.held_out]
+        bank = build_bank(motions, skeleton, joints, job.model.fps, device)
+        body = CollisionBody(
+            scene.character.merged_body(), skeleton.joint_count, limbs=limb_axes(scene), device=device
+        )
+        rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32, device=device)
+        part = max(1, frames // len(chosen))
+        place = torch.tensor(coordinates, dtype=torch.float32, device=device)
+        validator = Validator(bank, energy, body, scene, rest, job.model.fps, part, group)
+        found.append(ValidatedBody(bodies.names[row], place, validator))
+    return found
 
 
 def _take_over(model: GarmentModel, base: ModelFile) -> bool:

@@ -21,6 +21,7 @@ from ..errors import SsilkError, fail
 from ..files import replacing, split_location
 from ..network.tensors import pack_tensors, read_tensors
 from ..scene.assets import Scene
+from ..scene.family import DressedFamily
 from .curve import CurvePoint
 from .settings import TrainConfig
 from .step import Stepper
@@ -29,6 +30,7 @@ from .validation import Score
 Tensors = dict[str, Tensor]
 
 FORMAT = 1  # of training states
+SAME_DIGITS = 6  # of a family of bodies [m], and of its coordinates
 HEADER_NAME = "ssilk_state"  # of the JSON document in the metadata
 SAMPLER_PREFIX = "sampler."  # of the sampler's tensors; all others are parameters or optimiser state
 
@@ -296,6 +298,18 @@ def scene_digest(scene: Scene) -> str:
     skins = (lbs.indices, lbs.weights, rig.indices, rig.weights)
     for array in (*body, *garment, *skins, scene.parents, scene.bind_transforms):
         digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def family_digest(family: DressedFamily) -> str:
+    """Return a hash of the bodies that a garment is trained for, and of where it lies on them.
+
+    What linear algebra leaves of rounding, which depends on threads, is none of it.
+    """
+    bodies, digest = family.bodies, hashlib.sha256()
+    moves = (bodies.joint_moves, bodies.point_moves, bodies.taller, family.cloth_moves, family.proxy_moves)
+    for array in (bodies.members, bodies.joints, bodies.points, *moves):
+        digest.update((np.round(array, SAME_DIGITS) + 0.0).tobytes())
     return digest.hexdigest()
 
 

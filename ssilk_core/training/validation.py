@@ -9,7 +9,7 @@ from functools import cached_property
 from itertools import accumulate, pairwise
 from math import isfinite
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from ..physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ..physics.skin.figures import ShownSkin
 from ..physics.skinning import Skinning
 from ..scene.assets import Motion, Scene
+from .bodies import BodyWearer
 from .inner_garments import InnerGarments
 from .motion_bank import LatentModel, MotionBank, roll_states
 from .newton_steps import NewtonSteps
@@ -43,6 +44,23 @@ Counts = TypeVar("Counts")
 
 
 @dataclass(frozen=True)
+class BodyScore:
+    """Means over some frames on one more body of a family.
+
+    Attributes:
+        name: of the body.
+        total: sum of the energies but that of intersections [J]; gravity is relative to linear blend skinning.
+        lbs: that of linear blend skinning there [J].
+        collisions: share of garment vertices inside the body.
+    """
+
+    name: str
+    total: float
+    lbs: float
+    collisions: float
+
+
+@dataclass(frozen=True)
 class Score:
     """Means over all frames of all clips.
 
@@ -56,6 +74,7 @@ class Score:
             libigl.
         layers: how the garment lies over each inner one, in the same frames.
         step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
+        bodies: of a family beside its first one, which all else is of; none for linear blend skinning.
     """
 
     terms: dict[str, float]
@@ -65,6 +84,7 @@ class Score:
     intersections: SelfIntersections | None = None
     step_errors: StepErrors | None = None
     layers: tuple[LayerFigures, ...] = ()
+    bodies: tuple[BodyScore, ...] = ()
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Score:
@@ -76,6 +96,7 @@ class Score:
             "intersections": crossed and SelfIntersections(**crossed),
             "step_errors": steps and StepErrors(**steps),
             "layers": tuple(LayerFigures(**each) for each in document.get("layers", ())),
+            "bodies": tuple(BodyScore(**each) for each in document.get("bodies", ())),
         }
         return cls(**{**document, **parts})
 
@@ -83,6 +104,20 @@ class Score:
     def total(self) -> float:
         """Sum of all terms [J]."""
         return sum(self.terms.values())
+
+
+@dataclass(frozen=True, eq=False)
+class ValidatedBody:
+    """A body of a family that a model is validated on: its name, its coordinates (K,), and who validates there."""
+
+    name: str
+    place: Tensor
+    validator: Validator
+
+    @cached_property
+    def lbs(self) -> float:
+        """Energy of linear blend skinning [J]."""
+        return _total(self.validator.means(None))
 
 
 class Validator:
@@ -93,6 +128,7 @@ class Validator:
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
         contours: those of the garment, whose energy is a term where training has it.
         inner: garments beneath, all of which are worn; contact with them is part of that with the body.
+        members: bodies of a family whose energies are measured as well.
     """
 
     def __init__(
@@ -108,12 +144,12 @@ class Validator:
         spans: Sequence[Motion] | None = None,
         contours: IntersectionContours | None = None,
         inner: InnerGarments | None = None,
+        members: Sequence[ValidatedBody] = (),
     ) -> None:
+        self.members = tuple(members)
         self.bank, self.energy, self.body, self.fps, self.group = bank, energy, body, fps, group
         self.lbs = Skinning(scene.lbs_skin).to(rest.device)
         self.contacts = Contacts(scene, energy.cloth.samples, vertices=body.vertices, device=rest.device)
-        self.covered = CoveredSkin(scene, device=rest.device)
-        self.cloth = contours.cloth if contours else ClothIntersections.of(scene) if can_find() else None
         self.contours, self.inner = contours, inner
         self.rest, self.scene = rest, scene
         self.clips = [
@@ -125,6 +161,18 @@ class Validator:
             self.names = [PurePath(split_location(span.path)[0]).stem for span in spans]
             self.first = [round(span.start * fps / span.fps) for span in spans]
         self.down = torch.tensor([0.0, -1.0, 0.0], device=rest.device)
+
+    @cached_property
+    def covered(self) -> CoveredSkin:
+        """The skin that the garment covers."""
+        return CoveredSkin(self.scene, device=self.rest.device)
+
+    @cached_property
+    def cloth(self) -> ClothIntersections | None:
+        """The garment's triangles; None without libigl."""
+        if self.contours:
+            return self.contours.cloth
+        return ClothIntersections.of(self.scene) if can_find() else None
 
     def lbs_vertices(self, character: Tensor) -> Tensor:
         """Return linear blend skinning's positions (V, 3, N) [m]."""
@@ -140,18 +188,38 @@ class Validator:
 
     def _mean(self, model: LatentModel | None) -> Score:
         """Return the mean over all clips, distributed over the processes of the group; all get the same score."""
-        clips = self.clips[self.group.rank :: self.group.size]
-        states = self._states(clips, model)
-        own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
-        dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
-        scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
-        joined = {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
+        states = self._states(self.clips[self.group.rank :: self.group.size], model)
+        joined = self._joined(model, states)
         terms = {name: joined[name] for name in (*TERMS, INTERSECTION) if name in joined}
         shown, crossed = self._shown(model, states), self._crossed(model, states)
         steps = self._step_errors(model, states)
-        return Score(
-            terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps, self._layers(model, states)
-        )
+        layers, bodies = self._layers(model, states), self._bodies(model)
+        return Score(terms, joined["collisions"], joined["dynamics"] ** 0.5, shown, crossed, steps, layers, bodies)
+
+    def means(self, model: LatentModel | None) -> dict[str, float]:
+        """Return the means of `frame_terms` over all clips; all processes of the group get the same."""
+        return self._joined(model, self._states(self.clips[self.group.rank :: self.group.size], model))
+
+    def _joined(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> dict[str, float]:
+        clips = self.clips[self.group.rank :: self.group.size]
+        own = [self._clip_terms(clip, model, latents) for clip, latents in zip(clips, states)]
+        dealt = self.group.gather([{name: value.cpu() for name, value in terms.items()} for terms in own])
+        scores = [dealt[index % self.group.size][index // self.group.size] for index in range(len(self.clips))]
+        return {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
+
+    def _bodies(self, model: LatentModel | None) -> tuple[BodyScore, ...]:
+        """Return the scores on the other bodies of a family; the model is on the first one before and after."""
+        if model is None or not self.members:
+            return ()
+        found, wearer = [], cast(BodyWearer, model)
+        try:
+            for member in self.members:
+                wearer.wear(member.place)
+                means = member.validator.means(model)
+                found.append(BodyScore(member.name, _total(means), member.lbs, means["collisions"]))
+        finally:
+            wearer.wear(torch.zeros_like(self.members[0].place))
+        return tuple(found)
 
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""
@@ -313,3 +381,8 @@ class Validator:
             parts.append({**terms, "dynamics": ((x - still) ** 2).sum(1).mean(0)})
             tail = joined[..., -2:]
         return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+
+
+def _total(means: Mapping[str, float]) -> float:
+    """Return the sum of the energies of `TERMS` [J]."""
+    return sum(means[name] for name in TERMS if name in means)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ from ..events import Message
 from ..physics.skin.figures import MOST_MEAN, MOST_WORST
 
 if TYPE_CHECKING:
-    from .validation import Score
+    from .validation import BodyScore, Score
 
 # A rollout closer than this to the quasi-static state of each pose has learned no dynamics.
 NO_DYNAMICS = 2e-3  # [m]
@@ -42,6 +43,21 @@ def percent(share: float) -> str:
 def is_worse(score: Score, lbs: Score) -> bool:
     """Return whether a model is worse than none: its total is above that of linear blend skinning."""
     return lower_by(score, lbs) < -WORSE
+
+
+def worst_body(score: Score) -> BodyScore | None:
+    """Return the body of a family, its first left out, on which least is won over linear blend skinning."""
+    return min(score.bodies, key=lambda body: share_below(body.total, body.lbs), default=None)
+
+
+def worse_bodies(model: str, score: Score) -> Iterator[Message]:
+    """Yield a warning for each body of a family, its first left out, on which a model is worse than none."""
+    for body in score.bodies:
+        if share_below(body.total, body.lbs) < -WORSE:
+            text = (
+                f"its validation total of {body.total:.4g} J is above the {body.lbs:.4g} J of linear blend skinning"
+            )
+            yield Message(f"{model}: on {body.name} the model is worse than none: {text}", "warning")
 
 
 def worse_message(model: str, score: Score, lbs: Score) -> Message:

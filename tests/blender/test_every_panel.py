@@ -154,7 +154,7 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
         ("solved", {"solving": SimpleNamespace(started=True, total=9, waits=False, lost={3}, failed=2), "solved": 9}),
     ):
         still = {
-            "done": None, "stale": False, "behind": False, "unkeyed": "", "renewed": False, "wrong": "",
+            "done": None, "stale": False, "behind": False, "unkeyed": "", "renewed": False, "wrong": "", "told": "",
             "solving": None, "first": 1,
         }  # fmt: skip
         yield name, live(monkeypatch, **(still | fields))

@@ -129,6 +129,13 @@ def test_a_family_is_learned_and_the_model_file_holds_it(world):
     assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
 
 
+def test_a_training_tells_the_figures_of_each_body_and_the_worst(world, toy, capsys):
+    run(f"{TRAIN} --family taller.usda heavier.usda -o new.safetensors", *toy.training)
+    told = capsys.readouterr()
+    told = told.out + told.err
+    assert "taller.usda:/Hero [J]" in told and "heavier.usda:/Hero [J]" in told and "worst body" in told
+
+
 def test_a_family_needs_members(world, capsys, toy):
     stage = Usd.Stage.Open("taller.usda")
     stage.GetPrimAtPath("/Hero/Rig").GetAttribute("joints").Set(["Hips", "Hips/Spine", "Hips/Spine/Skull"])
@@ -264,6 +271,38 @@ def test_a_model_is_exported_for_a_member_and_reduced_for_all(world):
     assert run("bake small.safetensors --motion clip.usda --stage heavier.usda -o small.usda") == 0
 
 
+def test_a_level_of_quality_of_a_member_is_fitted_to_it(world, monkeypatch):
+    from ssilk_core.delivery.bake import sizing
+
+    reduced, original = [], sizing.Reducer
+    monkeypatch.setattr(sizing, "Reducer", lambda file, motions: reduced.append(file) or original(file, motions))
+    assert run(f"{BAKE} --stage heavier.usda --budget 1MB -o small.usda") == 0
+    (file,) = reduced
+    points = file.scene.garment.mesh.points
+    base = load_model("family.safetensors").scene.garment.mesh.points
+    assert np.abs(points - base).max() > 0.04
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["stress family.safetensors --quick --only rate:", "trade family.safetensors --motions clips --frames 4"],
+)
+def test_what_there_is_to_say_of_a_body_is_said_by_all_that_measure_it(world, capsys, command):
+    (world / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
+    run(f"{command} --stage large.usda")
+    told = capsys.readouterr()
+    assert "beyond the bodies of the training" in told.out + told.err
+
+
+def test_which_body_a_network_is_exported_for_is_told(world, capsys):
+    pytest.importorskip("onnx")
+    assert run("export family.safetensors -o base.onnx") == 0
+    told = capsys.readouterr()
+    assert "for the first of them" in told.out + told.err
+
+
 def test_a_character_without_a_stage_is_no_body_to_export_for(world, capsys):
     assert run("export family.safetensors --root /Hero -o hero.onnx") == 2
     assert "a SkelRoot without a stage" in capsys.readouterr().err and not Path("hero.onnx").exists()
@@ -272,6 +311,58 @@ def test_a_character_without_a_stage_is_no_body_to_export_for(world, capsys):
 def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
     assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
     assert "train for the family anew" in capsys.readouterr().err
+
+
+def with_hat(path: str) -> None:
+    """Give a hero a second mesh, which one of its joints carries; it is no body unless it is named."""
+    stage = Usd.Stage.Open(path)
+    hat = UsdGeom.Mesh.Define(stage, "/Hero/Hat")
+    hat.CreatePointsAttr([(0.1, 1.7, 0), (-0.1, 1.7, 0), (0, 1.8, 0.1)])
+    hat.CreateFaceVertexCountsAttr([3])
+    hat.CreateFaceVertexIndicesAttr([0, 1, 2])
+    skin = UsdSkel.BindingAPI.Apply(hat.GetPrim())
+    skin.CreateJointIndicesPrimvar(True, 1).Set([2])
+    skin.CreateJointWeightsPrimvar(True, 1).Set([1.0])
+    stage.Save()
+
+
+@pytest.mark.parametrize("named", ["--body Body", "--body Hat --body Body"])
+def test_a_family_of_some_meshes_is_dressed_on_its_own_stages(world, toy, capsys, named):
+    for path in ("rigged.usda", "taller.usda"):
+        with_hat(path)
+    train = f"{TRAIN} --family taller.usda {named} -o some.safetensors"
+    assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    shot = "bake some.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage rigged.usda -o own.usda") == 0
+    capsys.readouterr()
+    assert run(f"{shot} --stage taller.usda -o its.usda") == 0
+    told = capsys.readouterr()
+    assert "a body of the model's family" in told.out + told.err
+    assert {"Body", "Hat", "Skirt"} <= shown("its.usda", 3).keys()
+
+
+def test_a_family_is_not_dressed_where_its_mesh_has_other_points(world, capsys):
+    stage = Usd.Stage.Open("taller.usda")
+    body = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body"))
+    body.GetPointsAttr().Set([*body.GetPointsAttr().Get(), (0, 2, 0)])
+    for name, weight in (("jointIndices", 2), ("jointWeights", 1.0)):
+        values = UsdGeom.PrimvarsAPI(body).GetPrimvar(f"skel:{name}")
+        values.Set([*values.Get(), weight])
+    stage.Save()
+    assert run(f"{BAKE} --stage taller.usda -o out.usda") == 2
+    told = capsys.readouterr().err
+    assert "'Body' with" in told and "the model's family of bodies has 'Body' with" in told
+    assert not Path("out.usda").exists()
+
+
+def test_bodies_that_are_alike_in_three_digits_are_two(world, capsys):
+    write_member(world / "one.usda", lambda points: points * [1.15, 1, 1.15])
+    write_member(world / "other.usda", lambda points: points * [1.15003, 1, 1.15003])
+    shot = "bake family.safetensors --motion clip.usda"
+    assert run(f"{shot} --stage one.usda -o shots/") == 0
+    capsys.readouterr()
+    assert run(f"{shot} --stage other.usda --shot-name second -o shots/") == 2
+    assert "another body of its model's family" in capsys.readouterr().err
 
 
 def test_in_a_folder_of_layers_a_name_stays_with_its_body(world, capsys):

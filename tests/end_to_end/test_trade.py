@@ -17,6 +17,7 @@ from pxr import Sdf
 from ssilk_core.cli import main
 from ssilk_core.cli.trade import Bench
 from ssilk_core.errors import EXIT_WORSE
+from ssilk_core.events import silent
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.quality.cost import Time
 
@@ -71,7 +72,7 @@ def test_points_are_of_what_files_hold_and_not_of_their_names(world):
             models=[folder / "model.safetensors"], stage=folder / "above.usda", motions=folder / "motions",
             clips=["long"], frames=12, root=None, device="cpu", output=folder / "trade.json",
         )  # fmt: skip
-        return Bench(options).asked
+        return Bench(options, silent).asked
 
     before = asked(world)
     assert before["clips"] == ["long"] and before["frames"] == {"long": 12}

@@ -9,7 +9,7 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 `VerificationError`. This package and the command line are the only ones that join the core and USD.
 """
 
-from .bodies import WornModel, worn
+from .bodies import WornModel, worn, worn_by
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
@@ -26,5 +26,5 @@ __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
     "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "cache_origin",
     "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
-    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model", "worn",
+    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model", "worn", "worn_by",
 ]  # fmt: skip

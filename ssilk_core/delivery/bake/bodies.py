@@ -12,7 +12,7 @@ from ...errors import fail
 from ...events import Event, Message
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Scene
-from ...scene.family import BodyPlace
+from ...scene.family import BodyPlace, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
 
 if TYPE_CHECKING:
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 TRAINED, FARTHEST = 0.1, 0.5  # how far beyond the members bodies were trained on, and may be
 NEAR, UNLIKE = 0.005, 0.03  # [m] from the family's space, from which on it is told, and refused
+DIGITS = 7  # of what tells bodies apart
 BETTER = f"{TODO}, or with it among --family"
 
 
@@ -31,31 +32,50 @@ class WornModel:
         file: as a model for that body.
         scene: its garment there.
         told: what there is to say of the body.
-        body: its place in the model's family, in words; None for the body that the model is of.
+        body: what tells it from other bodies of the model's family: its coordinates, then where its joints are
+            bound and how far off the family its points are [m]; None for the body that the model is of.
     """
 
     file: ModelFile
     scene: Scene
     told: tuple[Event, ...] = ()
-    body: str | None = None
+    body: tuple[float, ...] | None = None
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
-    """Put a model on the character of a stage.
+    """Put a model on the character of a stage, as `worn_by`.
+
+    Raises:
+        SsilkError: the stage's character is none that the model dresses, or it cannot be read.
+    """
+    from ssilk_usd.reading.character import has_meshes, read_character
+
+    character = read_character(stage, root=root, garment=None)
+    names = file.bodies.family.bodies.meshes if file.bodies else ()
+    known = character
+    if not names_of(character).issuperset(names) and has_meshes(stage, root, names):
+        # Meshes that a joint carries are read where they are named alone, as `--body` may have named them.
+        known = read_character(stage, root=root, bodies=names)
+    return worn_by(file, character, known)
+
+
+def worn_by(file: ModelFile, character: Character, known: Character) -> WornModel:
+    """Put a model on a character.
 
     A model for one body fits that body. One of a family fits any body of it. What its networks see of a body ends at
     `TRAINED` beyond the members. A body beyond `FARTHEST`, or one that the members do not add up to, is refused.
 
-    Raises:
-        SsilkError: the stage's character is none that the model dresses.
-    """
-    from ssilk_usd.reading.character import read_character
+    Args:
+        known: the same character, with those meshes at least that the model's family knows.
 
-    character, base = read_character(stage, root=root, garment=None), file.scene.character.skeleton
+    Raises:
+        SsilkError: the model does not dress it.
+    """
+    base = file.scene.character.skeleton
     if file.bodies is None:
         return WornModel(file, replace(file.scene, character=in_order_of(base, character)))
     own, bodies = in_order_of(base, character, moved=True), file.bodies.family.bodies
-    place = bodies.place_of(own)
+    place = bodies.place_of(own if known is character else in_order_of(base, known, moved=True))
     _need_like(place, character.path)
     away = np.linalg.norm(own.skeleton.bind_transforms[:, :3, 3] - base.bind_transforms[:, :3, 3], axis=1)
     if not place.coordinates.any() and away.max() < BIND_TOLERANCE:
@@ -68,7 +88,8 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     one = file.on_body(place.coordinates, seen)
     bare = replace(own, bodies=(), stand_ins=())  # as model files have it
     one = replace(one, scene=replace(one.scene, character=bare))
-    return WornModel(one, replace(one.scene, character=own), tuple(_told(place, own)), _words(place))
+    told = tuple(_told(place, own))
+    return WornModel(one, replace(one.scene, character=own), told, _identity(place, own))
 
 
 def _need_like(place: BodyPlace, path: str) -> None:
@@ -79,6 +100,12 @@ def _need_like(place: BodyPlace, path: str) -> None:
     if place.beyond > FARTHEST:
         found = f"its body is {place.beyond:.0%} beyond the bodies that the model was trained for"
         fail(path, found, f"{FARTHEST:.0%} are allowed", BETTER)
+
+
+def _identity(place: BodyPlace, own: Character) -> tuple[float, ...]:
+    joints = own.skeleton.bind_transforms[:, :3, 3].reshape(-1)
+    numbers = np.concatenate([place.coordinates, joints, [place.points_off]])
+    return tuple((np.round(numbers, DIGITS) + 0.0).tolist())
 
 
 def _words(place: BodyPlace) -> str:

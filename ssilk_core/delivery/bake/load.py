@@ -69,7 +69,7 @@ class LoadedGarment:
         info: of the garment as an asset.
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
-        body: where in the model's family it is (`bodies.WornModel.body`).
+        body: which of the model's family it lies on (`bodies.WornModel.body`).
     """
 
     request: BakeRequest
@@ -85,7 +85,7 @@ class LoadedGarment:
     info: AssetInfo
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
-    body: str | None = None
+    body: tuple[float, ...] | None = None
 
     @property
     def over_models(self) -> dict[str, str]:

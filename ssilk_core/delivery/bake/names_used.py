@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import NoReturn
 
+import numpy as np
+
 from ...errors import fail
 from ...files import replacing, split_location
 from ...scene.plain import from_plain
@@ -18,6 +20,7 @@ from .record import RECORD, RecordedInput, TaskRecord, portable, read_record
 from .task import OF_ASSET, BakeTask
 
 USED = "used.json"
+SAME_BODY = 1e-5  # [m], and in coordinates of a family, whose members are at one
 
 
 @dataclass(frozen=True)
@@ -30,17 +33,19 @@ class GarmentUse:
         model: of the garment.
         root: the SkelRoot, where one was named.
         asset_version, asset_identifier: of the asset, where they were given.
-        body: that it lies on, by its place in the model's family; None for the body that the model is of.
+        body: that it lies on, as `bodies.WornModel` tells it from others; None for the body that the model is of.
     """
 
     model: RecordedInput
     root: str | None
     asset_version: str | None = None
     asset_identifier: str | None = None
-    body: str | None = None
+    body: tuple[float, ...] | None = None
 
     @classmethod
-    def of(cls, task: BakeTask, model: RecordedInput, folder: Path, body: str | None = None) -> GarmentUse:
+    def of(
+        cls, task: BakeTask, model: RecordedInput, folder: Path, body: tuple[float, ...] | None = None
+    ) -> GarmentUse:
         """Return what a task uses its garment's name for in a folder: what it does not say of the asset stays, as
         long as the model is the same."""
         before = _stated(_place(folder, task.garment))
@@ -93,13 +98,22 @@ def read_use(folder: Path, garment: str) -> GarmentUse | None:
 def need_same_body(folder: Path, task: BakeTask, use: GarmentUse) -> None:
     """Raise `SsilkError` where the name's asset lies on another body of its model's family: shots share it."""
     before = _stated(_place(folder, task.garment))
-    if before and not task.replace and before.model.sha256 == use.model.sha256 and before.body != use.body:
+    if before is None or task.replace or before.model.sha256 != use.model.sha256:
+        return
+    if not _same_body(before.body, use.body):
         fail(
             str(folder),
             f"the garment '{task.garment}' was baked on another body of its model's family",
             "the shots of a name share one asset, which lies on one body",
             "name it otherwise for each body with --garment-name, or use the name all the same with --replace",
         )
+
+
+def _same_body(one: tuple[float, ...] | None, other: tuple[float, ...] | None) -> bool:
+    """Return whether two bodies of a family are one, but for what rounding leaves on another machine."""
+    if one is None or other is None:
+        return one is other
+    return len(one) == len(other) and bool(np.allclose(one, other, rtol=0, atol=SAME_BODY))
 
 
 def says(folder: Path, task: BakeTask) -> bool:

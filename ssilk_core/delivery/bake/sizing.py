@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import fail
 from ...events import Reporter
-from ...network.checkpoint import ModelFile, load_model
+from ...network.checkpoint import ModelFile
 from ...quality.cost import ShotBytes
 from ...quality.levels import quality_named, size_at, spend
 from ...quality.reduction import Reducer
 from ...scene.assets import Deformer, GarmentPose, Motion
 from ..targets import GLB
 from .glb import write_glb_shot
-from .load import load_rollout, with_model
+from .load import load_garment, load_rollout, with_model
 from .request import BakeRequest
 from .rollout import BakeRollout
 
@@ -52,13 +52,14 @@ def load_sized(
         SsilkError: an unknown level, a budget that nothing fits, or either for linear blend skinning or points.
     """
     request = _at_quality(request, quality, budget)
-    rollout = load_rollout(request)
+    garment = load_garment(request)
+    rollout = garment.over(request.motion, range=request.range, handles=request.handles)
     most = request.receiver.influences or rollout.influences
     if not (quality or budget or rollout.influences > most):
         return rollout
     if quality and request.fps is None:
         request = replace(request, fps=quality_named(quality).rate(rollout.source.fps))
-    reducer = Reducer(load_model(request.model), [rollout.source])
+    reducer = Reducer(garment.file, [rollout.source])
     size = size_at(quality, reducer.whole)
     size = replace(size, influences=min(size.influences, most))
     if budget:

@@ -28,10 +28,12 @@ class NumpyGarment:
     """A trained garment whose networks are evaluated with numpy.
 
     Raises:
-        SsilkError: the runtime does not support the model's integration scheme.
+        SsilkError: the runtime does not support the model's integration scheme, or it is a model of a family of
+            bodies that was put on none of them.
     """
 
     def __init__(self, file: ModelFile) -> None:
+        file.need_body()
         scene, config = file.scene, file.config
         if config.scheme not in STEPPERS:
             fail(

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...errors import fail
-from ...scene.assets import Motion
+from ...scene.assets import Floats, Motion
 from ..checkpoint import load_model
 from .garment import NumpyGarment
 from .playback import BLOCK, Playback
@@ -16,9 +16,17 @@ class Player(NumpyGarment):
     """A trained garment, ready to play motions."""
 
     @classmethod
-    def load(cls, path: str | Path) -> Player:
-        """Read a model file; raise `SsilkError` as `checkpoint.load_model` does."""
-        return cls(load_model(path))
+    def load(cls, path: str | Path, coordinates: Floats | None = None) -> Player:
+        """Read a model file.
+
+        Args:
+            coordinates: of the body that one of a family plays on, shape (K,) (`scene.family.BodyFamily`).
+
+        Raises:
+            SsilkError: as `checkpoint.load_model` does, or these are missing, not finite, or of another family.
+        """
+        file = load_model(path)
+        return cls(file if coordinates is None else file.on_body(coordinates))
 
     def play(self, motion: Motion, *, pre_roll: float = 0.0, block: int = BLOCK) -> Playback:
         """Return the garment over a motion of any rate, with or without cuts; frames are computed on request.

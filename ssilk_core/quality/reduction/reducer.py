@@ -49,7 +49,7 @@ class Reducer:
     """Makes smaller models of one, all measured on the same motions.
 
     Args:
-        file: the model to reduce.
+        file: the model to reduce; one of a family of bodies is measured on the first of these.
         motions: representative motions, on which errors are measured.
         frames: number of frames to measure on.
 
@@ -61,7 +61,7 @@ class Reducer:
     """
 
     def __init__(self, file: ModelFile, motions: Sequence[Motion], *, frames: int = FRAMES) -> None:
-        self.file, self.scene, self.player = file, file.scene, Player(file)
+        self.file, self.scene, self.player = file, file.scene, Player(file.on_base())
         self.seen = observe(self.player, motions, frames)
         self.activations, self.matrices = self.seen.decode(self.player)
         mesh = self.scene.garment.mesh
@@ -166,7 +166,7 @@ class Reducer:
         """Return distances between a model's vertices and those of the whole model, RMS and largest [m]."""
         squares = [
             ((mine - theirs) ** 2).sum(axis=2)
-            for mine, theirs in zip(self.seen.vertices(self.player), self.seen.vertices(Player(file)))
+            for mine, theirs in zip(self.seen.vertices(self.player), self.seen.vertices(Player(file.on_base())))
         ]
         square = np.concatenate(squares)
         return float(np.sqrt((square @ self.mass).mean())), float(np.sqrt(square.max()))

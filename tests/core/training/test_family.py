@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training for a family of bodies, and a model of one put on a body."""
 
-from dataclasses import replace
+import json
+from dataclasses import asdict, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,14 +17,20 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime.player import Player
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody, limb_axes
+from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
 from ssilk_core.training.family_bank import build_family_bank
+from ssilk_core.training.inner_garments import InnerModel
+from ssilk_core.training.job import TrainJob
 from ssilk_core.training.motion_bank import build_bank
+from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
+from ssilk_core.training.validation import BodyScore, Score, Validator
+from ssilk_core.training.verdict import worse_bodies, worst_body
 
 CPU = torch.device("cpu")
 CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
@@ -133,6 +140,25 @@ def test_bodies_make_a_difference_to_all_three_networks(scene, family, model):
     assert all((one - other).abs().max() > 1e-3 for one, other in zip(*seen))
 
 
+@torch.no_grad()
+def test_nothing_plays_a_family_that_was_put_on_no_body(model, members, family, tmp_path, toy_motion, scene):
+    path, motion = tmp_path / "family.safetensors", toy_motion(scene, 6)
+    save_model(path, model_file(model, Fabric("toy"), {}))
+    for play in (lambda: Player.load(path), lambda: network(load_model(path)), lambda: InnerModel.load(path)):
+        with pytest.raises(SsilkError, match="a model of a family of bodies"):
+            play()
+    heavier = Player.load(path, family.bodies.members[2])
+    np.testing.assert_allclose(heavier.skeleton.bind_transforms, members[2].skeleton.bind_transforms, atol=1e-6)
+    own = [Player.load(path, at).play(motion).vertices(3) for at in family.bodies.members[[0, 2]]]
+    assert np.abs(own[0] - own[1]).max() > 0.05
+    for wrong in (np.zeros(3), [np.nan, 0.0]):
+        with pytest.raises(SsilkError, match="bodies of its family have 2 finite numbers each"):
+            Player.load(path, wrong)
+    save_model(path, load_model(path).on_base())
+    with pytest.raises(SsilkError, match="a model of one body"):
+        Player.load(path, np.zeros(2))
+
+
 def test_at_the_base_the_file_is_as_one_of_that_body(model, tmp_path, scene):
     file = model_file(model, Fabric("toy"), {"seed": 1})
     save_model(tmp_path / "family.safetensors", file)
@@ -181,6 +207,58 @@ def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_
     for number in (3, 4, 3):
         DrawnBodies(bodies, [Seen()], 7, CPU).draw(number)
     assert torch.equal(seen[0], seen[2]) and not torch.equal(seen[0], seen[1])
+
+
+def test_a_run_does_not_go_on_with_another_family_of_the_same_coordinates(scene, members, toy_motion, tmp_path):
+    """Two members are always at zero and one."""
+    motion = toy_motion(scene, 12)
+
+    def identity(member):
+        family = dressed_family(scene, BodyFamily.of([members[0], member]), [member])[0]
+        return TrainJob(
+            scene=scene, motions=[motion], held_out=[motion], model=CONFIG, train=TrainConfig(), fabric=Fabric("toy"),
+            output=tmp_path / "model.safetensors", family=family,
+        ).identity()  # fmt: skip
+
+    taller, heavier = (identity(member) for member in members[1:])
+    assert taller["family"] != heavier["family"] and identity(members[1]) == taller
+    moved = shaped(members[1], lambda points: points * (1 + 1e-12), "/taller")
+    assert identity(moved)["family"] == taller["family"]
+
+
+@torch.no_grad()
+def test_validation_measures_members_as_models_of_these_alone(scene, members, family, toy_motion, tmp_path):
+    motion, base = toy_motion(scene, 40), members[0].skeleton
+    job = TrainJob(
+        scene=scene, motions=[motion], held_out=[motion], model=CONFIG, train=TrainConfig(valid_frames=20),
+        fabric=Fabric("toy"), output=tmp_path / "model.safetensors", family=family,
+    )  # fmt: skip
+    parts = build_parts(job, CPU)
+    generator = torch.Generator().manual_seed(1)
+    for value in parts.model.parameters():
+        value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    score = parts.validator.score(parts.model)
+    assert [body.name for body in score.bodies] == ["/taller", "/heavier"]
+    file = model_file(parts.model, Fabric("toy"), {})
+    for body, member, coordinates in zip(score.bodies, members[1:], family.bodies.members[1:]):
+        own = family.scene_at(scene, coordinates)
+        its = motion_on(motion, base, member.skeleton, 1 + float(family.bodies.taller @ coordinates))
+        bank = build_bank([its], own.character.skeleton, parts.model.joints, 30.0, CPU)
+        energy = GarmentEnergy(own.garment.sewn_mesh, job.fabric, own.classes, device=CPU)
+        touched = CollisionBody(member.merged_body(), 3, limbs=limb_axes(own), device=CPU)
+        rest = torch.tensor(own.garment.mesh.points, dtype=torch.float32)
+        alone = Validator(bank, energy, touched, own, rest, 30.0, 10)
+        one = alone.score(network(file.on_body(coordinates), own))
+        assert body.total == pytest.approx(one.total, rel=1e-3) and not one.bodies
+        assert body.lbs == pytest.approx(alone.lbs_score().total, rel=1e-3)
+        assert body.collisions == pytest.approx(one.collisions, abs=1e-3)
+    assert not any(module.place.any() for module in parts.model.modules() if isinstance(module, SeenBody))
+    again = Score.of(json.loads(json.dumps(asdict(score))))
+    assert again.bodies == score.bodies and parts.validator.lbs_score().bodies == ()
+    worst = worst_body(replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), BodyScore("/b", 3.0, 2.9, 0.0))))
+    assert worst.name == "/b"
+    (told,) = worse_bodies("m", replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), worst)))
+    assert "on /b the model is worse than none" in told.text
 
 
 def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(model, family, scene):

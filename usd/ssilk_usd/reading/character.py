@@ -76,6 +76,12 @@ def read_character(
     )
 
 
+def has_meshes(stage: Usd.Stage, root: str | None, names: Sequence[str]) -> bool:
+    """Return whether meshes of all these names lie beneath a character's SkelRoot; raise as `read_character` does."""
+    beneath = Usd.PrimRange(find_skeleton(stage, root=root).root, PRIMS)
+    return {prim.GetName() for prim in beneath if prim.IsA(UsdGeom.Mesh)}.issuperset(names)
+
+
 def geom_to_core(prim: Usd.Prim, skel: SkelSource) -> Floats:
     """Return the transform from a bound mesh's local space to the core's bind space [m], column vectors, (4, 4)."""
     bind = inherited(prim, GEOM_BIND)
