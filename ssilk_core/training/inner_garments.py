@@ -71,13 +71,13 @@ def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None
                 f"the outer garment plays at {fps:g}",
                 f"train it with --set fps={fps:g}",
             )
-        found = _other_character(model.file.scene.character.skeleton, scene.character.skeleton)
+        found = other_character(model.file.scene.character.skeleton, scene.character.skeleton)
         if found:
             allowed = "inner and outer garments are trained on one character"
             fail(f"--over {model.name}", found, allowed, f"train it on {scene.character.path}")
 
 
-def _other_character(own: Skeleton, skeleton: Skeleton) -> str:
+def other_character(own: Skeleton, skeleton: Skeleton) -> str:
     """Return how the skeleton of an inner model differs; empty where it does not."""
     if own.joint_names != skeleton.joint_names:
         other = next((name for name in own.joint_names if name not in skeleton.joint_names), "")
