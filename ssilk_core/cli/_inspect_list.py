@@ -15,7 +15,6 @@ from ..training.wardrobe.listing import WardrobeEntry, garment_file, read_list, 
 if TYPE_CHECKING:
     from .inspect import Inspected
 
-LIST = ".toml"
 OF_A_GARMENT = ("garment", "root", "body", "over", "family")  # options that a list has no use for
 
 
@@ -40,7 +39,7 @@ def inspect_list(
         table = tables[entry.name] = entry.located(folder)
         own = _options_of(entry, table, tables, options)
         if copy:
-            file, prim = garment_file(table)
+            prim = garment_file(table)[1]
             own.fix = copy.parent / f"{entry.name}.usdc"
             table["garment"] = f"{own.fix}:{prim}" if prim else str(own.fix)
         found[entry.name] = inspect(own, report)
@@ -68,7 +67,10 @@ def _need_folder(folder: Path, path: Path) -> Path:
 
 
 def _options_of(
-    entry: WardrobeEntry, table: Mapping[str, Any], tables: Mapping[str, Mapping[str, Any]], options: argparse.Namespace
+    entry: WardrobeEntry,
+    table: Mapping[str, Any],
+    tables: Mapping[str, Mapping[str, Any]],
+    options: argparse.Namespace,
 ) -> argparse.Namespace:
     """Return the options that inspect a garment of a list."""
     listed = table["motions"] if isinstance(table["motions"], list) else [table["motions"]]

@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from ..scene.assets import Character, Mesh, Motion, Skeleton
 
 
-MODEL = ".safetensors"
-
-
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=shared.STAGE + ", or a list of garments (.toml)")
@@ -68,9 +65,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Inspect; return 0, or 2 when there are errors."""
-    from ._inspect_list import LIST, inspect_list
+    from ._inspect_list import inspect_list
 
-    if options.stage.suffix == LIST:
+    if options.stage.suffix == shared.LIST:
         return inspect_list(options, report, _inspect)
     found = _inspect(options, report)
     if options.json:
@@ -93,7 +90,9 @@ class Inspected:
 
     def detail(self, fix: Path | None) -> dict[str, object]:
         """Return it as a result tells it; `fix` is the repaired copy, where there is one."""
-        return {"findings": self.findings} | ({"fixed": {"output": str(fix), "repaired": self.repaired}} if fix else {})
+        return {"findings": self.findings} | (
+            {"fixed": {"output": str(fix), "repaired": self.repaired}} if fix else {}
+        )
 
     def text(self, fix: Path | None) -> str:
         """Return it in words."""
@@ -144,7 +143,7 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
     found: dict[str, Mesh] = {}
     names = getattr(options, "over_names", options.over)  # a list has names for them
     for name, location in zip(names, options.over, strict=True):
-        if location.endswith(MODEL):
+        if location.endswith(shared.MODEL):
             from ..network.checkpoint import load_model
             from ..training.inner_garments import other_character
 

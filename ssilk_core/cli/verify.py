@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Check a shot, and compare it, re-skinned by UsdSkel alone, with the decoder's vertices or its cache.
 
-The shot says which model, stage and motion it was baked from. Give the present paths of those that have moved. A shot
-that was solved in latents, or refined with feedback, is only checked for being valid and complete.
+The stage of a shot in a folder of layers stands for all its garments: each is verified, and then it is counted how
+they lie over one another. A shot says which model, stage and motion it was baked from. Give the present paths of
+those that have moved. A shot that was solved in latents, or refined with feedback, is only checked for being valid
+and complete.
 """
 
 from __future__ import annotations
@@ -11,7 +13,8 @@ import argparse
 from pathlib import Path
 
 from ..delivery import bake
-from ..errors import EXIT_OK
+from ..delivery.bake.shots import is_stage
+from ..errors import EXIT_OK, fail
 from ..events import Reporter
 
 
@@ -25,6 +28,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Verify; raise `VerificationError` (exit code 3) when the file is not what was computed."""
+    if is_stage(options.shot):
+        for name in ("model", "stage", "motion", "cache"):
+            if getattr(options, name):
+                found, allowed = "a shot of several garments", "each names inputs of its own"
+                fail(f"--{name}", found, allowed, "verify its anim.usdc alone with it")
+        bake.verify_shot(options.shot, device=options.device, report=report)
+        return EXIT_OK
     bake.verify(
         options.shot,
         model=options.model,

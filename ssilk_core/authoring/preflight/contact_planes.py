@@ -94,9 +94,7 @@ class ContactPlanes:
         return HeldSamples(samples, normals, np.einsum("sc,sc->s", normals, points))
 
 
-def covering_planes(
-    surface: Surface, points: Floats, faces: Ints, facing: Facing, distance: float
-) -> HeldSamples:
+def covering_planes(surface: Surface, points: Floats, faces: Ints, facing: Facing, distance: float) -> HeldSamples:
     """Return the points of cloth over vertices of the body that it covers, with the planes through these.
 
     Args:

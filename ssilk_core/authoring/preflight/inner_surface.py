@@ -53,9 +53,7 @@ class LayeredSurface:
         """Return the points of the surface that points (S, 3) are deepest in or nearest to."""
         return self._deepest(self.skin.nearest(points), points)
 
-    def belonging(
-        self, points: Floats, inside: Mask, facing: Floats, doubtful: Mask, crossed: Mask
-    ) -> SurfaceSide:
+    def belonging(self, points: Floats, inside: Mask, facing: Floats, doubtful: Mask, crossed: Mask) -> SurfaceSide:
         """Return likewise those that cloth belongs to, from what `OuterSurface.belonging` takes."""
         in_body = np.zeros(len(points), dtype=bool)
         in_body[inside] = self.skin.inside(points[inside])

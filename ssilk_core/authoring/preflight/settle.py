@@ -14,9 +14,9 @@ from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh.topology import SAME_PLACE, components, edges, vertex_mask
 from .cloth_samples import ClothSamples, sample_cloth
 from .contact_planes import ContactPlanes, HeldSamples, covering_planes
+from .inner_surface import LayeredSurface
 from .mesh import distinct_faces
 from .shape_energy import ShapeEnergy
-from .inner_surface import LayeredSurface
 from .sides import Facing, OuterSurface, Surface, find_facing
 
 if TYPE_CHECKING:

@@ -41,7 +41,7 @@ def layers(mesh: Mesh, character: Character, inner: Mapping[str, Mesh]) -> Findi
         if not each.count:
             continue
         left = len(np.unique(intersections_between(after, mesh.faces, inner[name].points, inner[name].faces)[:, 0]))
-        clean = settled.moved and not left and not len(settled.after.vertices)
+        clean = bool(settled.moved) and not left and not len(settled.after.vertices)
         where = format_joints(character.skeleton, joints_at(each.corners, mesh, character), MOST_REGIONS)
         yield Finding(
             severity="warning",
@@ -51,8 +51,9 @@ def layers(mesh: Mesh, character: Character, inner: Mapping[str, Mesh]) -> Findi
             found=f"{len(each.faces)} of {len(mesh.faces)} triangles intersect those of {name}, and "
             f"{len(each.beneath)} vertices lie beneath it, up to {1000 * each.depth:.1f} mm deep, at {where}",
             why="garments that start inside each other stay so where they are pinned or tight, in every frame",
-            fix=f"move the outer garment off the inner one in the bind pose; --fix {_does(settled.moved, clean, left)}",
-            fixable=bool(clean),
+            fix="move the outer garment off the inner one in the bind pose; --fix "
+            + _does(settled.moved, clean, left),
+            fixable=clean,
             elements="faces",
             indices=index_tuple(each.faces),
         )

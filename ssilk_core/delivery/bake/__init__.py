@@ -10,6 +10,7 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 """
 
 from .bodies import WornModel, worn
+from .layered import verify_shot
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .request import BakeRequest
@@ -26,5 +27,5 @@ __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
     "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "cache_origin",
     "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
-    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "with_model", "worn",
+    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "verify_shot", "with_model", "worn",
 ]  # fmt: skip

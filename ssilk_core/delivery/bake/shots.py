@@ -14,6 +14,8 @@ from ...events import Message, Reporter, silent
 from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
 
+STAGE = "shot.usda"  # of a shot, with all its garments
+
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
 
@@ -98,6 +100,17 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
         )
 
     return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
+
+
+def is_stage(path: Path) -> bool:
+    """Return whether a file is the stage of a shot in a folder of layers."""
+    return path.name == STAGE and path.is_file() and any(finished(*place_of(path)))
+
+
+def place_of(stage: Path) -> tuple[Path, str]:
+    """Return the folder of layers that the stage of a shot lies in, and the name of the shot."""
+    home = stage.absolute().parent
+    return home.parent.parent, home.name
 
 
 def finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:

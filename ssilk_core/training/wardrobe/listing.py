@@ -36,7 +36,6 @@ class WardrobeEntry:
     over: tuple[str, ...] = ()
     table: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
-
     def located(self, folder: Path) -> dict[str, Any]:
         """Return the table with its paths as seen from here; `folder` is that of the list."""
         return {key: _relocated(key, value, lambda path: str(folder / path)) for key, value in self.table.items()}
