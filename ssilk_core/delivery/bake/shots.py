@@ -74,7 +74,7 @@ def write_shot_stage(
         todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
         report(Message(f"{folder / 'shots' / shot}: {text}; {todo}", "warning"))
     for name, other in written.bodies.items():
-        if (record := found[name]) and record.result.hidden_faces is not None:
+        if name in written.uncovered:
             text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
             report(Message(text, "warning"))
 
