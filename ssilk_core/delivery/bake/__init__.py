@@ -10,9 +10,9 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 """
 
 from .bodies import WornModel, worn
-from .layered import verify_shot
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
+from .outfit import bake_outfit, holds_several, verify_garments
 from .request import BakeRequest
 from .result import BakeResult, FrameSpan, LatentSummary, RefinementSummary, Verification
 from .riders import riders_of
@@ -25,7 +25,8 @@ from .write import bake
 
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
-    "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "cache_origin",
-    "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of", "rig_deformer", "shot_bytes",
-    "skin_trajectories", "stored_bytes", "trained_deformer", "verify", "verify_shot", "with_model", "worn",
+    "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "bake_outfit",
+    "cache_origin", "holds_several", "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of",
+    "rig_deformer", "shot_bytes", "skin_trajectories", "stored_bytes", "trained_deformer", "verify",
+    "verify_garments", "with_model", "worn",
 ]  # fmt: skip

@@ -8,14 +8,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ...events import Message, Reporter, Result, silent
+from ...events import Message, Reporter, Result
 from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
 from ...scene.assets import Floats
 from .record import TaskRecord
-from .result import Verification
-from .shots import finished, place_of
-from .verification import verify
+from .shots import finished
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot
@@ -67,29 +65,6 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
         named = {"shot": shot, "garment": each.outer, "over": each.inner}
         report(Result(verb, {**named, **each.summary("time code")}))
     return touching
-
-
-def verify_shot(
-    stage: Path, *, device: str | None = None, report: Reporter = silent
-) -> tuple[dict[str, Verification], list[LayerFigures]]:
-    """Verify each garment of a shot in a folder of layers, and count how they lie over one another.
-
-    Args:
-        stage: of the shot, as `bake_layers` wrote it.
-        device: where networks run; None for where they ran for the bake.
-
-    Returns:
-        What `verify` says of each garment, by name, and what `tell_layers` says of all.
-
-    Raises:
-        SsilkError, VerificationError: as `verify` does.
-    """
-    from ssilk_usd.shots.layers import Layout
-
-    folder, shot = place_of(stage)
-    layers = {name: Layout(folder, name, shot).animation for name in finished(folder, shot)}
-    proven = {name: verify(path, device=device, report=report) for name, path in layers.items()}
-    return proven, tell_layers(folder, shot, report, "verify")
 
 
 def _whole(found: Mapping[str, TaskRecord | None]) -> dict[str, TaskRecord]:

@@ -44,7 +44,9 @@ def hide_together(shot: Usd.Stage, garment: Usd.Prim, covered: Sequence[Masks]) 
     prims = [garment.GetChild(name) for name in names]
     meshes = [read_mesh(prim, np.eye(4)) for prim in prims if prim.IsA(UsdGeom.Mesh)]
     counts = {name: len(np.asarray(mesh.polygon_counts)) for name, mesh in zip(names, meshes)}
-    if len(counts) < len(names) or any(len(mask) != counts[name] for masks in covered for name, mask in masks.items()):
+    if len(counts) < len(names) or any(
+        len(mask) != counts[name] for masks in covered for name, mask in masks.items()
+    ):
         garment.GetVariantSet(BODY).SetVariantSelection(COVERED_HIDDEN)
         return False
     together = [np.any([masks[name] for masks in covered if name in masks], axis=0) for name in names]
