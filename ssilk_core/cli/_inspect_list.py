@@ -6,14 +6,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..errors import fail
 from ..events import Reporter, Result
 from ..training.wardrobe.listing import WardrobeEntry, garment_file, read_list, write_list
-
-if TYPE_CHECKING:
-    from .inspect import Inspected
+from ._inspected import Inspected
 
 OF_A_GARMENT = ("garment", "root", "body", "over", "family")  # options that a list has no use for
 

@@ -39,7 +39,7 @@ class InnerModel:
     """A trained garment to be worn beneath the one that is trained.
 
     Attributes:
-        name: of its file, without the suffix.
+        name: of its file, without the suffix; of its folder where another model of the training has that one.
         sha256: of its file.
     """
 
@@ -48,11 +48,18 @@ class InnerModel:
     file: ModelFile
 
     @classmethod
-    def load(cls, path: Path) -> InnerModel:
-        """Read one from a file; raise `SsilkError` as `load_model` does."""
+    def load_all(cls, paths: Sequence[Path], output: Path) -> list[InnerModel]:
+        """Read those of a training that writes a model to `output`; raise `SsilkError` as `load_model` does."""
+        stems = [path.stem for path in (*paths, output)]
+        alike = [stems.count(path.stem) > 1 for path in paths]
+        return [cls.load(path, path.absolute().parent.name if shared else None) for path, shared in zip(paths, alike)]
+
+    @classmethod
+    def load(cls, path: Path, name: str | None = None) -> InnerModel:
+        """Read one from a file, by that name or by its own; raise `SsilkError` as `load_model` does."""
         from ..files import sha256
 
-        return cls(path.stem, sha256(path) if path.is_file() else "", load_model(path))
+        return cls(name or path.stem, sha256(path) if path.is_file() else "", load_model(path))
 
 
 def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None:

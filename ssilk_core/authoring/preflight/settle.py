@@ -17,7 +17,7 @@ from .contact_planes import ContactPlanes, HeldSamples, covering_planes
 from .inner_surface import LayeredSurface
 from .mesh import distinct_faces
 from .shape_energy import ShapeEnergy
-from .sides import Facing, OuterSurface, Surface, find_facing
+from .sides import ClothObstacle, Facing, OuterSurface, find_facing
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -129,7 +129,7 @@ class _Cloth:
         self.joined = joined.reshape(-1)
         self.points = mesh.points[first]
         self.faces = distinct_faces(self.joined[mesh.faces])
-        self.surface: Surface = LayeredSurface(body, inner) if inner else OuterSurface(body)
+        self.surface: ClothObstacle = LayeredSurface(body, inner) if inner else OuterSurface(body)
         self.samples = sample_cloth(self.points, self.faces)
 
     def inside_now(self) -> PartInside:

@@ -64,7 +64,7 @@ class Facing:
     crossed: Mask
 
 
-class Surface(Protocol):
+class ClothObstacle(Protocol):
     """What cloth is settled off: a body's `OuterSurface`, or that with garments on it (`LayeredSurface`)."""
 
     mesh: Mesh
@@ -131,7 +131,7 @@ class OuterSurface:
         return replace(side, inside=inside)
 
 
-def find_facing(points: Floats, faces: Ints, surface: Surface) -> Facing:
+def find_facing(points: Floats, faces: Ints, surface: ClothObstacle) -> Facing:
     """Find out where cloth should face.
 
     Vertices outside the body tell whether the cloth is wound with the surface beneath it or against it, as the inner

@@ -129,13 +129,14 @@ class _Joined:
         for node, new in moved.items():
             if "mesh" in document["nodes"][node]:
                 item = glb["nodes"][new]
-                item["mesh"] = self._mesh(document["meshes"][document["nodes"][node]["mesh"]], name, material)
+                mesh = {**document["meshes"][document["nodes"][node]["mesh"]], "name": item["name"]}
+                item["mesh"] = self._mesh(mesh, name, material)
                 item["skin"] = number
         self._animate(document["animations"][0], moved, everything=not glb["animations"][0]["channels"])
         glb["asset"]["extras"]["ssilk"].setdefault(GARMENTS, {})[name] = document["asset"]["extras"].get("ssilk", {})
 
-    def _mesh(self, mesh: Mapping[str, Any], garment: str, material: int) -> int:
-        item = copy.deepcopy(dict(mesh))
+    def _mesh(self, mesh: dict[str, Any], garment: str, material: int) -> int:
+        item = copy.deepcopy(mesh)
         if item["extras"]["kind"] in (GARMENT, RIDER):
             item["extras"][GARMENT] = garment
         for primitive in item["primitives"]:
