@@ -355,9 +355,10 @@ def train_command(
     motions = [*(f"{MOTIONS}/{name}" for name in takes), *files]
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
     budget += ["--minutes", f"{settings.minutes:g}"] if settings.minutes else []
+    beneath_it = [word for model in over for word in ("--over", model)]
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
-        *(word for model in over for word in ("--over", model)), "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
+        *beneath_it, "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
     ]  # fmt: skip
 
 

@@ -80,7 +80,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
         override=SHOTS,
     )
     layer: IntProperty(
-        description="Place among the garments of the character, from the skin on; zero where nobody has put it in order",
+        description="Place among the garments of the character, from the skin on; zero where it is in no order",
         default=0, min=0, options={"HIDDEN"}, override=SHOTS,
     )  # fmt: skip
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")

@@ -168,8 +168,9 @@ WORDS = {
         "Beheben, was gefunden wurde, wo nichts zu entscheiden ist; danach neu prüfen"
     ),
     "Push Out": "Herausdrücken",
-    "Settle the garment out of the body with little change of shape, with all shape keys": (
-        "Das Kleidungsstück mit wenig Formänderung aus dem Körper drücken, mit allen Formschlüsseln"
+    "Settle the garment out of the body and off garments beneath, with little change of shape, and all shape keys": (
+        "Das Kleidungsstück mit wenig Formänderung aus dem Körper und von Kleidungsstücken darunter drücken, mit "
+        "allen Formschlüsseln"
     ),
     # Classes
     "Class": "Klasse",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -132,3 +133,61 @@ def test_a_job_says_what_it_is_trained_over(tmp_path):
     jobs._write(tmp_path / jobs.ORDER, {"command": ["train", "--over", "../inner/model.safetensors", "--json"]})
     assert jobs.models_beneath(tmp_path) == [Path(os.path.normpath(tmp_path / "../inner/model.safetensors"))]
     assert jobs.models_beneath(tmp_path / "nowhere") == []
+
+
+def test_what_starts_inside_the_garment_beneath_is_found_and_pushed_out(ready, skirt, coat, tmp_path, ssilk_python):
+    """The coat is narrower than the skirt on one side; nothing is wrong with it alone."""
+    bpy = ready
+    for garment in (skirt, coat):
+        activate(bpy, garment)
+        assert bpy.ops.ssilk.classify() == {"FINISHED"}
+    for vertex in coat.data.vertices:
+        if vertex.co.x > 0:
+            vertex.co.x, vertex.co.y = 0.84 * vertex.co.x, 0.84 * vertex.co.y
+    bpy.ops.ssilk.generate_rig(proxies=6)
+    assert bpy.ops.ssilk.inspect() == {"FINISHED"}
+    preflight = bpy.context.window_manager.ssilk_preflight
+
+    def found() -> list[int]:
+        return [number for number, item in enumerate(preflight.findings) if item.code == "garments-cross"]
+
+    assert not found()  # nobody has said which of them is beneath
+    bpy.ops.ssilk.move_layer(garment="Skirt", where="INNER")
+    assert bpy.ops.ssilk.inspect() == {"FINISHED"}
+    (preflight.active,) = found()
+    item = preflight.findings[preflight.active]
+    assert "triangles intersect those of 'Skirt'" in item.found and item.elements == "polygons"
+    assert crossing(ssilk_python, tmp_path, coat, skirt) > 0
+    before = points_of(coat)
+    assert bpy.ops.ssilk.push_out() == {"FINISHED"}
+    assert crossing(ssilk_python, tmp_path, coat, skirt) == 0
+    assert 0 < np.linalg.norm(points_of(coat) - before, axis=1).max() < 0.1
+    assert bpy.ops.ssilk.inspect() == {"FINISHED"} and not found()
+
+
+def points_of(thing) -> np.ndarray:
+    points = np.empty(len(thing.data.vertices) * 3, dtype=np.float32)
+    thing.data.vertices.foreach_get("co", points)
+    return points.reshape(-1, 3).astype(float)
+
+
+def triangles_of(thing) -> np.ndarray:
+    thing.data.calc_loop_triangles()
+    return np.array([triangle.vertices[:] for triangle in thing.data.loop_triangles])
+
+
+CROSSING = """
+import sys
+import numpy as np
+from ssilk_core.physics.intersections.pairs import intersections_between
+both = np.load(sys.argv[1])
+print(len(np.unique(intersections_between(*(both[name] for name in ("x", "f", "y", "g")))[:, 0])))
+"""
+
+
+def crossing(python: str, folder: Path, outer, inner) -> int:
+    """Triangles of a mesh that intersect another one's, by libigl on what Blender has; both objects stand at 0."""
+    whole = {"x": points_of(outer), "f": triangles_of(outer), "y": points_of(inner), "g": triangles_of(inner)}
+    np.savez(folder / "both.npz", **whole)
+    told = subprocess.run([python, "-c", CROSSING, str(folder / "both.npz")], check=True, capture_output=True)
+    return int(told.stdout)
