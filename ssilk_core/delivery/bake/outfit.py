@@ -18,6 +18,7 @@ from ...files import replacing
 from ...network.checkpoint import ModelFile, load_model
 from ...physics.intersections.figures import EVERY, LAYERS, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
+from ...scene.assets import Mesh
 from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
@@ -75,7 +76,8 @@ def bake_outfit(
         with replacing(output) as unverified:
             join_glbs(parts, unverified)
             _need_unchanged(parts, unverified, folder, output)
-            layers = _layers(dict(zip(names, (load_model(each.model) for each in requests))), parts, report)
+            models = dict(zip(names, (load_model(each.model) for each in requests)))
+            layers = _layers(models, parts, _body_of(requests[0]), report)
             add_provenance(unverified, {LAYERS: [each.to_metadata() for each in layers]} if layers else {})
     for each in layers:
         report(Result("bake", {"garment": each.outer, "over": each.inner, **each.summary("time code")}))
@@ -162,7 +164,16 @@ def _need_unchanged(parts: Mapping[str, Path], joined: Path, folder: Path, outpu
                 )
 
 
-def _layers(models: Mapping[str, ModelFile], parts: Mapping[str, Path], report: Reporter) -> list[LayerFigures]:
+def _body_of(request: BakeRequest) -> Mesh:
+    """Return the body of a request's character in the bind pose, which tells the outside of cloth."""
+    from ssilk_usd.reading.character import read_character
+
+    return read_character(request.stage, root=request.root).merged_body().mesh
+
+
+def _layers(
+    models: Mapping[str, ModelFile], parts: Mapping[str, Path], body: Mesh, report: Reporter
+) -> list[LayerFigures]:
     """Count how the garments lie over one another, in every `EVERY`-th frame, as their files have them."""
     if not can_find():
         report(Message(f"cloth through other garments is {NOT_COUNTED}", "warning"))
@@ -172,7 +183,6 @@ def _layers(models: Mapping[str, ModelFile], parts: Mapping[str, Path], report: 
     found = []
     shots = {name: GlbShot(path) for name, path in parts.items()}
     for one, other in combinations(models, 2):
-        body = models[one].scene.character.merged_body().mesh if models[one].scene.character.bodies else None
         meshes = {name: models[name].scene.garment.mesh for name in (one, other)}
         order = [pair for pair in ((one, other), (other, one)) if _is_over(models[pair[0]], shots[pair[1]])]
         layers = (
