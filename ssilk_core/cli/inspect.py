@@ -45,6 +45,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="a garment that is worn beneath this one (repeatable): a file of its own, a mesh of the stage, or a "
              "trained model",
     )  # fmt: skip
+    verb.set_defaults(over_names=None)  # what findings call them, where a list has names
     verb.add_argument(
         "--motion", type=Path, nargs="+", default=[], metavar="PATH", help="motion files or folders to check too"
     )
@@ -116,8 +117,7 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
     from ssilk_usd.reading.scene import read_scene
 
     found: dict[str, Mesh] = {}
-    names = getattr(options, "over_names", options.over)  # a list has names for them
-    for name, location in zip(names, options.over, strict=True):
+    for name, location in zip(options.over_names or options.over, options.over, strict=True):
         if location.endswith(shared.MODEL):
             from ..network.checkpoint import load_model
             from ..training.inner_garments import other_character

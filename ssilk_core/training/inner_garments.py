@@ -193,7 +193,8 @@ class InnerGarments:
         found = int((cloth.distance(x, y)[: scene.garment.mesh.vertex_count] < 0).sum())
         if found:
             count = f"{found} of its {scene.garment.mesh.vertex_count} vertices lie beneath '{name}' in the bind pose"
-            report(Message(f"{scene.garment.mesh.path}: {count}; training pushes out those that move", "warning"))
+            todo = "training pushes out those that move; 'ssilk inspect --over' settles all of them off it before"
+            report(Message(f"{scene.garment.mesh.path}: {count}; {todo}", "warning"))
 
     def attach(self, sampler: WindowSampler) -> None:
         """Let a sampler keep the states of the inner garments from window to window."""

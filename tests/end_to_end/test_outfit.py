@@ -134,6 +134,13 @@ def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
     assert main(shlex.split("wardrobe apart/outfit.toml -o models --device cpu --json")) in (0, 5)
     over = load_model("models/coat.safetensors").provenance["over"]
     assert over == {"skirt": sha256(Path("models/skirt.safetensors"))}
+    other = Path("apart/outfit.toml").read_text().replace("[coat]", "[cloak]")
+    Path("apart/night.toml").write_text(other)  # another outfit over the same skirt
+    capsys.readouterr()
+    assert main(shlex.split("wardrobe apart/night.toml -o models --device cpu --json")) in (0, 5)
+    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    skipped = [each["name"] for each in said if "finished before; skipped" in each.get("said", {}).get("text", "")]
+    assert skipped == ["skirt"] and load_model("models/cloak.safetensors").provenance["over"] == over
     layers = baked(capsys, "models/outfit.toml", "layers")
     assert baked_garments("layers") == {"coat", "skirt"}
     figures = [event["detail"] for event in layers if event["event"] == "result" and "over" in event["detail"]]
