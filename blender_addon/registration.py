@@ -16,6 +16,7 @@ from .operators import (
     help,
     make_it_move,
     match_bones,
+    outfit,
     playback,
     preflight,
     quality,
@@ -53,6 +54,7 @@ CLASSES = (
     *gltf_export.CLASSES,
     *playback.CLASSES,
     *quality.CLASSES,
+    *outfit.CLASSES,
     *panels.CLASSES,
 )
 
@@ -74,6 +76,7 @@ def register() -> None:
 def unregister() -> None:
     """Stop what runs outside, then remove properties and classes in reverse."""
     tasks.stop()
+    outfit.stop()
     make_it_move.stop()
     overlay.hide()
     quality.remove_key()

@@ -20,8 +20,8 @@ from ssilk_core.events import format_count
 from ssilk_core.scene.assets import Mesh
 
 HOLES = "body-not-watertight"
-PUSHED = "penetration"  # the finding that Push Out mends; all others are mended by Fix
-SETTLED = (PUSHED, "pierced")  # those that speak of what settling does
+PUSHED, CROSSING = "penetration", "garments-cross"  # what Push Out mends; all others are mended by Fix
+SETTLED = (PUSHED, "pierced", CROSSING)  # those that speak of what settling does
 OPTION = "--fix"  # which does so in a console
 
 

@@ -37,12 +37,14 @@ class Course:
     Attributes:
         begun: names of the operators that were called.
         before: the folder of the training that it had at first.
+        improves: whether its training goes on after the preset, until it is cancelled.
         told: which motions were taken, in words; empty where all were.
     """
 
     uid: int
     name: str
     before: Path | None
+    improves: bool = True
     begun: list[str] = field(default_factory=list)
     told: str = ""
 
@@ -71,19 +73,27 @@ class MakeItMove(RefusingOperator, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Begin; without a window do all that can be waited for."""
-        global course
-        garment = context.object
-        tasks.failed = ""
-        course = Course(garment.session_uid, garment.name, job_of(garment))
-        if not bpy.app.background:
-            bpy.app.timers.register(go_on, first_interval=0.0)
-            return {"FINISHED"}
-        while go_on() is not None:
-            pass
-        if tasks.failed:
+        begin(context.object, improves=True)
+        if bpy.app.background and tasks.failed:
             self.report({"ERROR"}, tasks.failed)
             return {"CANCELLED"}
         return {"FINISHED"}
+
+
+def begin(garment: bpy.types.Object, *, improves: bool = False) -> None:
+    """Begin with a garment; without a window do all that can be waited for.
+
+    Args:
+        improves: whether a training without a budget goes on until it is cancelled; others would wait for it.
+    """
+    global course
+    tasks.failed = ""
+    course = Course(garment.session_uid, garment.name, job_of(garment), improves)
+    if not bpy.app.background:
+        bpy.app.timers.register(go_on, first_interval=0.0)
+        return
+    while go_on() is not None:
+        pass
 
 
 class StopCourse(ReportingOperator, bpy.types.Operator):
@@ -168,7 +178,7 @@ def _call(name: str, garment: bpy.types.Object) -> None:
             _prepare_training(garment)
         operator = getattr(bpy.ops.ssilk, name.removeprefix("ssilk."))
         try:
-            operator("EXEC_DEFAULT", True, **({"improves": not has_budget(garment)} if name == TRAIN else {}))
+            operator("EXEC_DEFAULT", True, **({"improves": _improves(garment)} if name == TRAIN else {}))
         except RuntimeError as error:  # Blender's own way to say what the operator reported, or that it refuses
             raise SetupError(str(error).strip().removeprefix("Error: ").split("\n")[0]) from error
 
@@ -195,6 +205,10 @@ def take_enough(garment: bpy.types.Object) -> str:
 def has_budget(garment: bpy.types.Object) -> bool:
     """Return whether the artist has said how long a garment is trained; without that it goes on and gets better."""
     return bool(garment.ssilk.training.iterations or garment.ssilk.training.minutes)
+
+
+def _improves(garment: bpy.types.Object) -> bool:
+    return bool(course and course.improves) and not has_budget(garment)
 
 
 def _prepare_training(garment: bpy.types.Object) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ssilk_core.events import format_count
 
-from ..arrays.findings import PUSHED, Clip, read_findings
+from ..arrays.findings import CROSSING, PUSHED, Clip, read_findings
 from ..errors import SetupError
 from ..motions.sampling import ChosenMotions
 from ..motions.shapes import tell_changing_shapes
@@ -23,32 +23,39 @@ from ..preferences import interpreter, preferences, unready
 from ..quality.checks import SCALE, body_findings, look_again, scene_findings
 from ..quality.repairs import REPAIRS, apply_scale, move_points, repair_mesh
 from ..scene.armature import read_joints
-from ..scene.garment import armature_of, unusable
-from ..scene.gather import gather
-from ..scene.handover import MOTIONS, REPAIRED, hand_over, inspect_command, loading_usd
+from ..scene.garment import armature_of, beneath, unusable
+from ..scene.gather import GatheredScene, gather
+from ..scene.handover import MOTIONS, REPAIRED, STAGE, hand_over, inspect_command, loading_usd
 from ..scene.objects import Pair, select_bones, select_elements
 from ..settings.preflight import FindingItem, keep_findings, shown_finding, size_of
 from . import tasks
 from .reporting import ReportingOperator
 from .rig import RigOperator
 
+INNER = "inner-{}"  # folders of garments beneath, among what is handed over
 MOVED, LEFT = "moved ", "left "  # begin what `ssilk inspect --fix` says of settled cloth, and of what stays inside
 
 
 class InspectOperator(RigOperator):
-    """Base of operators that hand the garment to `ssilk inspect`; subclasses give `words`.
+    """Base of operators that hand the garment to `ssilk inspect`, with those beneath it; subclasses give `words`.
 
     Attributes:
+        inner: the garments beneath, at rest.
         doing: what is done with the garment.
         motions: in which its bodies are looked at; the timeline without any.
     """
 
     doing = ""
     motions: Sequence[Source] = ()
+    inner: Sequence[tuple[Pair, GatheredScene]] = ()
 
     def prepare(self, context: bpy.types.Context) -> Work:
         garment = context.object
-        self.pair, self.scene = Pair.of(garment, armature_of(garment)), gather(garment)
+        armature = armature_of(garment)
+        self.pair, self.scene = Pair.of(garment, armature), gather(garment)
+        self.inner = [
+            (Pair.of(each, armature), gather(each, classes=False, proxies=False)) for each in beneath(garment)
+        ]
         tell_changing_shapes(self, garment, self.motions)
         self.python = interpreter(preferences(context))
         return Work(
@@ -63,7 +70,20 @@ class InspectOperator(RigOperator):
     def commands(self, folder: Path) -> list[list[str]]:
         """Write what is inspected; return the command."""
         self.handover = hand_over(self.scene, self.pair, folder)
-        return [inspect_command(self.python, folder, self.handover, self.words(folder))]
+        over: list[str] = []
+        for number, (pair, scene) in enumerate(self.inner):  # as they are at rest, which is where they were trained
+            place = folder / INNER.format(number)
+            place.mkdir()
+            given = hand_over(scene, pair, place)
+            over += ["--over", f"{given.stage}:{given.prim}"]
+        return [inspect_command(self.python, folder, self.handover, [*over, *self.words(folder)])]
+
+    def rephrase(self, sentence: str) -> str:
+        """Return a sentence with names of objects in place of files and prims, those of garments beneath too."""
+        for number, (pair, scene) in enumerate(self.inner if self.handover else ()):
+            given = f"{INNER.format(number)}/{STAGE}:{scene.garment.mesh.path}"
+            sentence = reworded(sentence, self.work.folder, {given: f"'{pair.name}'"})
+        return super().rephrase(sentence)
 
     def words(self, folder: Path) -> list[str]:
         """Return further arguments of `ssilk inspect`."""
@@ -177,7 +197,7 @@ class FixFinding(ReportingOperator, bpy.types.Operator):
 
 
 class PushOut(InspectOperator, bpy.types.Operator):
-    """Settle the garment out of the body with little change of shape, with all shape keys"""
+    """Settle the garment out of the body and off garments beneath, with little change of shape, and all shape keys"""
 
     bl_idname = "ssilk.push_out"
     bl_label = "Push Out"
@@ -219,7 +239,7 @@ class PushOut(InspectOperator, bpy.types.Operator):
 
 def fixer(item: FindingItem) -> str:
     """Return the operator that repairs a finding; empty where none does."""
-    if item.code == PUSHED:
+    if item.code in (PUSHED, CROSSING):
         return PushOut.bl_idname
     safe = item.fixable or item.code == "body-inside-out"
     return FixFinding.bl_idname if safe and (item.code in REPAIRS or item.code == SCALE) else ""

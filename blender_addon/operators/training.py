@@ -11,6 +11,9 @@ from pathlib import Path
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, EnumProperty, IntProperty, StringProperty
 
+from ssilk_core.errors import SsilkError
+from ssilk_core.files import sha256
+from ssilk_core.network.checkpoint import load_model
 from ssilk_core.scene.assets import LOOSE
 
 from ..arrays.joints import identifiers
@@ -27,7 +30,7 @@ from ..playback.models import job_of, orphans, progress_of, relative, trainings,
 from ..preferences import interpreter, on_processor, preferences, unready
 from ..quality.checks import look_again
 from ..scene.armature import leader_of
-from ..scene.garment import armature_of, unusable, unusable_here
+from ..scene.garment import armature_of, beneath, unusable, unusable_here
 from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.objects import Pair
@@ -188,18 +191,21 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         (garment, _), name = self.pair.objects(), self.pair.name
         folder = jobs.create(trainings_folder(), identifiers([name])[0])
+        inner = {each.name: job_of(each) for each in beneath(garment) if is_coming(each)}
         given = hand_over(self.scene, self.pair, folder)
         remember(folder, {**given.words, **self.chosen.words, jobs.MODEL: f"the model of '{name}'"})
         remember(folder, given.scene.joints.bones, BONES)
         shutil.move(work.folder / MOTIONS, folder / MOTIONS)
         files = [beside(path, folder) for path in self.chosen.files]
-        command = train_command(garment, given.prim, self.chosen.names, files)
+        over = [f"{beside(job, folder)}/{jobs.MODEL}" for job in inner.values() if job]
+        command = train_command(garment, given.prim, self.chosen.names, files, over)
         jobs.own(folder, garment.name, Path(bpy.data.filepath).name)
         jobs.begin(interpreter(preferences(context)), folder, command, improves=self.improves)
         begun.add(folder)
         models.forget()
         garment.ssilk.training.folder = relative(folder)
-        return f"The training of '{name}' began; it lies in {folder}."
+        lies = f", over {' and '.join(repr(each) for each in inner)}" if inner else ""
+        return f"The training of '{name}'{lies} began; it lies in {folder}."
 
 
 class JobOperator(ReportingOperator):
@@ -308,15 +314,51 @@ def need_trainable(garment: bpy.types.Object, armature: bpy.types.Object, scene:
     need_bakeable(garment, armature, scene.joints)
 
 
-def train_command(garment: bpy.types.Object, prim: str, takes: Sequence[str], files: Sequence[str]) -> list[str]:
-    """Return the arguments of the Python that has ssilk, for its folder of the job."""
+def is_coming(garment: bpy.types.Object) -> bool:
+    """Return whether a garment has a model of its own training, or one that is under way."""
+    folder = job_of(garment)
+    state = jobs.read_state(folder) if folder else None
+    return bool(folder and ((folder / jobs.MODEL).is_file() or (state and state.alive)))
+
+
+def needs_training(garment: bpy.types.Object) -> bool:
+    """Return whether a garment has no model, and none under way, that was trained over those beneath it.
+
+    A model that the artist has chosen is left as it is.
+    """
+    if garment.ssilk.model:
+        return False
+    folder = job_of(garment)
+    state = jobs.read_state(folder) if folder else None
+    if not folder or not is_coming(garment):
+        return True
+    inner = [job_of(each) for each in beneath(garment)]
+    if state and state.alive:  # it began with what was there, or was coming
+        return jobs.models_beneath(folder) != [job / jobs.MODEL for job in inner if job]
+    try:
+        over = sorted((load_model(folder / jobs.MODEL).provenance.get("over") or {}).values())
+    except SsilkError:
+        return True
+    reached = [sha256(job / jobs.MODEL) for job in inner if job and (job / jobs.MODEL).is_file()]
+    return jobs.models_beneath(folder) != [job / jobs.MODEL for job in inner if job] or not set(over) <= set(reached)
+
+
+def train_command(
+    garment: bpy.types.Object, prim: str, takes: Sequence[str], files: Sequence[str], over: Sequence[str] = ()
+) -> list[str]:
+    """Return the arguments of the Python that has ssilk, for its folder of the job.
+
+    Args:
+        over: models of the garments beneath.
+    """
     settings = garment.ssilk.training
     motions = [*(f"{MOTIONS}/{name}" for name in takes), *files]
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
     budget += ["--minutes", f"{settings.minutes:g}"] if settings.minutes else []
+    beneath_it = [word for model in over for word in ("--over", model)]
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
-        "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
+        *beneath_it, "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
     ]  # fmt: skip
 
 

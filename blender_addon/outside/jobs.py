@@ -150,6 +150,13 @@ def begin(python: str, folder: Path, command: Sequence[str], *, improves: bool =
     _launch(python, folder)
 
 
+def models_beneath(folder: Path) -> list[Path]:
+    """Return the models that a job's garment is trained over, as it was begun."""
+    command = _read(folder / ORDER).get("command", [])
+    given = [command[at + 1] for at, word in enumerate(command[:-1]) if word == "--over"]
+    return [Path(os.path.normpath(folder / path)) for path in given]
+
+
 def resume(python: str, folder: Path) -> None:
     """Let a job go on where it ended; it begins again where that was before it had written anything.
 

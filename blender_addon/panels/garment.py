@@ -6,7 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
-from ..operators import make_it_move, tasks
+from ..operators import make_it_move, outfit, tasks
 from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
@@ -16,17 +16,30 @@ from .training import draw_bar
 
 
 def draw_garments(layout: bpy.types.UILayout, shown: bpy.types.Object) -> None:
-    """Draw the garments of the character, where there are several, to go from one to another."""
+    """Draw the garments of the character, where there are several: their order, and what is done with all of them."""
     try:
         garments = garments_of(armature_of(shown))
     except SetupError:
         return  # other panels say what is wrong
     if len(garments) < 2:
         return
+    draw_text(layout, "Worn from the skin outwards:")
     column = layout.column(align=True)
     for garment in garments:
-        chosen = column.operator("ssilk.choose_garment", text=garment.name, icon="MATCLOTH", depress=garment == shown)
+        row = column.row(align=True)
+        chosen = row.operator("ssilk.choose_garment", text=garment.name, icon="MATCLOTH", depress=garment == shown)
         chosen.garment = garment.name
+        for where, icon in (("INNER", "TRIA_UP"), ("OUTER", "TRIA_DOWN")):
+            moved = row.operator("ssilk.move_layer", text="", icon=icon)
+            moved.garment, moved.where = garment.name, where
+    column = layout.column(align=True)
+    column.operator("ssilk.train_outfit", icon="PLAY")
+    column.operator("ssilk.bake_outfit", icon="REC")
+    column.operator("ssilk.hide_covered_outfit", icon="HIDE_ON")
+    if waits := outfit.line():
+        row = layout.row()
+        draw_text(row, waits, icon="TIME")
+        row.operator("ssilk.stop_outfit", text="", icon="X")
 
 
 def draw_course(layout: bpy.types.UILayout, garment: bpy.types.Object) -> None:

@@ -97,10 +97,25 @@ def armature_of(garment: bpy.types.Object) -> bpy.types.Object:
 
 
 def garments_of(armature: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return the garments of the view layer that belong to an armature, by name."""
+    """Return the garments of the view layer that belong to an armature, from inner to outer ones.
+
+    Those that nobody has put in order come last, by name.
+    """
     found = [thing for thing in bpy.context.view_layer.objects if is_garment(thing)]
     bound = [thing for thing in found if (thing.ssilk.armature or _modifier_armature(thing)) == armature]
-    return sorted(bound, key=lambda thing: thing.name)
+    return sorted(bound, key=lambda thing: (thing.ssilk.layer or len(bound) + 1, thing.name))
+
+
+def put_in_order(garments: Sequence[bpy.types.Object]) -> None:
+    """Let garments be worn in this order, from inner to outer ones."""
+    for number, garment in enumerate(garments, start=1):
+        garment.ssilk.layer = number
+
+
+def beneath(garment: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the garments that a garment is worn over: those of its character that come before it in the order."""
+    found = garments_of(armature_of(garment))
+    return found[: found.index(garment)] if garment in found and garment.ssilk.layer else []
 
 
 def bodies_of(garment: bpy.types.Object, armature: bpy.types.Object) -> list[bpy.types.Object]:

@@ -79,6 +79,10 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Meshes that the garment meets besides its bodies, with Collision physics or without",
         override=SHOTS,
     )
+    layer: IntProperty(
+        description="Place among the garments of the character, from the skin on; zero where it is in no order",
+        default=0, min=0, options={"HIDDEN"}, override=SHOTS,
+    )  # fmt: skip
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
     tightness: FloatProperty(
         name="Tightness",

@@ -13,6 +13,32 @@ WORDS = {
     "Choose Garment": "Kleidungsstück wählen",
     "Work on this garment": "An diesem Kleidungsstück arbeiten",
     "Name of the object to work on": "Name des Objekts, an dem gearbeitet wird",
+    "Move Layer": "Lage verschieben",
+    "Wear this garment further inside or further outside": (
+        "Dieses Kleidungsstück weiter innen oder weiter außen tragen"
+    ),
+    "Where": "Wohin",
+    "Which way it goes in the order": "Wohin es in der Reihenfolge rückt",
+    "Inner": "Innen",
+    "Nearer to the skin": "Näher an der Haut",
+    "Outer": "Außen",
+    "Farther from the skin": "Weiter weg von der Haut",
+    "Train Outfit": "Alle trainieren",
+    "Train the garments of the character that need it, inner ones first, each over those beneath it": (
+        "Die Kleidungsstücke der Figur trainieren, die es brauchen, innere zuerst, jedes über denen darunter"
+    ),
+    "Bake Outfit": "Alle backen",
+    "Bake all garments of the character over the scene's frames, as bones and shape keys": (
+        "Alle Kleidungsstücke der Figur über die Bilder der Szene backen, als Knochen und Formschlüssel"
+    ),
+    "Hide Skin Under Outfit": "Haut unter allen verbergen",
+    "Hide faces of the body that any garment of the character covers in every frame, a last resort": (
+        "Flächen des Körpers verbergen, die irgendein Kleidungsstück der Figur in jedem Bild bedeckt, als letzter "
+        "Ausweg"
+    ),
+    "Take no further garment; what was done stays": (
+        "Kein weiteres Kleidungsstück mehr nehmen; was getan ist, bleibt"
+    ),
     "Attach to Cloth": "Am Stoff befestigen",
     "Let the other selected objects ride on the garment: each is parented to the three vertices beneath it": (
         "Die anderen ausgewählten Objekte reiten auf dem Kleidungsstück: jedes hängt an den drei Eckpunkten unter ihm"
@@ -142,8 +168,9 @@ WORDS = {
         "Beheben, was gefunden wurde, wo nichts zu entscheiden ist; danach neu prüfen"
     ),
     "Push Out": "Herausdrücken",
-    "Settle the garment out of the body with little change of shape, with all shape keys": (
-        "Das Kleidungsstück mit wenig Formänderung aus dem Körper drücken, mit allen Formschlüsseln"
+    "Settle the garment out of the body and off garments beneath, with little change of shape, and all shape keys": (
+        "Das Kleidungsstück mit wenig Formänderung aus dem Körper und von Kleidungsstücken darunter drücken, mit "
+        "allen Formschlüsseln"
     ),
     # Classes
     "Class": "Klasse",

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bake trained garments over motions as UsdSkel, and verify it by re-skinning the files.
 
-One garment over one motion goes into one file: joints, blendshapes and their animation, no vertex caches. A folder
+One garment over one motion goes into one file: joints, blendshapes and their animation, no vertex caches. A glb takes
+several garments of a character. A folder
 takes any number of both, as layers: an asset for each garment, a small layer for each garment in each shot, and a
 stage for each shot. Layers that are current are left alone.
 
@@ -30,6 +31,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from ..delivery import bake as library
 from ..errors import EXIT_OK, fail
@@ -58,18 +60,19 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             )
         library.bake_layers(requests, options.output, **layer_options(options), report=report)
         return EXIT_OK
-    if len(requests) != 1 or options.points:
-        found, allowed = "one file", "it holds one garment in one shot and no point cache"
-        fail(str(options.output), found, allowed, "name a folder")
+    if options.points:
+        fail(str(options.output), "one file", "it holds no point cache", "name a folder")
     if options.level_of:
         fail("--level-of", "one file", "levels are variants of a shot in a folder of layers", "name a folder")
-    library.bake(
-        requests[0],
-        options.output,
-        quality=options.quality,
-        budget=options.budget,
-        include_body=not options.no_body,
-        verify=not options.no_verify,
-        report=report,
-    )
+    common: dict[str, Any] = {
+        "quality": options.quality,
+        "budget": options.budget,
+        "include_body": not options.no_body,
+        "verify": not options.no_verify,
+        "report": report,
+    }
+    if len(requests) > 1:
+        library.bake_outfit(requests, options.output, **common)
+    else:
+        library.bake(requests[0], options.output, **common)
     return EXIT_OK

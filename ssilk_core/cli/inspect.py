@@ -4,6 +4,11 @@
 Every finding names the prim, the count, what was found, why it matters and what to do. --fix writes a copy of the
 garment's file with all safe repairs made, and reports what is left. The exit code is 2 when there are errors, and 0
 otherwise. --family also says whether further characters are bodies of one family with the first, or what differs.
+--over also finds where the garment starts inside others that it is worn over, and --fix settles it off these.
+
+A list as 'ssilk wardrobe' takes it (.toml) in place of the stage is inspected garment by garment, inner ones first,
+each over what it names with 'over'. --fix then takes a folder: it gets a repaired copy of each garment, and of the
+list, which names these copies.
 """
 
 from __future__ import annotations
@@ -14,11 +19,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import EXIT_BAD_INPUT, EXIT_OK, SsilkError, fail
+from ..errors import SsilkError, fail
 from ..events import Reporter, Result, silent
 from ..files import replacing
 from ..training.settings import PRESETS, preset_named
 from . import options as shared
+from ._inspected import Inspected
 
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
@@ -27,12 +33,19 @@ if TYPE_CHECKING:
     from ..authoring.preflight.inspection import PreflightInput
     from ..authoring.preflight.motion import MotionFile
     from ..authoring.preflight.units import FileUnits
-    from ..scene.assets import Motion, Skeleton
+    from ..scene.assets import Character, Mesh, Motion, Skeleton
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    shared.add_scene(verb)
+    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=shared.STAGE + ", or a list of garments (.toml)")
+    shared.add_garment(verb)
+    verb.add_argument(
+        "--over", action="append", default=[], metavar="FILE[:/PRIM]|PRIM|MODEL",
+        help="a garment that is worn beneath this one (repeatable): a file of its own, a mesh of the stage, or a "
+             "trained model",
+    )  # fmt: skip
+    verb.set_defaults(over_names=None)  # what findings call them, where a list has names
     verb.add_argument(
         "--motion", type=Path, nargs="+", default=[], metavar="PATH", help="motion files or folders to check too"
     )
@@ -46,28 +59,34 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
     )  # fmt: skip
     verb.add_argument(
-        "--fix", type=Path, metavar="OUT", help="write a repaired copy of the garment's file (.usdc, .usd or .usda)"
-    )
+        "--fix", type=Path, metavar="OUT",
+        help="write a repaired copy of the garment's file (.usdc, .usd or .usda); of a list, a folder of copies",
+    )  # fmt: skip
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Inspect; return 0, or 2 when there are errors."""
+    from ._inspect_list import inspect_list
+
+    if options.stage.suffix == shared.LIST:
+        return inspect_list(options, report, _inspect)
+    found = _inspect(options, report)
+    if options.json:
+        report(Result("inspect", found.detail(options.fix)))
+    else:
+        print(found.text(options.fix))
+    return found.code
+
+
+def _inspect(options: argparse.Namespace, report: Reporter) -> Inspected:
+    """Inspect a garment, or the repaired copy of it that is written first where one is asked for."""
     from ..authoring.preflight.inspection import inspect
-    from ..authoring.preflight.table import format_findings
 
     inputs, repaired = _read_inputs(options, report), None
     if options.fix:
         repaired = _fix(options, inputs)
         inputs = _read_inputs(_moved(options, options.fix), silent)
-    findings = [*inspect(inputs), *_on_family(options, inputs, report)]
-    if options.json:
-        detail = {"fixed": {"output": str(options.fix), "repaired": repaired}} if options.fix else {}
-        report(Result("inspect", {"findings": findings, **detail}))
-    else:
-        if options.fix:
-            print(f"{options.fix}:", *(repaired or ["nothing to repair"]), sep="\n  ", end="\n\n")
-        print(format_findings(findings))
-    return EXIT_BAD_INPUT if any(finding.severity == "error" for finding in findings) else EXIT_OK
+    return Inspected([*inspect(inputs), *_on_family(options, inputs, report)], repaired)
 
 
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
@@ -85,7 +104,35 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
         preset=preset_named(options.preset or _default_preset()), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
+        inner=_inner(options, character),
     )  # fmt: skip
+
+
+def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]:
+    """Return the garments of --over in the bind pose, by name.
+
+    Raises:
+        SsilkError: one cannot be read, is of another character, or has the name of another one.
+    """
+    from ssilk_usd.reading.scene import read_scene
+
+    found: dict[str, Mesh] = {}
+    for name, location in zip(options.over_names or options.over, options.over, strict=True):
+        if location.endswith(shared.MODEL):
+            from ..network.checkpoint import load_model
+            from ..training.inner_garments import other_character
+
+            scene = load_model(location).scene
+            if differs := other_character(scene.character.skeleton, character.skeleton):
+                allowed = "garments of an outfit are of one character"
+                fail(f"--over {location}", differs, allowed, f"name one that was trained on {character.path}")
+            mesh = scene.garment.mesh
+        else:
+            mesh = read_scene(options.stage, root=options.root, bodies=options.body, garment=location)[1].mesh
+        if name in found:
+            fail(f"--over {name}", "it is named twice", "each garment beneath is named once", "leave one out")
+        found[name] = mesh
+    return found
 
 
 def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
@@ -164,7 +211,13 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
         # Units first: everything else is measured in them.
         write_with_units(file, half_done, units)
         inputs = _read_inputs(_moved(options, half_done), silent)
-        repair = plan_repair(inputs.character, inputs.garment, inputs.rig, topology=not inputs.locked)
+        repair = plan_repair(
+            inputs.character,
+            inputs.garment,
+            inputs.rig,
+            topology=not inputs.locked,
+            inner=list(inputs.inner.values()),
+        )
         skeleton = inputs.character.skeleton
         write_repaired(half_done, half_done, repair, garment=prim, root=options.root, skeleton=skeleton)
     return [*stated, *repair.done]

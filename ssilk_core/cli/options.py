@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ..scene.assets import Character, Garment, Motion, ProxyRig, Scene, SurfaceMaterial
 
 
+LIST, MODEL = ".toml", ".safetensors"  # suffixes of a list of garments, and of a trained one
 STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
 
 
@@ -153,9 +154,10 @@ RATE = NumberRange(MIN_FPS, MAX_FPS)  # frames in a second
 
 def add_bake(verb: argparse.ArgumentParser) -> None:
     """Add the options that say what is baked, over what, and for whom."""
-    verb.add_argument("model", nargs="+", metavar="MODEL[:/ROOT]",
-                      help="models written by 'ssilk train'; ROOT is the SkelRoot that wears it, where the stage has "
-                           "several")  # fmt: skip
+    verb.add_argument("model", nargs="+", metavar="MODEL|LIST[:/ROOT]",
+                      help="models written by 'ssilk train', or the list that 'ssilk wardrobe' left beside its "
+                           "models, which stands for all of these; ROOT is the SkelRoot that wears it, where the "
+                           "stage has several")  # fmt: skip
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the characters")
     motions = verb.add_mutually_exclusive_group(required=True)
     motions.add_argument(
@@ -298,7 +300,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
         shots = [(_name(options.shot_name, shot.motion, "--shot-name"), shot) for shot in listed]
     worn = [
         (model, split_location(model), _name(options.garment_name, model, "--garment-name"))
-        for model in options.model
+        for model in _models(options.model)
     ]
     return [
         BakeRequest(
@@ -335,6 +337,30 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
         for whole, (model, root), garment in worn
         for name, shot in shots
     ]
+
+
+def _models(named: Iterable[str]) -> list[str]:
+    """Return models, "MODEL[:/ROOT]" each, with those of a list in its place, inner ones first.
+
+    Raises:
+        SsilkError: a list cannot be read, or a model that it stands for is not beside it.
+    """
+    found = list[str]()
+    for each in named:
+        path, root = split_location(each)
+        if not path.endswith(LIST):
+            found.append(each)
+            continue
+        from ..training.wardrobe.listing import read_list
+
+        for entry in read_list(Path(path)):
+            model = Path(path).with_name(f"{entry.name}{MODEL}")
+            if not model.is_file():
+                missing, allowed = f"there is no {model}", "the models of a list lie beside it"
+                todo = "train it with 'ssilk wardrobe', and name the list in the folder of its models"
+                fail(f"{path}: table '{entry.name}'", missing, allowed, todo)
+            found.append(f"{model}:{root}" if root else str(model))
+    return found
 
 
 def _name(pattern: str | None, location: str, option: str) -> str | None:

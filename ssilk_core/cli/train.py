@@ -209,7 +209,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         if options.stepper_of and train.collider_fraction and not base.config.proximity_points:
             text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
-    over = [InnerModel.load(path) for path in options.over]
+    over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     if family and train.collider_fraction:
         report(Message("a family of bodies is trained without colliders: its models see none", "warning"))

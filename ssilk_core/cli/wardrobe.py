@@ -20,7 +20,8 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     garment = "tights.usdc"
 
 Other keys are valid, fabric and material. Garments named by 'over' are trained first, and worn beneath; a name that
-ends in .safetensors is a model file. FOLDER gets NAME.safetensors and NAME.log for each garment. The same
+ends in .safetensors is a model file. 'ssilk inspect LIST' tells where garments start inside each other. FOLDER gets
+NAME.safetensors and NAME.log for each garment, and a copy of LIST, which 'ssilk bake' takes for all of them. The same
 command, given again, skips what is finished and resumes what was interrupted; a garment whose entry or inputs have
 changed is trained again. Ctrl-C stops all trainings after their current step, a second Ctrl-C at once. A garment that
 fails does not stop the others.
@@ -37,7 +38,7 @@ from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256
-from ..training.wardrobe.listing import WardrobeEntry, read_list
+from ..training.wardrobe.listing import WardrobeEntry, read_list, write_list
 from ..training.wardrobe.panel import ProgressTable, table
 from ..training.wardrobe.queue import CommandTask, End, Queue, Slot
 from ..training.wardrobe.training import GarmentTraining
@@ -74,6 +75,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         known[entry.name] = GarmentTraining(entry, options.output, requests[entry.name], known)
     trainings = [*known.values()]
     options.output.mkdir(parents=True, exist_ok=True)
+    _keep_list(entries, options.list, options.output)
     show = report if options.json else ProgressTable([entry.name for entry in entries])
     show(Started("wardrobe", len(trainings), {"device": device, "at a time": len(slots)}))
     _train(trainings, options.list.absolute().parent, device, slots, show)
@@ -83,6 +85,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     else:
         print(table(rows), *(f"{t.entry.name}: {t.error}" for t in trainings if t.state == "failed"), sep="\n")
     return max((training.code for training in trainings), key=lambda code: (code not in (EXIT_OK, EXIT_WORSE), code))
+
+
+def _keep_list(entries: Sequence[WardrobeEntry], path: Path, folder: Path) -> None:
+    """Copy a list beside the models that it stands for, unless it lies there."""
+    if not folder.samefile(path.absolute().parent):
+        write_list(folder / path.name, {entry.name: entry.located(path.parent) for entry in entries})
 
 
 def _train(

@@ -39,7 +39,7 @@ class InnerModel:
     """A trained garment to be worn beneath the one that is trained.
 
     Attributes:
-        name: of its file, without the suffix.
+        name: of its file, without the suffix; of its folder where another model of the training has that one.
         sha256: of its file.
     """
 
@@ -48,8 +48,15 @@ class InnerModel:
     file: ModelFile
 
     @classmethod
-    def load(cls, path: Path) -> InnerModel:
-        """Read one from a file.
+    def load_all(cls, paths: Sequence[Path], output: Path) -> list[InnerModel]:
+        """Read those of a training that writes a model to `output`; raise `SsilkError` as `load` does."""
+        stems = [path.stem for path in (*paths, output)]
+        alike = [stems.count(path.stem) > 1 for path in paths]
+        return [cls.load(path, path.absolute().parent.name if shared else None) for path, shared in zip(paths, alike)]
+
+    @classmethod
+    def load(cls, path: Path, name: str | None = None) -> InnerModel:
+        """Read one from a file, by that name or by its own.
 
         Raises:
             SsilkError: as `load_model` does, or it is a model of a family of bodies, of which this does not know the
@@ -57,11 +64,11 @@ class InnerModel:
         """
         from ..files import sha256
 
-        file = load_model(path)
+        digest, file = sha256(path) if path.is_file() else "", load_model(path)
         if file.bodies:
             found = "a model of a family of bodies"
             fail(f"--over {path}", found, "a garment is trained over models of one body", "train it for that body")
-        return cls(path.stem, sha256(path), file)
+        return cls(name or path.stem, digest, file)
 
 
 def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None:
@@ -80,13 +87,13 @@ def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None
                 f"the outer garment plays at {fps:g}",
                 f"train it with --set fps={fps:g}",
             )
-        found = _other_character(model.file.scene.character.skeleton, scene.character.skeleton)
+        found = other_character(model.file.scene.character.skeleton, scene.character.skeleton)
         if found:
             allowed = "inner and outer garments are trained on one character"
             fail(f"--over {model.name}", found, allowed, f"train it on {scene.character.path}")
 
 
-def _other_character(own: Skeleton, skeleton: Skeleton) -> str:
+def other_character(own: Skeleton, skeleton: Skeleton) -> str:
     """Return how the skeleton of an inner model differs; empty where it does not."""
     if own.joint_names != skeleton.joint_names:
         other = next((name for name in own.joint_names if name not in skeleton.joint_names), "")
@@ -195,7 +202,8 @@ class InnerGarments:
         found = int((cloth.distance(x, y)[: scene.garment.mesh.vertex_count] < 0).sum())
         if found:
             count = f"{found} of its {scene.garment.mesh.vertex_count} vertices lie beneath '{name}' in the bind pose"
-            report(Message(f"{scene.garment.mesh.path}: {count}; training pushes out those that move", "warning"))
+            todo = "training pushes out those that move; 'ssilk inspect --over' settles all of them off it before"
+            report(Message(f"{scene.garment.mesh.path}: {count}; {todo}", "warning"))
 
     def attach(self, sampler: WindowSampler) -> None:
         """Let a sampler keep the states of the inner garments from window to window."""

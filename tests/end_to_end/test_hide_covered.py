@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.shots.play import Shot
 from ssilk_usd.writing.body_faces import BODY, COVERED_HIDDEN, FULL, open_with_full_bodies
 
@@ -183,3 +183,26 @@ def test_farms_take_the_option_along(copy):
     words = BAKE.replace("bake ", "farm ", 1)
     assert main(shlex.split(f"{words} --bundle bundle")) == 0
     assert [task.request.hide_covered for task in read_job("bundle/job.json").tasks] == [True]
+
+
+def test_the_body_of_a_shot_hides_what_any_of_its_garments_covers(toy, copy):
+    """The body comes with the garment that is first by name; a collar above it covers skin that the skirt leaves."""
+    assert bake("-o layers") == 0
+    stage = Usd.Stage.Open("rigged.usda")
+    cloth = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt")).GetPointsAttr()
+    cloth.Set(Vt.Vec3fArray([Gf.Vec3f(x, 0.5 + y, z) for x, y, z in cloth.Get()]))
+    stage.Export("high.usda")
+    moved = shlex.split("rig high.usda --garment /Hero/Skirt -o high_rigged.usda")
+    assert main(moved) == 0
+    train = shlex.split("train high_rigged.usda --motions clip.usda -o zhigh.safetensors")
+    assert main([*train, *toy.training]) in (0, 5)
+    other = BAKE.replace("skirt.safetensors", "zhigh.safetensors")
+    assert main(shlex.split(f"{other} -o layers")) == 0
+    shot = Usd.Stage.Open("layers/shots/walk/shot.usda")
+    whole = set(map(tuple, whole_body()))
+    hidden = [
+        whole - set(map(tuple, faces_in(f"layers/shots/walk/{garment}/anim.usdc"))) for garment in ("skirt", "zhigh")
+    ]
+    assert hidden[0] and hidden[1] and hidden[1] - hidden[0]
+    assert whole - set(map(tuple, faces(shot))) == hidden[0] | hidden[1]
+    assert np.array_equal(faces(open_with_full_bodies("layers/shots/walk/shot.usda")), whole_body())

@@ -8,10 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
+from ssilk_usd.reading.scene import read_scene
+from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
+from ssilk_core.physics.intersections.pairs import intersections_between
+
+from .test_glb import Reader
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +68,143 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     other = baked(capsys, "coat.safetensors tights.safetensors", "other")
     (text,) = [text for text in told(other) if "trained over" in text]
     assert "walk/coat: it was trained over 'skirt', and tights of this shot is another model" in text
+
+
+LIST = """
+[defaults]
+stage = "rigged.usda"
+motions = "clip.usda"
+preset = "draft"
+set = {{ {settings} }}
+
+[coat]
+garment = "coat.usda:/Hero/Skirt"
+over = ["skirt"]
+
+[skirt]
+garment = "/Hero/Skirt"
+"""
+
+
+def write_outfit(toy) -> None:
+    """A list of the toy's skirt and of a coat over it, which lies through it all around."""
+    stage = Usd.Stage.Open("rigged.usda")
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt")).GetPointsAttr()
+    moved = np.array(points.Get()) * [1.03, 1, 1.03]
+    moved[:, [0, 2]] *= 1 - 0.06 * (moved[:, :1] > 0)  # one half passes through
+    points.Set(Vt.Vec3fArray.FromNumpy(moved.astype(np.float32)))
+    stage.Export("coat.usda")
+    words = [each for each in toy.training if "=" in each]
+    Path("outfit.toml").write_text(LIST.format(settings=", ".join(words)))
+
+
+def crossing(outer: str, inner: str) -> int:
+    """Triangles of a garment's file that intersect another one's, in the bind pose, by libigl on what USD reads."""
+    first, second = (read_scene("rigged.usda", garment=each)[1].mesh for each in (outer, inner))
+    return len(np.unique(intersections_between(first.points, first.faces, second.points, second.faces)[:, 0]))
+
+
+def inspected(capsys: pytest.CaptureFixture[str], words: str) -> dict:
+    capsys.readouterr()
+    assert main(shlex.split(f"inspect {words} --json")) == 0
+    (result,) = (
+        event["detail"]
+        for event in map(json.loads, capsys.readouterr().out.splitlines())
+        if event["event"] == "result"
+    )
+    return result
+
+
+def codes(found: dict, name: str) -> list[str]:
+    return [finding["code"] for finding in found["garments"][name]["findings"]]
+
+
+def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
+    """From a list whose garments start inside each other to a folder and to one glb of both."""
+    write_outfit(toy)
+    before = {name: Path(name).read_bytes() for name in ("coat.usda", "rigged.usda", "outfit.toml")}
+    assert crossing("coat.usda:/Hero/Skirt", "/Hero/Skirt") > 0
+    found = inspected(capsys, "outfit.toml")
+    assert list(found["garments"]) == ["skirt", "coat"]  # the inner one first
+    assert "garments-cross" in codes(found, "coat") and "garments-cross" not in codes(found, "skirt")
+    found = inspected(capsys, "outfit.toml --fix apart")
+    assert found["fixed"] == "apart/outfit.toml" and "garments-cross" not in codes(found, "coat")
+    assert crossing("apart/coat.usdc:/Hero/Skirt", "apart/skirt.usdc:/Hero/Skirt") == 0
+    assert before == {name: Path(name).read_bytes() for name in before}  # copies were written
+    assert main(shlex.split("wardrobe apart/outfit.toml -o models --device cpu --json")) in (0, 5)
+    over = load_model("models/coat.safetensors").provenance["over"]
+    assert over == {"skirt": sha256(Path("models/skirt.safetensors"))}
+    other = Path("apart/outfit.toml").read_text().replace("[coat]", "[cloak]")
+    Path("apart/night.toml").write_text(other)  # another outfit over the same skirt
+    capsys.readouterr()
+    assert main(shlex.split("wardrobe apart/night.toml -o models --device cpu --json")) in (0, 5)
+    said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    skipped = [each["name"] for each in said if "finished before; skipped" in each.get("said", {}).get("text", "")]
+    assert skipped == ["skirt"] and load_model("models/cloak.safetensors").provenance["over"] == over
+    layers = baked(capsys, "models/outfit.toml", "layers")
+    assert baked_garments("layers") == {"coat", "skirt"}
+    figures = [event["detail"] for event in layers if event["event"] == "result" and "over" in event["detail"]]
+    assert [(each["garment"], each["over"]) for each in figures] == [("coat", "skirt")]
+    bake = "bake models/outfit.toml --stage rigged.usda --motion walk.usda --target glb -o both.glb --json"
+    capsys.readouterr()
+    assert main(shlex.split(bake)) == 0
+    told = [json.loads(line)["detail"] for line in capsys.readouterr().out.splitlines() if '"result"' in line]
+    pair = next(each for each in told if "over" in each)
+    assert {name: pair[name] for name in ("garment", "over")} == {"garment": "coat", "over": "skirt"}
+    assert (
+        pair["triangles that intersect skirt"].split("%")[0]
+        == next(each["triangles that intersect skirt"] for each in figures).split("%")[0]
+    )
+    assert main(["verify", "both.glb"]) == main(["verify", "layers/shots/walk/shot.usda"]) == 0
+    reader = Reader("both.glb")
+    names = [mesh["name"] for mesh in reader.json["meshes"]]
+    assert len(reader.json["skins"]) == 2 and names.count("Body") == 1 and len(set(names)) == len(names) == 3
+    shots = {name: Shot(f"layers/shots/walk/{name}/anim.usdc") for name in ("skirt", "coat")}
+    meshes = {
+        mesh["extras"]["garment"]: mesh["name"] for mesh in reader.json["meshes"] if "garment" in mesh["extras"]
+    }
+    for name, shot in shots.items():
+        for frame, time in enumerate(shot.frame_times):
+            away = np.abs(reader.skinned(meshes[name], frame) - shot.garment_points(time)).max()
+            assert away < 1e-5, (name, frame)
+
+
+def baked_garments(folder: str) -> set[str]:
+    stage = Usd.Stage.Open(f"{folder}/shots/walk/shot.usda")
+    return {prim.GetName() for prim in stage.GetPrimAtPath("/Shot").GetChildren()}
+
+
+def test_garments_that_nobody_trained_over_others_are_counted_by_what_they_cover(toy, copy, capsys):
+    """Both were trained alone: the wider one is the outer."""
+    Path("coat.safetensors").unlink()
+    wide = shlex.split("train wide.usda --motions clip.usda -o awide.safetensors")
+    assert main([*wide, *toy.training]) in (0, 5)
+    events = baked(capsys, "awide.safetensors skirt.safetensors", "alone")
+    figures = [event["detail"] for event in events if event["event"] == "result" and "over" in event["detail"]]
+    assert [(each["garment"], each["over"]) for each in figures] == [("awide", "skirt")]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("inspect outfit.toml --garment coat.usda", "outfit.toml is a list"),
+        ("inspect outfit.toml --fix apart.usdc", "the repaired copies of a list's garments go into a folder"),
+        ("bake outfit.toml --stage rigged.usda --motion walk.usda -o x", "the models of a list lie beside it"),
+        ("bake skirt.safetensors coat.safetensors --stage rigged.usda --motion walk.usda -o x.usdc",
+         "go into a .glb or a folder"),
+        ("bake skirt.safetensors coat.safetensors --stage rigged.usda --motion walk.usda clip.usda --target glb "
+         "-o x.glb", "several motions or characters"),
+        ("bake skirt.safetensors skirt.safetensors --stage rigged.usda --motion walk.usda --target glb -o x.glb",
+         "two garments named 'skirt'"),
+        ("bake skirt.safetensors coat.safetensors --stage rigged.usda --motion walk.usda --target glb "
+         "--hide-covered -o x.glb", "name a folder, whose shots hide what any garment covers"),
+    ],
+)  # fmt: skip
+def test_what_is_no_outfit_is_refused_in_one_sentence(toy, copy, capsys, words, told):
+    write_outfit(toy)
+    Path("new").mkdir()
+    Path("coat.safetensors").rename("new/coat.safetensors")
+    capsys.readouterr()
+    words = words.replace("coat.safetensors", "new/coat.safetensors")
+    assert main(shlex.split(words)) == 2
+    assert told in capsys.readouterr().err and not Path("x.glb").exists() and not Path("apart.usdc").exists()

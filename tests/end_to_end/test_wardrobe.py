@@ -23,7 +23,7 @@ from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
-from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list
+from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list, write_list
 from ssilk_core.training.wardrobe.panel import ProgressTable, table
 from ssilk_core.training.wardrobe.queue import CommandTask, End, Queue
 from ssilk_core.training.wardrobe.training import WORSE_FIGURE, GarmentTraining
@@ -74,6 +74,33 @@ def test_a_garment_has_its_own_keys_and_the_defaults(tmp_path):
     assert shlex.join(torn.words) == (
         f"rigged.usda --motions torn.usda --valid a b --preset draft {material} {settings}"
     )
+
+
+def test_a_list_that_is_written_elsewhere_says_the_same(tmp_path):
+    """Paths lead to the same files from the new folder, and all else is as it was."""
+    text = (
+        '[defaults]\nstage = "hero.usda"\nmotions = ["walks/", "/data/run.usda"]\nvalid = "held.usda"\n'
+        'set = { seed = 3, widths = [16, 8], "a.b" = "\\"quoted\\" \u00fc \\u007f" }\n'
+        '[coat]\ngarment = "cloth/coat.usd:/World/Coat"\nover = ["shirt", "tights.safetensors"]\n'
+        '["shirt.1"]\n[shirt]\ngarment = "/Hero/Shirt"\nmaterial = { drag = 0.5 }\n'
+    )
+    before = listed(tmp_path, text)
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    write_list(tmp_path / "far" / "away" / "new.toml", {each.name: each.located(tmp_path) for each in before})
+    after = read_list(tmp_path / "far" / "away" / "new.toml")
+    assert [(each.name, each.over) for each in after] == [(each.name, each.over) for each in before]
+    for one, other in zip(before, after):
+        places = [each.located(folder) for each, folder in ((one, tmp_path), (other, tmp_path / "far" / "away"))]
+        plain = [json.loads(json.dumps(each), object_hook=dict) for each in places]
+        for each in plain:
+            each["motions"] = [os.path.normpath(path) for path in each["motions"]]
+            each["valid"] = [os.path.normpath(path) for path in each["valid"]]
+            each["over"] = [os.path.normpath(path) for path in each.get("over", [])]
+            each |= {name: os.path.normpath(each[name]) for name in ("stage", "garment") if name in each}
+        assert {**plain[0], "set": {}, "material": {}} == {**plain[1], "set": {}, "material": {}}
+        assert one.table["set"] == other.table["set"]
+        assert one.table.get("material") or other.table.get("material", {}) == {}
+    assert after[0].located(tmp_path / "far" / "away")["motions"][1] == "/data/run.usda"
 
 
 WRONG = {

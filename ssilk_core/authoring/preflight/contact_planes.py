@@ -12,7 +12,7 @@ from ...scene.assets import Floats, Ints
 from ...scene.mesh.topology import vertex_normals
 from ..setup.surface import barycentric_coordinates
 from .cloth_samples import ClothSamples
-from .sides import Facing, OuterSurface
+from .sides import ClothObstacle, Facing
 
 Mask = NDArray[np.bool_]
 TURNED = 0.9  # cosine between planes below which the earlier is kept as well
@@ -52,7 +52,7 @@ class ContactPlanes:
         distance: distance of each sample to the surface that it belongs to [m], negative inside, shape (S,).
     """
 
-    def __init__(self, surface: OuterSurface, samples: ClothSamples, facing: Facing, points: Floats) -> None:
+    def __init__(self, surface: ClothObstacle, samples: ClothSamples, facing: Facing, points: Floats) -> None:
         """Query all samples of cloth with vertices at `points` (V, 3)."""
         among, count = samples.weights > 0, len(samples.corners)
         directions = samples.of(facing.directions)
@@ -95,7 +95,7 @@ class ContactPlanes:
 
 
 def covering_planes(
-    surface: OuterSurface, points: Floats, faces: Ints, facing: Facing, distance: float
+    surface: ClothObstacle, points: Floats, faces: Ints, facing: Facing, distance: float
 ) -> HeldSamples:
     """Return the points of cloth over vertices of the body that it covers, with the planes through these.
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -268,14 +268,23 @@ def describe_left(settled: Settled, mesh: Mesh, character: Character) -> str:
     """Say what of a settled garment stays inside the body, and where; empty if nothing does."""
     if not settled.left:
         return ""
-    left, body = settled.after.vertices, character.merged_body()
-    nearest = closest_on_surface((mesh.points + settled.offsets)[left], body.mesh)
-    beneath = nearest.corners[np.arange(len(left)), nearest.barycentric.argmax(axis=1)]
+    left = settled.after.vertices
+    where = format_joints(
+        character.skeleton, joints_at(left, replace(mesh, points=mesh.points + settled.offsets), character), 3
+    )
+    what = "inside the body or beneath other garments" if settled.layered else "inside the body"
+    deep = f"{format_count(len(left), 'vertices')} {what}, up to {1000 * settled.after.depth:.1f} mm deep"
+    return ": ".join([f"left {deep}, at {where}", *_why_left(settled)])
+
+
+def joints_at(vertices: Ints, mesh: Mesh, character: Character) -> Ints:
+    """Return the joints that move the skin nearest to vertices (N,) of a garment, those of most vertices first."""
+    body = character.merged_body()
+    nearest = closest_on_surface(mesh.points[vertices], body.mesh)
+    beneath = nearest.corners[np.arange(len(vertices)), nearest.barycentric.argmax(axis=1)]
     strongest = body.skin.weights[beneath].argmax(axis=1)
     joints, count = np.unique(body.skin.indices[beneath, strongest], return_counts=True)
-    where = format_joints(character.skeleton, joints[np.argsort(-count, kind="stable")], 3)
-    deep = f"{format_count(len(left), 'vertices')} inside the body, up to {1000 * settled.after.depth:.1f} mm deep"
-    return ": ".join([f"left {deep}, at {where}", *_why_left(settled)])
+    return np.asarray(joints[np.argsort(-count, kind="stable")])
 
 
 def _not_all(settled: Settled) -> str:

@@ -10,11 +10,11 @@ from importlib.util import find_spec
 import numpy as np
 
 from ...errors import SsilkError
-from ...scene.assets import Character, Garment, Motion, ProxyRig, Scene
+from ...scene.assets import Character, Garment, Mesh, Motion, ProxyRig, Scene
 from ...scene.fabrics import fabric_of_surface, surface_message
 from ...training.settings import Preset
 from ..setup.prepare import prepare_scene
-from . import attachment, cost, fit, motion, pose, units, winding
+from . import attachment, cost, fit, motion, pose, units, winding, worn_over
 from . import mesh as meshes
 from .finding import SEVERITIES, Finding, Findings
 from .motion import MotionFile
@@ -39,6 +39,7 @@ class PreflightInput:
         character_units, garment_units: units of the character's and the garment's file; equal if they share a file.
         locked: reason why the garment's vertices and faces must not change; empty if they may.
         motions, files: the motions, and further facts about their files.
+        inner: garments that it is worn over in the bind pose, by name.
         unread: what keeps the other motions from being read, in a sentence, by their files.
         preset: settings for which memory and time are estimated.
     """
@@ -53,6 +54,7 @@ class PreflightInput:
     files: Sequence[MotionFile]
     preset: Preset
     unread: Mapping[str, str] = field(default_factory=dict)
+    inner: Mapping[str, Mesh] = field(default_factory=dict)
 
 
 def inspect(inputs: PreflightInput) -> list[Finding]:
@@ -103,6 +105,7 @@ def _on_fit(inputs: PreflightInput) -> Findings:
     yield from misplaced
     if not misplaced:  # the other checks assume that the garment is on the body
         yield from fit.penetration(mesh, body)
+        yield from worn_over.layers(mesh, inputs.character, inputs.inner)
         yield from winding.inside_out(mesh, body)
         yield from pose.rest_pose(inputs.character, mesh)
 

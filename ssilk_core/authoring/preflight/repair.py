@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,19 +47,27 @@ class MeshRepair:
     reshapes: bool = True
 
 
-def plan_repair(character: Character, garment: Garment, rig: ProxyRig | None, *, topology: bool = True) -> MeshRepair:
+def plan_repair(
+    character: Character,
+    garment: Garment,
+    rig: ProxyRig | None,
+    *,
+    topology: bool = True,
+    inner: Sequence[Mesh] = (),
+) -> MeshRepair:
     """Plan all safe repairs of a garment.
 
     Coincident vertices with the same class and weights are merged. Faces that collapse as a result, duplicate faces
     and isolated vertices are removed. Winding becomes consistent and faces away from the body. Cloth in the body is
-    settled out of it (`settle`).
+    settled out of it, and off inner garments (`settle`).
 
     Args:
         rig: proxies authored for the garment; merged vertices must agree in these weights, too.
         topology: whether vertices and faces may change; if not, vertices only move.
+        inner: the garments that it is worn over, in the bind pose.
     """
     mesh, body = garment.mesh, character.merged_body().mesh
-    settled = settle(mesh, body)
+    settled = settle(mesh, body, inner=inner)
     offsets, left = settled.offsets, describe_left(settled, mesh, character)
     moved = (*([describe_move(settled, "moved")] if settled.moved else []), *([left] if left else []))
     if not topology:

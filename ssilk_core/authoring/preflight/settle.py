@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +14,10 @@ from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh.topology import SAME_PLACE, components, edges, vertex_mask
 from .cloth_samples import ClothSamples, sample_cloth
 from .contact_planes import ContactPlanes, HeldSamples, covering_planes
+from .inner_surface import LayeredSurface
 from .mesh import distinct_faces
 from .shape_energy import ShapeEnergy
-from .sides import Facing, OuterSurface, find_facing
+from .sides import ClothObstacle, Facing, OuterSurface, find_facing
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -64,6 +66,7 @@ class Settled:
         offsets: how far the vertices move [m], shape (V, 3); exactly zero for those that stay.
         before, after: what lies in the body.
         failed: whether no shape was found that is less deep in the body, so that the garment stays as it is.
+        layered: whether there were garments beneath, besides the body.
         pierced: vertices where a limb goes through the cloth, which stay as they are, shape (N,).
     """
 
@@ -71,6 +74,7 @@ class Settled:
     before: PartInside
     after: PartInside
     failed: bool = False
+    layered: bool = False
     pierced: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @property
@@ -94,8 +98,8 @@ class Settled:
         return float(np.linalg.norm(self.offsets, axis=1).max(initial=0.0))
 
 
-def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
-    """Settle a garment out of a body.
+def settle(mesh: Mesh, body: Mesh, gap: float = GAP, *, inner: Sequence[Mesh] = ()) -> Settled:
+    """Settle a garment out of a body, and off garments that it is worn over.
 
     Every vertex, point inside a triangle, and vertex of the body beneath cloth comes to lie at least `gap` apart [m],
     as far as `ITERATIONS` allow; `Settled.after` tells what is left. The change of shape (`ShapeEnergy`) is the least
@@ -103,26 +107,29 @@ def settle(mesh: Mesh, body: Mesh, gap: float = GAP) -> Settled:
     does all of it where nothing is inside, where it lies deeper than `DEEPEST`, or where it would come to lie deeper
     than before (`Settled.failed`). A piece in the body that could only come out by moving cloth farther than
     `FARTHEST` stays, too (`Settled.pierced`): there a limb goes through the cloth.
+
+    Args:
+        inner: the garments beneath in the bind pose, which stay. What lies beneath one counts as inside.
     """
-    return _Cloth(mesh, body).settled(gap)
+    return replace(_Cloth(mesh, body, inner).settled(gap), layered=bool(inner))
 
 
-def part_inside(mesh: Mesh, body: Mesh) -> PartInside:
-    """Return the part of a garment that lies in a body, which `settle` would take out."""
-    return _Cloth(mesh, body).inside_now()
+def part_inside(mesh: Mesh, body: Mesh, *, inner: Sequence[Mesh] = ()) -> PartInside:
+    """Return the part of a garment that lies in a body or beneath inner garments, which `settle` would take out."""
+    return _Cloth(mesh, body, inner).inside_now()
 
 
 class _Cloth:
-    """The garment with coincident vertices joined, and the body's surface."""
+    """The garment with coincident vertices joined, and the surface of what is beneath."""
 
-    def __init__(self, mesh: Mesh, body: Mesh) -> None:
+    def __init__(self, mesh: Mesh, body: Mesh, inner: Sequence[Mesh] = ()) -> None:
         _, first, joined = np.unique(
             np.round(mesh.points / SAME_PLACE), axis=0, return_index=True, return_inverse=True
         )
         self.joined = joined.reshape(-1)
         self.points = mesh.points[first]
         self.faces = distinct_faces(self.joined[mesh.faces])
-        self.surface = OuterSurface(body)
+        self.surface: ClothObstacle = LayeredSurface(body, inner) if inner else OuterSurface(body)
         self.samples = sample_cloth(self.points, self.faces)
 
     def inside_now(self) -> PartInside:

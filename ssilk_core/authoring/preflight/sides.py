@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,20 @@ class Facing:
     crossed: Mask
 
 
+class ClothObstacle(Protocol):
+    """What cloth is settled off: a body's `OuterSurface`, or that with garments on it (`LayeredSurface`)."""
+
+    mesh: Mesh
+
+    def inside(self, points: Floats) -> Mask: ...
+
+    def nearest(self, points: Floats) -> SurfaceSide: ...
+
+    def belonging(
+        self, points: Floats, inside: Mask, facing: Floats, doubtful: Mask, crossed: Mask
+    ) -> SurfaceSide: ...
+
+
 class OuterSurface:
     """The part of a body's surface that is not buried in the body itself, with its normals outward."""
 
@@ -84,7 +99,7 @@ class OuterSurface:
     def nearest(self, points: Floats) -> SurfaceSide:
         """Return the nearest points of the surface."""
         normals, found, distance = _closest(points, self.mesh)
-        return _oriented(points, normals, found, self.inside(points), distance)
+        return oriented(points, normals, found, self.inside(points), distance)
 
     def belonging(self, points: Floats, inside: Mask, facing: Floats, doubtful: Mask, crossed: Mask) -> SurfaceSide:
         """Return the points of the surface that cloth belongs to.
@@ -112,11 +127,11 @@ class OuterSurface:
                 rows = chosen[better]
                 normals[rows], found[rows], distance[rows] = (values[better] for values in other)
                 beyond[rows] = True
-        side = _oriented(points, normals, found, inside | beyond, distance)
+        side = oriented(points, normals, found, inside | beyond, distance)
         return replace(side, inside=inside)
 
 
-def find_facing(points: Floats, faces: Ints, surface: OuterSurface) -> Facing:
+def find_facing(points: Floats, faces: Ints, surface: ClothObstacle) -> Facing:
     """Find out where cloth should face.
 
     Vertices outside the body tell whether the cloth is wound with the surface beneath it or against it, as the inner
@@ -167,7 +182,7 @@ def _closest(points: Floats, mesh: Mesh, shaded: Mesh | None = None) -> tuple[Fl
     return found.normals.copy(), np.einsum("sk,skc->sc", found.barycentric, corners), found.distance.copy()
 
 
-def _oriented(points: Floats, normals: Floats, found: Floats, inside: Mask, distance: Floats) -> SurfaceSide:
+def oriented(points: Floats, normals: Floats, found: Floats, inside: Mask, distance: Floats) -> SurfaceSide:
     """Return the side with directions to or from the surface where these agree with its normals."""
     sign = np.where(inside, -1.0, 1.0)
     away = (points - found) * sign[:, None] / np.maximum(distance, 1e-12)[:, None]

@@ -31,7 +31,7 @@ from ..view.player import ShotPlayer
 from .entered import EnteredCloth, EnteredCounter
 from .opened import add_provenance, open_shot, provenance_of
 from .rollout import BakeRollout
-from .shots import finished
+from .shots import STAGE, finished, place_of
 
 if TYPE_CHECKING:
     import torch
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 # What a shot says under these names.
 SHOWN_SKIN, INTERSECTIONS, SUNK, ENTERED = "shown_skin", "intersections", "sunk_cloth", "riders_in_cloth"
-STAGE = "shot.usda"  # of a folder of layers
 FRAMES_AT_ONCE = 32
 
 
@@ -170,8 +169,7 @@ def stated_sunk(path: Path, garments: Mapping[int, str]) -> dict[int, SunkCloth]
         SsilkError: not a readable shot, or it says so otherwise than this version does.
     """
     if path.name == STAGE:
-        home = path.absolute().parent
-        records = finished(home.parent.parent, home.name)
+        records = finished(*place_of(path))
         results = {name: record.result.sunk for name, record in records.items() if record and record.result.sunk}
         named = {number: prim.split("/")[2:3] for number, prim in garments.items()}
         return {number: results[name[0]] for number, name in named.items() if name and name[0] in results}

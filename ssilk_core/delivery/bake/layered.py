@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Garments of a shot that were trained over others: whether these lie beneath, and how one lies over the other."""
+"""Garments of a shot over one another: whether they were trained so, and how one lies over the other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,30 +39,32 @@ def tell_other_layers(folder: Path, shot: str, report: Reporter) -> None:
             report(Message(f"{shot}/{name}: {text}; {todo}", "warning"))
 
 
-def tell_layers(folder: Path, shot: str, report: Reporter) -> list[LayerFigures]:
-    """Count how garments of a shot lie over those that they were trained over, and report it.
+def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -> list[LayerFigures]:
+    """Count how garments of a shot that one character wears lie over one another, and report it.
+
+    Of two, the outer is the one that was trained over the other; else the one that covers more of it.
+
+    Args:
+        verb: the work whose result this is.
 
     Returns:
-        The figures of each pair, in the order of the outer garments; none without libigl, which is told.
+        The figures of each pair that could touch: one covers some of the other, or crosses it. None without libigl,
+        which is told.
 
     Raises:
         SsilkError: a layer cannot be read.
     """
     found = _whole(finished(folder, shot))
-    pairs = [
-        (name, other)
-        for name, record in found.items()
-        for other, own in _beside(found, name).items()
-        if own.inputs["model"].sha256 in record.over.values()
-    ]
+    pairs = [pair for pair in combinations(found, 2) if found[pair[0]].wearer == found[pair[1]].wearer]
     if pairs and not can_find():
         report(Message(f"{folder / 'shots' / shot}: cloth through other garments is {NOT_COUNTED}", "warning"))
         return []
-    counted = [_counted(folder, shot, *pair) for pair in pairs]
-    for each in counted:
+    counted = [_counted(folder, shot, found, *pair) for pair in pairs]
+    touching = [each for each in counted if each and (each.shown is not None or each.worst)]
+    for each in touching:
         named = {"shot": shot, "garment": each.outer, "over": each.inner}
-        report(Result("bake", {**named, **each.summary("time code")}))
-    return counted
+        report(Result(verb, {**named, **each.summary("time code")}))
+    return touching
 
 
 def _whole(found: Mapping[str, TaskRecord | None]) -> dict[str, TaskRecord]:
@@ -74,23 +77,37 @@ def _beside(found: Mapping[str, TaskRecord], name: str) -> dict[str, TaskRecord]
     return {other: own for other, own in found.items() if other != name and own.wearer == found[name].wearer}
 
 
-def _counted(folder: Path, shot: str, outer: str, inner: str) -> LayerFigures:
-    """Count in every `EVERY`-th frame that both garments have, as their layers play it."""
+def _counted(folder: Path, shot: str, found: Mapping[str, TaskRecord], one: str, other: str) -> LayerFigures | None:
+    """Count in every `EVERY`-th frame that two garments have, as their layers play it; None where they share none."""
     from ssilk_usd.shots.layers import Layout
     from ssilk_usd.shots.play import Shot
 
     from ...physics.intersections.layers import ClothLayers
     from ...scene.mesh.joined import joined
 
-    over, under = (_Layer(Shot(Layout(folder, name, shot).animation)) for name in (outer, inner))
-    cloth = ClothLayers((outer, inner), over.rest, under.rest, joined([*over.bodies, *under.bodies]))
-    both = set(under.shot.frame_times)
-    times = [time for time in over.shot.frame_times if time in both][::EVERY]
+    both = {name: _Layer(Shot(Layout(folder, name, shot).animation)) for name in (one, other)}
+    body = joined(both[one].bodies or both[other].bodies)
+    if _is_over(found[one], found[other]):
+        cloth = ClothLayers((one, other), both[one].rest, both[other].rest, body)
+    elif _is_over(found[other], found[one]):
+        cloth = ClothLayers((other, one), both[other].rest, both[one].rest, body)
+    else:
+        cloth = ClothLayers.by_cover((one, both[one].rest), (other, both[other].rest), body)
+    over, under = (both[name] for name in cloth.names)
+    shared = set(under.shot.frame_times)
+    times = [time for time in over.shot.frame_times if time in shared][::EVERY]
+    if not times:
+        return None
     parts = []
     for first in range(0, len(times), FRAMES_AT_ONCE):
         some = times[first : first + FRAMES_AT_ONCE]
         parts.append((shot, cloth.counts(over.points(some), under.points(some), some)))
     return cloth.figures(parts)
+
+
+def _is_over(outer: TaskRecord, inner: TaskRecord) -> bool:
+    """Return whether a garment's model was trained over that of another one."""
+    return inner.inputs["model"].sha256 in outer.over.values()
 
 
 class _Layer:
@@ -111,4 +128,4 @@ class _Layer:
 
     def points(self, times: Sequence[float]) -> list[Floats]:
         """Return positions of the garment at some frame times [m], each (V, 3)."""
-        return [self.shot.points(time)[self._place] for time in times]
+        return [self.shot.mesh_points(self._place, time) for time in times]

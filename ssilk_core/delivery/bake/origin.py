@@ -57,11 +57,16 @@ class ShotOrigin:
     hashes: Mapping[str, object]
 
 
-def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | None]) -> ShotOrigin:
+def read_origin(
+    shot: Path,
+    elsewhere: Mapping[str, str | os.PathLike[str] | None],
+    provenance: Mapping[str, object] | None = None,
+) -> ShotOrigin:
     """Read what a shot was baked from.
 
     Args:
         elsewhere: new paths of inputs that have moved, and not together with the shot.
+        provenance: what it says of one of several garments; what it says by default.
 
     Raises:
         SsilkError: no such shot, one that does not say how it was baked, or an input that is not found.
@@ -69,7 +74,7 @@ def read_origin(shot: Path, elsewhere: Mapping[str, str | os.PathLike[str] | Non
     allowed = "a shot written by 'ssilk bake' is needed"
     if not shot.is_file():
         fail(str(shot), "there is no such shot", allowed)
-    provenance = provenance_of(shot)
+    provenance = provenance_of(shot) if provenance is None else provenance
     if "request" not in provenance:
         fail(str(shot), "the file does not say how it was baked", allowed)
     try:

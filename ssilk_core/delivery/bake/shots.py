@@ -14,6 +14,8 @@ from ...events import Message, Reporter, silent
 from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
 
+STAGE = "shot.usda"  # of a shot, with all its garments
+
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
 
@@ -72,7 +74,7 @@ def write_shot_stage(
         todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
         report(Message(f"{folder / 'shots' / shot}: {text}; {todo}", "warning"))
     for name, other in written.bodies.items():
-        if (record := found[name]) and record.result.hidden_faces is not None:
+        if name in written.uncovered:
             text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
             report(Message(text, "warning"))
 
@@ -98,6 +100,17 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
         )
 
     return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
+
+
+def is_stage(path: Path) -> bool:
+    """Return whether a file is the stage of a shot in a folder of layers."""
+    return path.name == STAGE and path.is_file() and any(finished(*place_of(path)))
+
+
+def place_of(stage: Path) -> tuple[Path, str]:
+    """Return the folder of layers that the stage of a shot lies in, and the name of the shot."""
+    home = stage.absolute().parent
+    return home.parent.parent, home.name
 
 
 def finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:

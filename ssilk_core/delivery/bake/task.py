@@ -79,7 +79,7 @@ def plan_layers(
     _need_for_layers(requests, include_body)
     tasks = [
         BakeTask(
-            garment=_garment_name(request),
+            garment=garment_name(request),
             shot=_shot_name(request),
             request=replace(
                 request, garment=None, shot=None, level_of=None, asset_version=None, asset_identifier=None
@@ -158,7 +158,8 @@ def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> Non
         check_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
 
 
-def _garment_name(request: BakeRequest) -> str:
+def garment_name(request: BakeRequest) -> str:
+    """Return the name of a request's garment, where it is one of several."""
     stem = location_stem(request.model)
     return prim_name(request.garment or (f"{prim_leaf(request.root)}_{stem}" if request.root else stem))
 

@@ -41,6 +41,7 @@ def bake(
     include_body: bool = True,
     verify: bool = True,
     report: Reporter = silent,
+    place: Path | None = None,
 ) -> BakeResult:
     """Bake one garment over one motion into one file, which appears once it is verified.
 
@@ -51,13 +52,14 @@ def bake(
         include_body: write the character's body meshes as well.
         verify: re-skin the file by UsdSkel and compare it with the decoder's own vertices.
         report: takes events.
+        place: the file that this one becomes a part of, from which inputs are named; `output` by default.
 
     Raises:
         SsilkError: an input is missing or does not fit, or the file cannot be written.
         VerificationError: the file is not what was computed; it is not kept, and an older one stays.
     """
     path = Path(output)
-    _check_output(request, path)
+    _check_output(request, Path(place or path))
     need_body(request, include_body)
     if request.certify:
         need_certifier()
@@ -70,10 +72,12 @@ def bake(
     rollout.tell(report)
     rollout = certified(refined(solved(rollout, report), report), report)
     if path.suffix == GLB:
-        warn_of_sets(rollout.deformer, path, report)
-    rollout, hidden, summary, counts, verification = _write_verified(rollout, path, include_body, verify, report)
+        warn_of_sets(rollout.deformer, Path(place or path), report)
+    rollout, hidden, summary, counts, verification = _write_verified(
+        rollout, path, include_body, verify, report, place or path
+    )
     if summary.left_out:
-        report(Message(f"{path}: {summary.left_out}", "warning"))
+        report(Message(f"{place or path}: {summary.left_out}", "warning"))
     result = result_of(rollout, path, summary, counts, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
@@ -128,6 +132,7 @@ def _write_verified(
     include_body: bool,
     verify: bool,
     report: Reporter,
+    place: Path,
 ) -> tuple[BakeRollout, HiddenPolygons | None, ShotSummary, ShotCounts, Verification | None]:
     """Write a file that appears once it is verified; return the rollout that it holds, what is hidden, and what was
     found in it."""
@@ -136,10 +141,10 @@ def _write_verified(
     with replacing(output) as unverified:
         with packaged(unverified, report, name=output) as layer:
             hidden = hidden_polygons_of(rollout, report)
-            summary = _write(layer, rollout, output, include_body, hidden)
+            summary = _write(layer, rollout, output, include_body, hidden, place)
             while again := proven(rollout, layer, report):
                 rollout, hidden = again, hidden_polygons_of(again, report)
-                summary = _write(layer, rollout, output, include_body, hidden)
+                summary = _write(layer, rollout, output, include_body, hidden, place)
             counts = state_rollout_counts(layer, rollout)
         if not verify:
             report(Message("not verified, as asked", "warning"))
@@ -148,7 +153,12 @@ def _write_verified(
 
 
 def _write(
-    layer: Path, rollout: BakeRollout, output: Path, include_body: bool, hidden: HiddenPolygons | None
+    layer: Path,
+    rollout: BakeRollout,
+    output: Path,
+    include_body: bool,
+    hidden: HiddenPolygons | None,
+    place: Path,
 ) -> ShotSummary:
     """Write a shot of joints and blendshapes, or of refined points."""
     from ssilk_usd.shots.points import point_cache
@@ -160,7 +170,7 @@ def _write(
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
-        "provenance": shot_metadata(rollout, output),
+        "provenance": shot_metadata(rollout, place),
     }
     riders = rollout.rider_joints()
     poses = riders.poses(rollout.motion, rollout.poses())

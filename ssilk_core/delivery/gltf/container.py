@@ -75,7 +75,14 @@ class GlbBuilder:
         return self.add("accessors", item)
 
     def _view(self, values: np.ndarray, use: int | None) -> int:
-        data = np.ascontiguousarray(values).tobytes()
+        return self.bytes_of(np.ascontiguousarray(values).tobytes(), use)
+
+    def bytes_of(self, data: bytes, use: int | None) -> int:
+        """Add a view of bytes; return its index.
+
+        Args:
+            use: `VERTICES` or `INDICES` where it is bound as such.
+        """
         place = {"buffer": 0, "byteOffset": self._size, "byteLength": len(data)}
         padded = data + bytes(-len(data) % 4)
         self._parts.append(padded)

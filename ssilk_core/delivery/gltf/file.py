@@ -128,6 +128,19 @@ class GlbFile:
             values[rows] = self._rows(new["bufferView"], new.get("byteOffset", 0), few, width, kind)
         return _normalized(values) if item.get("normalized") else values
 
+    def view_bytes(self, index: int) -> bytes:
+        """Return the bytes of a buffer view that is not interleaved.
+
+        Raises:
+            KeyError, IndexError, TypeError, ValueError: the document is malformed.
+        """
+        item = listed(self.document["bufferViews"], index)
+        begin, length = item.get("byteOffset", 0), item["byteLength"]
+        data = self._buffer(item["buffer"])[begin : begin + length]
+        if "byteStride" in item or len(data) != length:
+            raise ValueError(f"buffer view {index} is interleaved, or ends behind its buffer")
+        return data
+
     def _rows(self, view: int, start: int, count: int, width: int, kind: np.dtype[Any]) -> np.ndarray:
         """Return the elements of a buffer view from a byte on, shape (count, width), interleaved or not."""
         item = listed(self.document["bufferViews"], view)

@@ -127,7 +127,8 @@ def write_glb(
     glb.document["scene"] = 0
     _animate(glb, labels.character, motion.fps, (rotations, translations), hidden, morphed)
     timing = {"startTimeCode": labels.start, "timeCodesPerSecond": motion.fps / labels.samples_per_frame,
-              "samplesPerFrame": labels.samples_per_frame}  # fmt: skip
+              "samplesPerFrame": labels.samples_per_frame,
+              "characterJoints": scene.character.skeleton.joint_count}  # fmt: skip
     glb.document["asset"]["extras"] = {**timing, "ssilk": _plain(provenance or {})}
     with replacing(path) as temporary:
         glb.write(temporary)

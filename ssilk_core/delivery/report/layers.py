@@ -28,8 +28,8 @@ class LayersMeter:
         self._pairs: list[tuple[tuple[int, int], ClothLayers, list[LayerCounts]]] = []
         self._frame = 0
         for pair in combinations(garments, 2):
-            ways = [(way, _layers(garments, way, body)) for way in (pair, pair[::-1])]
-            way, layers = max(ways, key=lambda each: each[1].covered)
+            layers = ClothLayers.by_cover(garments[pair[0]], garments[pair[1]], body)
+            way = pair if layers.outer is garments[pair[0]][1] else pair[::-1]
             self._pairs.append((way, layers, []))
 
     def add(self, points: Sequence[Floats], number: float) -> None:
@@ -42,11 +42,6 @@ class LayersMeter:
     def figures(self, clip: str) -> list[LayerFigures]:
         """Return the figures of each pair."""
         return [layers.figures([(clip, each) for each in counts]) for _, layers, counts in self._pairs]
-
-
-def _layers(garments: Mapping[int, tuple[str, Mesh]], way: tuple[int, int], body: Mesh | None) -> ClothLayers:
-    (outer_name, outer), (inner_name, inner) = (garments[index] for index in way)
-    return ClothLayers((outer_name, inner_name), outer, inner, body)
 
 
 def layers_section(figures: Sequence[LayerFigures]) -> Section:

@@ -62,6 +62,12 @@ class ClothLayers:
         turned = inner if body is None else replace(inner, faces=turned_away(inner, body))
         self._points = CoveredPoints(turned, outer, count=INNER_POINTS, device=torch.device("cpu"))
 
+    @classmethod
+    def by_cover(cls, one: tuple[str, Mesh], other: tuple[str, Mesh], body: Mesh | None) -> ClothLayers:
+        """Return two garments, by name, of which nothing says the order: the outer covers more of the other."""
+        ways = [cls((outer[0], inner[0]), outer[1], inner[1], body) for outer, inner in ((one, other), (other, one))]
+        return max(ways, key=lambda each: each.covered)
+
     @property
     def covered(self) -> int:
         """How many of `INNER_POINTS` points of the inner garment the outer one covers."""

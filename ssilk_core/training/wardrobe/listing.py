@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import tomllib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ...errors import fail, fail_unknown
+from ...files import relative_path, replacing, split_location
 from ...scene.fabrics import FABRICS
 from ..settings import PRESETS
 
@@ -25,11 +28,21 @@ class WardrobeEntry:
     Attributes:
         words: its arguments for 'ssilk train', without the garments of the list that it is worn over.
         over: names of these.
+        table: its keys and those that it inherits, as the list has them.
     """
 
     name: str
     words: tuple[str, ...]
     over: tuple[str, ...] = ()
+    table: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    def located(self, folder: Path) -> dict[str, Any]:
+        """Return the table with its paths as seen from here; `folder` is that of the list."""
+        return {key: _relocated(key, value, lambda path: str(folder / path)) for key, value in self.table.items()}
+
+    def models(self, table: Mapping[str, Any]) -> list[str]:
+        """Return the model files among what `located` says that it is worn over."""
+        return [inner for inner in table.get("over", ()) if inner.endswith(MODEL)]
 
 
 @dataclass(frozen=True)
@@ -64,6 +77,7 @@ KEYS = {
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
     "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["a"],'),
 }
+USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 MODEL = ".safetensors"  # what 'over' names that ends so is a file; all else is a garment of the list
 NEEDED = ("stage", "motions")
 
@@ -95,12 +109,62 @@ def read_list(path: Path) -> list[WardrobeEntry]:
     return _in_order(path, entries)
 
 
+def write_list(path: Path, tables: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write a list of garments, from tables whose paths are as seen from here.
+
+    Raises:
+        SsilkError: the file cannot be written.
+    """
+    here = path.absolute().parent
+
+    def moved(location: str) -> str:
+        return relative_path(location, here) or os.path.abspath(location)
+
+    lines = list[str]()
+    for name, table in tables.items():
+        said = {key: _relocated(key, value, moved) for key, value in table.items()}
+        lines += [f"[{_key(name)}]", *(f"{key} = {_toml(value)}" for key, value in said.items() if value != {}), ""]
+    with replacing(path) as half_done:
+        half_done.write_text("\n".join(lines), encoding="utf-8")
+
+
+def garment_file(table: Mapping[str, Any]) -> tuple[str, str | None]:
+    """Return the file with the garment of a table, and the prim that the table names in it."""
+    file, prim = split_location(str(table.get("garment", "")))
+    return (file, prim) if file.endswith(USD_SUFFIXES) else (str(table["stage"]), table.get("garment"))
+
+
+def _relocated(key: str, value: Any, move: Callable[[str], str]) -> Any:
+    """Return the value of a key with other paths."""
+    if key == "stage":
+        return move(value)
+    if key == "garment":
+        file, prim = split_location(value)
+        own = file.endswith(USD_SUFFIXES)
+        return (f"{move(file)}:{prim}" if prim else move(file)) if own else value
+    if key in ("motions", "valid"):
+        return [move(each) for each in ([value] if isinstance(value, str) else value)]
+    return [move(each) if each.endswith(MODEL) else each for each in value] if key == "over" else value
+
+
+def _key(name: str) -> str:
+    """Return a key as TOML has it."""
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _toml(name)
+
+
+def _toml(value: Any) -> str:
+    """Return a value of a list as TOML, whose strings are JSON's."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{_key(name)} = {_toml(item)}' for name, item in value.items())} }}"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def _entry(path: Path, name: str, table: dict[str, Any]) -> WardrobeEntry:
     over = [inner for inner in table.get("over", ()) if inner != name]  # of [defaults], which all inherit
     files = [inner for inner in over if inner.endswith(MODEL)]
     words = _words(path, name, {key: value for key, value in table.items() if key != "over"})
     given = tuple(word for file in files for word in ("--over", file))
-    return WardrobeEntry(name, words + given, tuple(inner for inner in over if inner not in files))
+    return WardrobeEntry(name, words + given, tuple(inner for inner in over if inner not in files), table)
 
 
 def _in_order(path: Path, entries: list[WardrobeEntry]) -> list[WardrobeEntry]:

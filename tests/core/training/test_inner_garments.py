@@ -213,3 +213,18 @@ def test_inner_models_that_do_not_fit_are_refused(asked, inner, case):
 def test_a_model_that_is_missing_is_told(tmp_path: Path):
     with pytest.raises(SsilkError, match="no such model file"):
         InnerModel.load(tmp_path / "none.safetensors")
+
+
+def test_models_of_one_file_name_are_told_apart_by_their_folders(inner, tmp_path: Path):
+    """As Blender has them, whose trainings all write a model.safetensors into a folder of their own."""
+    paths = [tmp_path / name / "model.safetensors" for name in ("Shirt-001", "Vest-001")]
+    for path in paths:
+        path.parent.mkdir()
+        save_model(path, inner.file)
+
+    def names(given: list[Path], output: str) -> list[str]:
+        return [model.name for model in InnerModel.load_all(given, Path(output))]
+
+    assert names(paths, "coat.safetensors") == names(paths, "model.safetensors") == ["Shirt-001", "Vest-001"]
+    assert names(paths[:1], "coat.safetensors") == ["model"]
+    assert names(paths[:1], "Coat-001/model.safetensors") == ["Shirt-001"]

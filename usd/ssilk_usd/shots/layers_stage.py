@@ -18,6 +18,7 @@ from ..reading.mesh import is_body
 from ..units import StageUnits
 from ..writing.export import new_stage, save
 from .layers import LEVEL, Layout, variant
+from .layers_hidden import Masks, hidden_in, hide_together
 
 OWN_LEVEL = "default"  # the level that a garment with others is itself
 
@@ -29,11 +30,13 @@ class WrittenStage:
     Attributes:
         unreadable: garments that are left out because they cannot be read, and why.
         bodies: garments whose body is not shown, with the garment whose body is.
+        uncovered: those of them that cover faces which the body that is shown does not hide for them.
         bodiless: levels without a body of a garment that shows it with its other levels, with that garment.
     """
 
     unreadable: Mapping[str, str]
     bodies: Mapping[str, str]
+    uncovered: frozenset[str]
     bodiless: Mapping[str, str]
 
 
@@ -59,7 +62,7 @@ def write_stage(
     stages, unreadable = _opened(garments, needed)
     others: dict[str, str] = {}
     if not stages:
-        return WrittenStage(unreadable, others, {})
+        return WrittenStage(unreadable, others, frozenset(), {})
     grouped: dict[str, list[Layout]] = {}
     for garment in stages:
         grouped.setdefault((levels or {}).get(garment.garment, garment.garment), []).append(garment)
@@ -85,12 +88,14 @@ def write_stage(
                     others[garment.garment] = shown[garments[garment]]
                     for body in bodies[garment]:
                         stage.OverridePrim(prim.GetPath().AppendChild(body)).SetActive(False)
+        hidden = {garment: hidden_in(stages[garment], bodies[garment]) for garment in stages if bodies[garment]}
+        uncovered = _hide_covered(stage, shot, grouped, garments, hidden, shown)
         free_when_closed(stage.GetUsedLayers())
         save(stage.GetRootLayer(), layout.stage)
         del stage, shot, prim
     showing = {name: grouped[name] for name in shown.values()}
     bodiless = {each.garment: name for name, group in showing.items() for each in group if not bodies[each]}
-    return WrittenStage(unreadable, others, bodiless)
+    return WrittenStage(unreadable, others, frozenset(uncovered), bodiless)
 
 
 def _shown_with(
@@ -110,6 +115,28 @@ def _shown_with(
                 if not all_levels or all(bodies[each] and wearers[each] == wearers[one] for each in group):
                     shown.setdefault(wearers[one], name)
     return shown
+
+
+def _hide_covered(
+    stage: Usd.Stage,
+    shot: Usd.Prim,
+    grouped: Mapping[str, Sequence[Layout]],
+    wearers: Mapping[Layout, Hashable],
+    hidden: Mapping[Layout, Masks],
+    shown: Mapping[Hashable, str],
+) -> set[str]:
+    """Hide on each body that is shown what all garments of its wearer hide; return the garments whose faces stay.
+
+    A body with levels of quality stays as its levels have it: which of them shows it is a choice of the shot's.
+    """
+    left = set[str]()
+    for wearer, name in shown.items():
+        group = grouped[name]
+        others = [each for each in hidden if wearers[each] == wearer and hidden[each] and each not in group]
+        covered = [hidden[each] for each in (*group, *others) if hidden.get(each)]
+        if others and not (len(group) == 1 and hide_together(stage, shot.GetChild(name), covered)):
+            left |= {each.garment for each in others}
+    return left
 
 
 def _reference_levels(prim: Usd.Prim, name: str, group: Sequence[Layout]) -> None:
