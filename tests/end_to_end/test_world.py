@@ -247,6 +247,11 @@ def test_a_network_goes_on_without_a_collider_that_cannot_be_read(stage, capsys,
     assert ("the network sees /Set/Floor\n" in told) is sees
     np.testing.assert_array_equal(points_of("network.usdc"), points_of("whole.usdc"))
     assert main(["verify", "network.usdc"]) == 0
+    capsys.readouterr()
+    assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
+    told = capsys.readouterr().err
+    assert told.count(left_out) == 1 and "/Set/Flat: no triangle of it has an area" in told
+    assert "does not see" not in told and "/Set/Bad" not in read_provenance("lbs.usdc")["sunk_cloth"]["colliders"]
     for command in ([*BAKE, "floored.usda", "--refine", "1"], [*SIMULATE, "floored.usda"]):
         assert main([*command, "-o", "solved.usdc"]) == 2
         assert "/Set/Bad: its faces change over time" in capsys.readouterr().err
