@@ -31,7 +31,7 @@ from ..view.player import ShotPlayer
 from .entered import EnteredCloth, EnteredCounter
 from .opened import add_provenance, open_shot, provenance_of
 from .rollout import BakeRollout
-from .shots import finished
+from .shots import STAGE, finished
 
 if TYPE_CHECKING:
     import torch
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
 # What a shot says under these names.
 SHOWN_SKIN, INTERSECTIONS, SUNK, ENTERED = "shown_skin", "intersections", "sunk_cloth", "riders_in_cloth"
-STAGE = "shot.usda"  # of a folder of layers
 FRAMES_AT_ONCE = 32
 
 

@@ -17,6 +17,8 @@ from .record import RECORD, TaskRecord, read_record
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
 
+STAGE = "shot.usda"  # of a shot
+
 
 def write_shot_stage(
     folder: Path,
