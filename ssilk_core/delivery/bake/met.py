@@ -12,7 +12,7 @@ from ...events import Message, Reporter
 from ...scene.assets import ShotWorld
 from ..view.props import ShotProps
 from .opened import open_shot
-from .origin import MetColliders, read_met
+from .origin import ColliderOrigin, read_met
 from .shots import STAGE, finished
 
 
@@ -45,7 +45,7 @@ def _layers(shot: Path) -> list[Path]:
     return [home / name / "anim.usdc" for name, record in finished(home.parent.parent, home.name).items() if record]
 
 
-def _read(met: list[MetColliders], seconds: np.ndarray, fps: float) -> ShotWorld:
+def _read(met: list[ColliderOrigin], seconds: np.ndarray, fps: float) -> ShotWorld:
     from ssilk_usd.reading.world import read_named
 
     found = [each for own in met for each in read_named(own.stage, own.prims, seconds)]

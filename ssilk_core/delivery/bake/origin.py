@@ -45,14 +45,14 @@ def met_metadata(world: ShotWorld | None, output: Path) -> dict[str, object]:
 
 
 @dataclass(frozen=True)
-class MetColliders:
+class ColliderOrigin:
     """The colliders that the cloth of a shot met: the present path of their stage, and their prims in it."""
 
     stage: str
     prims: tuple[str, ...]
 
 
-def read_met(shot: Path) -> MetColliders | None:
+def read_met(shot: Path) -> ColliderOrigin | None:
     """Return the colliders that a shot says its cloth met; None where it says of none.
 
     Raises:
@@ -64,7 +64,7 @@ def read_met(shot: Path) -> MetColliders | None:
     near = str(said.get("stage"))
     if (found := _existing(shot, near, None)) is None:
         fail(str(shot), f"the stage of its colliders is not at {near}", "it is looked for as seen from the shot")
-    return MetColliders(str(found), tuple(map(str, said.get("prims", ()))))
+    return ColliderOrigin(str(found), tuple(map(str, said.get("prims", ()))))
 
 
 def _from_folder(location: str, folder: Path) -> str:
