@@ -148,7 +148,7 @@ class ShotSurroundings:
             return world  # networks that see none are baked without libigl, too
         from ...physics.world.own_shapes import OwnShapes
 
-        shapes, asked = OwnShapes(self._scene, self.motion), self.found.asked
+        shapes, asked = OwnShapes.of(self._scene, self.motion), self.found.asked
         own = [each for each in world.colliders if each.path not in asked and shapes.has(each)]
         if not own:
             return world
