@@ -15,15 +15,17 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
+from ssilk_core.errors import SsilkError
 from ssilk_core.scene.assets import Collider
 
 from ..errors import SetupError
 from ..scene.garment import is_garment, is_own_body, no_mesh
 from ..scene.meshes import triangles_of
 from ..scene.modifiers import moves_by_itself
-from ..scene.objects import is_disabled, scene_units
+from ..scene.objects import found_again, is_disabled, scene_units
 from .evaluating import evaluating
 from .keys import changing_paths
+from .own_shapes import own_shapes
 from .sampling import SLICE
 
 KIND, USE = "COLLISION", "collision.use"
@@ -221,7 +223,13 @@ def _least(values: np.ndarray) -> np.ndarray:
 
 
 class MetColliders:
-    """The colliders of a garment over frames of the timeline, to be sampled."""
+    """The colliders of a garment over frames of the timeline, to be sampled.
+
+    Attributes:
+        found: what cloth meets, once it was sampled.
+        own: names of those with Collision physics that lie inside the character in all frames, as shapes of a ragdoll
+            do: cloth does not meet them, unless the garment's collection has them.
+    """
 
     def __init__(self, garment: bpy.types.Object, armature: bpy.types.Object, frames: range) -> None:
         """Choose them.
@@ -237,6 +245,8 @@ class MetColliders:
         self.signature, self._frames = signature(garment, armature), frames
         self._waiting = [_Sampled(thing.session_uid, thing.name, thing in named) for thing in things]
         self.found: tuple[Collider, ...] = ()
+        self.own: tuple[str, ...] = ()
+        self._objects = [(thing.session_uid, thing.name) for thing in (garment, armature)]
         self._met: dict[int, tuple[_Sampled, Collider | None]] = {}
         self._told: dict[int, bytes] = {}  # shapes that differed from what was read, and were read again
 
@@ -267,7 +277,22 @@ class MetColliders:
                         break
             yield done / len(self._frames)
         self._met = {each.uid: (each, each.collider()) for each in waiting}
-        self.found = tuple(collider for _, collider in self._met.values() if collider)
+        yield from self._leave_out_own()
+
+    def _leave_out_own(self) -> Iterator[float]:
+        """Leave out the shapes that stand for the character's own body, which the artist did not choose."""
+        found = {uid: collider for uid, (_, collider) in self._met.items() if collider}
+        asked = [uid for uid in found if not self._met[uid][0].named]
+        shapes = own_shapes(*(found_again(*each) for each in self._objects), self._frames) if asked else None
+        own = []
+        for uid in asked:
+            try:
+                own += [uid] if shapes and shapes.has(found[uid]) else []
+            except SsilkError:  # a body whose faces change: nothing is known of it
+                break
+            yield 1.0
+        self.own = tuple(found[uid].name for uid in own)
+        self.found = tuple(collider for uid, collider in found.items() if uid not in own)
 
     def differ(self, things: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph, frame: int) -> bool:
         """Return whether one of some objects is evaluated otherwise in a frame than it was read there.
@@ -298,6 +323,13 @@ class MetColliders:
     def things(self) -> list[bpy.types.Object]:
         """Return those that are still there."""
         return [thing for thing in bpy.data.objects if thing.session_uid in self._met]
+
+
+def left_out(met: MetColliders | None) -> str:
+    """Return in words which shapes of the character's own body were left out; empty where none was."""
+    own = met.own if met else ()
+    names = ", ".join(f"'{name}'" for name in own[:NAMED]) + (f" and {len(own) - NAMED} more" * (len(own) > NAMED))
+    return f"; cloth does not meet {names}, inside the body in each frame" if own else ""
 
 
 def _are_same(points: np.ndarray, place: np.ndarray, other: np.ndarray, there: np.ndarray) -> bool:

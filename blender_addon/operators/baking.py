@@ -23,7 +23,7 @@ from ssilk_core.scene.assets import Collider
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, known_as
 from ..errors import SetupError
-from ..motions.colliders import MetColliders, unseen
+from ..motions.colliders import MetColliders, left_out, unseen
 from ..motions.freedom import freedom, is_held
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
@@ -215,6 +215,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         self.bones, self.character = joints.bones, joints.character
         self.inputs = inputs_folder(garment, self.model)
         self.words = {f"{self.inputs.name}/{MOTION}": "the timeline"}
+        self.meets, self.left_out = False, ""
         closing = self.closing() if self.to_timeline else None
         return Work(
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
@@ -274,7 +275,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if self.meets_colliders:
             read = MetColliders(*self.pair.objects(), self.take.frames)
             yield from read.sample()
-            met = read.found
+            met, self.left_out = read.found, left_out(read)
+            self.meets = bool(met)
         yield from self.keys.sample()
         world = world_over(bpy.context.scene, self.take.frames, motion.fps, met)
         write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
@@ -299,6 +301,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
 
     def commands(self, folder: Path) -> list[list[str]]:
         """Write the inputs of the bake; return the command."""
+        from ssilk_usd.writing.world import COLLIDERS
+
         garment, armature = self.pair.objects()
         need_company(garment, armature, self.take)
         inputs = self.inputs
@@ -318,13 +322,15 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             self.words[f"{inputs.name}/{RIDDEN}"] = f"what rides on '{self.pair.name}'"
             stage = inputs / RIDDEN
         self.shot = self.shot or folder / SHOT
+        # Which of them are the body's own is known by now.
+        collider = ["--collider", COLLIDERS] if self.meets else []
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
                 "--motion", str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}",
-                *level, *rate, "--json",
+                *level, *rate, *collider, "--json",
             ]
         ]  # fmt: skip
 
@@ -337,7 +343,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        return f"'{self.pair.name}' is baked: {' and '.join(where)}{lost(work.result)}{self.reshaped}."
+        said = f"{lost(work.result)}{self.reshaped}{self.left_out}"
+        return f"'{self.pair.name}' is baked: {' and '.join(where)}{said}."
 
 
 class RemoveBake(ReportingOperator, bpy.types.Operator):

@@ -6,6 +6,7 @@ from __future__ import annotations
 import bpy
 
 from ..errors import SetupError
+from ..motions.colliders import left_out
 from ..motions.shapes import tell_changing_shapes
 from ..playback import playing
 from ..playback.models import model_of, no_model
@@ -32,9 +33,10 @@ class PlayLive(ReportingOperator, bpy.types.Operator):
     def apply(self, context: bpy.types.Context) -> str:
         tell_changing_shapes(self, context.object)
         playing.play(context.object)
-        if not playing.live(context.object):
+        live = playing.live(context.object)
+        if not live:
             raise SetupError(playing.reason(context.object))
-        return f"'{context.object.name}' plays {model_of(context.object).name}."
+        return f"'{context.object.name}' plays {model_of(context.object).name}{left_out(live.colliders)}."
 
 
 class LiveOperator(ReportingOperator):

@@ -54,18 +54,18 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _shipped(options: argparse.Namespace) -> list[list[str]]:
-    """Return the commands that bake and film the shipped model; its body is the character, its file the garment."""
+    """Return the commands that rig the garment onto the demo's body, and bake and film the shipped model on it."""
     from ..demo.shipped import shipped_path
 
-    shots = _shots(options)
-    bake = ["bake", str(shipped_path(options.garment)), "--stage", str(_body())]
-    bake += ["--motion", str(options.output / "shot.usdc")]
+    shots, out, stage = _shots(options), options.output, _stage(options)
+    bake = ["bake", str(shipped_path(options.garment)), "--stage", stage, "--motion", str(out / "shot.usdc")]
     return [
+        ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{options.garment}.usdc"), "-o", stage],
         [*bake, "-o", shots["linear blend skinning"], "--lbs"],
         [*bake, "-o", shots["shipped"]],
         # The film after the training has every frame of these shots; half of them are enough until then.
         *_views(
-            options.output / "shipped",
+            out / "shipped",
             {name: shots[name] for name in ("linear blend skinning", "shipped")},
             fps=30 if options.pretrained else 15,
         ),
@@ -73,16 +73,20 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
 
 
 def _trained(options: argparse.Namespace) -> list[list[str]]:
-    """Return the commands that rig the garment, train it, and film it beside LBS and the shipped model."""
-    out, garment, shots = options.output, options.garment, _shots(options)
-    stage, model = str(out / f"{garment}_stage.usdc"), str(out / f"{garment}_{PRESET}.safetensors")
+    """Return the commands that train the garment as it is rigged, and film it beside LBS and the shipped model."""
+    out, garment, shots, stage = options.output, options.garment, _shots(options), _stage(options)
+    model = str(out / f"{garment}_{PRESET}.safetensors")
     settings = [word for setting in options.settings for word in ("--set", setting)]
     return [
-        ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{garment}.usdc"), "-o", stage],
         ["train", stage, "--motions", str(out / "motions"), "-o", model, "--preset", PRESET, *settings],
         ["bake", model, "--stage", stage, "--motion", str(out / "shot.usdc"), "-o", shots[PRESET]],
         *_views(out / PRESET, shots, fps=30),
     ]
+
+
+def _stage(options: argparse.Namespace) -> str:
+    """Return the file of the character with the garment."""
+    return str(options.output / f"{options.garment}_stage.usdc")
 
 
 def _shots(options: argparse.Namespace) -> dict[str, str]:

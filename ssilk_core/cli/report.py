@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
 
     from ..delivery.report.page import Section
+    from ..delivery.view.props import ShotProps
 
 MODEL = ".safetensors"
 
@@ -98,14 +99,19 @@ def _check(options: argparse.Namespace) -> None:
         fail(str(options.subject), "--stage for a shot", "shots hold their character")
 
 
-def _shot(path: Path, report: Reporter) -> list[Section]:
-    """Return the sections of a shot, its provenance last."""
+def _shot(path: Path, report: Reporter, props: ShotProps | None = None) -> list[Section]:
+    """Return the sections of a shot, its provenance last.
+
+    Args:
+        props: the colliders that its cloth met; by default those that it names.
+    """
     from ssilk_usd.reading.facts import read_provenance
     from ssilk_usd.shots.play import Shot
     from ssilk_usd.shots.read import read_parts
     from ssilk_usd.writing.body_faces import open_with_full_bodies
 
     from ..delivery.bake.counted import stated_sunk
+    from ..delivery.bake.met import props_of
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
 
@@ -124,7 +130,8 @@ def _shot(path: Path, report: Reporter) -> list[Section]:
     others = {index for index, mesh in enumerate(shot.meshes) if mesh.is_garment or mesh.is_rider}
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
     sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
-    sections = shot_sections(shot, garments, bodies, report, sunk=sunk)
+    props = props or props_of(path, report)
+    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     said = read_provenance(path)
     if isinstance(certificate := said.get("certificate"), Mapping):
@@ -167,12 +174,20 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     from ssilk_usd.shots.shot import write_shot
 
     from ..delivery.bake import BakeRequest, load_rollout
+    from ..delivery.bake.counted import state_rollout_counts
+    from ..delivery.bake.refinement import refined
+    from ..delivery.view.props import ShotProps
 
     model, stage, motion = (str(path) for path in (options.subject, options.stage, options.motion))
     rollout = load_rollout(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))
+    rollout.tell(report)
+    rollout = refined(rollout, report)  # nothing asks for that: it tells what the network sees
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / f"{options.subject.stem}.usdc"
         write_shot(
             shot, rollout.deformer, rollout.motion, rollout.poses(), units=rollout.units, record=rollout.record
         )
-        return _shot(shot, report)[:-1]
+        rollout.warn(report)
+        state_rollout_counts(shot, rollout)
+        world = rollout.around.seen
+        return _shot(shot, report, ShotProps(world, rollout.seconds) if world else None)[:-1]

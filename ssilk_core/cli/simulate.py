@@ -15,7 +15,7 @@ import argparse
 import shutil
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ from ..delivery.bake.request import parse_range
 from ..delivery.bake.world import ShotSurroundings, asked_world
 from ..errors import EXIT_OK, SsilkError, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from ..files import replacing
+from ..files import replacing, split_location
 from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import Fabric
 from . import options as shared
@@ -37,12 +37,14 @@ if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
     from ssilk_usd.shots.points import PointCache
 
-    from ..delivery.bake.result import ShotShapes
+    from ..delivery.bake.counted import MetWorld, ShotCounts
+    from ..delivery.bake.result import BakeResult, ShotShapes
     from ..physics.intersections.figures import SelfIntersections
     from ..physics.simulate import SimulationOptions
     from ..physics.simulate.simulator import SimulatedFrame
     from ..physics.skin.figures import ShownSkin
-    from ..scene.assets import Floats, Motion, Scene
+    from ..physics.world.sunk import SunkCloth
+    from ..scene.assets import Floats, Motion, Scene, ShotWorld
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -202,7 +204,7 @@ def _written(
     report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
     figures, start = _Figures(settings.solver.tolerance), time.monotonic()
     with ExitStack() as stack:
-        caches = _Caches(stack, options, shots, scene, played, report)
+        caches = _Caches(stack, options, shots, scene, played, worlds, report)
         told = Countdown(total, report)
         for frame in simulator.frames(motions, worlds):
             caches.write(frame.shot, frame.number, frame.points)
@@ -225,6 +227,7 @@ class _Caches:
         shots: Sequence[_Shot],
         scene: Scene,
         played: Sequence[Motion],
+        worlds: Sequence[ShotWorld | None],
         report: Reporter,
     ) -> None:
         from ssilk_usd.opening.stage import open_stage
@@ -233,6 +236,7 @@ class _Caches:
         from ..delivery.bake import riders_of
 
         self.stack, self.options, self.shots, self.scene, self.played = stack, options, shots, scene, played
+        self.worlds = worlds
         stage = open_stage(options.stage)
         self.units = StageUnits.of(stage)
         self.riders = riders_of(stage, scene.garment.mesh, options.root, report)
@@ -246,6 +250,7 @@ class _Caches:
         self.fits: list[ShotShapes] = []
         self.shown: list[ShownSkin] = []
         self.crossed: list[SelfIntersections] = []
+        self.sunk: list[SunkCloth] = []
 
     def write(self, shot: int, frame: int, points: Floats) -> None:
         """Write the garment's points (V, 3) [m] of one frame."""
@@ -256,36 +261,58 @@ class _Caches:
         if cache.written.all():
             del self.open[shot], cache
             own.close()
-            if not self.options.points:
+            if self.options.points:
+                self._count(shot, self._path(shot))
+            else:
                 self._skin(shot)
 
     def figures(self) -> dict[str, object]:
         """Return how far joints and blendshapes are from the points, at most, and what the points would take.
 
-        And how much covered skin shows, and how many triangles intersect others, in the shots in which most do.
+        And how much covered skin shows, how many triangles intersect others, and how much cloth is in colliders, in
+        the shots in which most is.
         """
-        if not self.fits:
-            return {}
-        most = max(self.shown, key=lambda shown: shown.mean, default=None)
-        crossed = max(self.crossed, key=lambda found: found.mean, default=None)
         where = "" if len(self.shots) == 1 else "most in a shot: "
+        told = {
+            f"{where}{name}": value
+            for found in (self.shown, self.crossed, self.sunk)
+            for name, value in _most(found).items()
+        }
+        if not self.fits:
+            return told
         return {
             "shapes of a shot, at most": max(fit.count for fit in self.fits),
             "joints lose, RMS [mm]": float(f"{max(fit.rms_mm for fit in self.fits):.4g}"),
             "joints lose, at most [mm]": float(f"{max(fit.largest_mm for fit in self.fits):.4g}"),
             "bytes": sum(shot.output.stat().st_size for shot in self.shots if shot.output.is_file()),
             "bytes of the points alone": sum(fit.point_bytes for fit in self.fits),
-            **{
-                f"{where}{name}": value
-                for found in (most, crossed)
-                for name, value in (found.summary("time code") if found else {}).items()
-            },
+            **told,
         }
 
     def _path(self, shot: int) -> Path:
         """Return where the points of a shot are written."""
         output = self.shots[shot].output
         return output if self.options.points else self.folder / f"{shot}{output.suffix}"
+
+    def _met(self, shot: int) -> MetWorld | None:
+        """Return what surrounds the character of a shot; None where nothing does."""
+        from ..delivery.bake.counted import MetWorld
+
+        world, fps = self.worlds[shot], self.played[shot].fps
+        return MetWorld(world, lambda frame: frame / fps) if world else None
+
+    def _count(self, shot: int, path: Path) -> None:
+        """Count in the file of a shot of points, and let it say what was found."""
+        from ..delivery.bake.counted import state_counts
+
+        name = Path(split_location(self.shots[shot].source)[0]).stem
+        scene, motion, met = self.scene, self.played[shot], self._met(shot)
+        self._keep(state_counts(path, scene, motion, name=name, device=self.options.device, met=met))
+
+    def _keep(self, found: ShotCounts | BakeResult) -> None:
+        self.shown += [found.shown_skin] if found.shown_skin else []
+        self.crossed += [found.intersections] if found.intersections else []
+        self.sunk += [found.sunk] if found.sunk else []
 
     def _skin(self, shot: int) -> None:
         """Turn the points of a shot into joints and blendshapes."""
@@ -305,6 +332,7 @@ class _Caches:
                 origin={},
                 about={"simulated": asked.provenance},
                 riders=self.riders,
+                met=self._met(shot),
                 include_body=not self.options.no_body,
                 device=self.options.device,
                 report=self.report,
@@ -315,15 +343,17 @@ class _Caches:
             if not isinstance(error, SsilkError):
                 raise
             self.report(Message(f"{error} They are written as points.", "warning"))
+            self._count(shot, asked.output)
         else:
             assert result.shapes is not None
             self.fits.append(result.shapes)
-            self.shown += [result.shown_skin] if result.shown_skin else []
-            self.crossed += [result.intersections] if result.intersections else []
+            self._keep(result)
         path.unlink()
 
     def _opened(self, shot: int) -> tuple[ExitStack, PointCache]:
         from ssilk_usd.shots.points import point_cache
+
+        from ..delivery.bake.origin import met_metadata
 
         asked, own = self.shots[shot], self.stack.enter_context(ExitStack())
         cache = own.enter_context(
@@ -333,10 +363,16 @@ class _Caches:
                 self.played[shot],
                 units=self.units,
                 include_body=not self.options.no_body,
-                provenance={"simulated": asked.provenance},
+                provenance={"simulated": asked.provenance, **met_metadata(self.worlds[shot], asked.output)},
             )
         )
         return own, cache
+
+
+def _most(found: Sequence[ShownSkin | SelfIntersections | SunkCloth]) -> Mapping[str, object]:
+    """Return figures of the shot in which the mean is highest, for people; none of no shot."""
+    most = max(found, key=lambda each: each.mean, default=None)
+    return most.summary("time code") if most else {}
 
 
 def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> dict[str, str | float]:

@@ -22,7 +22,8 @@ from ..files import split_location
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..scene.assets import Deformer
+    from ..delivery.bake.counted import MetWorld
+    from ..scene.assets import Deformer, Motion
 
 LARGEST = 5  # times the RMS tolerance: how far any vertex may be off
 
@@ -86,6 +87,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         units=StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis),
         origin=cache_origin(options.cache, points.mesh, options.output),
         riders=riders_of(stage, mesh, options.root, report),
+        met=_met(str(where), options, deformer, motion, report),
         hidden=read_hidden(where, motion, root=options.root),
         include_body=not options.no_body,
         verify=not options.no_verify,
@@ -96,6 +98,19 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     )
     report(Result("skin", result.figures()))
     return EXIT_OK
+
+
+def _met(
+    where: str, options: argparse.Namespace, deformer: Deformer, motion: Motion, report: Reporter
+) -> MetWorld | None:
+    """Return what surrounds the character where its motion was read; None where nothing does."""
+    from ..delivery.bake.counted import MetWorld
+    from ..delivery.bake.world import ShotSurroundings
+
+    around = ShotSurroundings(where, str(options.stage), deformer.scene, motion, None)
+    world = around.seen
+    around.tell(report)
+    return MetWorld(world, lambda frame: frame / motion.fps) if world else None
 
 
 def _deformer(options: argparse.Namespace, report: Reporter) -> Deformer:

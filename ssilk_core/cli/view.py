@@ -22,6 +22,7 @@ from .options import RATE, NumberRange, check_output
 
 if TYPE_CHECKING:
     from ..delivery.view.player import ShotPlayer
+    from ..delivery.view.props import ShotProps
 
 PAGE = ".html"
 
@@ -60,9 +61,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     players = [open_shot(path) for path in options.shots]
     labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
     look = _look(options, film)
-    props = [] if suffix == PAGE else [props_of(path, report) for path in options.shots]
+    props = [props_of(path, report) for path in options.shots]
     if suffix == PAGE:
-        count = _write_page(options.output, players, labels, report)
+        count = _write_page(options.output, players, labels, props, report)
     elif film:
         count = film_of_shots(
             options.output, players, labels=labels, fps=options.fps, look=look, props=props, report=report
@@ -81,13 +82,19 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_OK
 
 
-def _write_page(path: Path, players: Sequence[ShotPlayer], labels: Sequence[str], report: Reporter) -> int:
+def _write_page(
+    path: Path,
+    players: Sequence[ShotPlayer],
+    labels: Sequence[str],
+    props: Sequence[ShotProps | None],
+    report: Reporter,
+) -> int:
     """Write a page that plays shots; return the number of their frames."""
     from ..delivery.report.page import Section, page
     from ..delivery.report.player import played
 
     title = ", ".join(labels) or path.stem
-    text = page(title, [Section("The shot", played(players, labels, report), plays=True)])
+    text = page(title, [Section("The shot", played(players, labels, report, props), plays=True)])
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return len(players[0].frame_times)

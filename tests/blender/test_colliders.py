@@ -457,3 +457,63 @@ def test_a_pose_that_differs_is_seen_by_colliders_where_it_is(ready, seeing):
     assert np.abs(now[4] - before[4]).max() > 1e-2
     np.testing.assert_array_equal(np.delete(now, 4, axis=0), np.delete(before, 4, axis=0))
     assert ready.ops.ssilk.stop_live() == {"FINISHED"}
+
+
+def a_shape_of_the_body(ready: Any, garment: Any) -> Any:
+    """A cylinder that collides and rides on the character's root bone, inside its body, as a ragdoll's shapes do."""
+    armature = garment.find_armature()
+    bone = next(bone for bone in armature.pose.bones if not bone.parent)
+    ready.ops.mesh.primitive_cylinder_add(radius=0.06, depth=0.2, location=armature.matrix_world @ bone.center)
+    shape = ready.context.object
+    world = shape.matrix_world.copy()
+    shape.parent, shape.parent_type, shape.parent_bone = armature, "BONE", bone.name
+    ready.context.view_layer.update()
+    shape.matrix_world = world
+    return collide(ready, garment, shape)
+
+
+def inside_body(ready: Any, shape: Any, body: Any) -> list[float]:
+    """Return for some frames the share of a shape's vertices inside the body, both as Blender evaluates them."""
+    from mathutils import Vector
+
+    found = []
+    for frame in FRAMES[::13]:
+        ready.context.scene.frame_set(frame)
+        depsgraph = ready.context.evaluated_depsgraph_get()
+        skin, own = body.evaluated_get(depsgraph), shape.evaluated_get(depsgraph)
+        to_skin = skin.matrix_world.inverted() @ own.matrix_world
+        hits = []
+        for vertex in own.data.vertices:
+            at, crossed = to_skin @ vertex.co, 0
+            while (hit := skin.ray_cast(at, Vector((0.9, 0.3, 0.05))))[0]:
+                crossed, at = crossed + 1, hit[1] + 1e-4 * Vector((0.9, 0.3, 0.05))
+            hits.append(crossed % 2)
+        found.append(float(np.mean(hits)))
+    ready.context.scene.frame_set(1)
+    return found
+
+
+def test_a_shape_inside_the_body_is_its_own_in_live_playback_and_in_bakes_unless_it_is_chosen(ready, seeing, capfd):
+    from blender_addon.playback import playing
+    from blender_addon.scene.garment import bodies_of
+
+    alone, _ = live(ready, seeing)
+    shape = a_shape_of_the_body(ready, seeing)
+    (body,) = bodies_of(seeing, seeing.find_armature())
+    assert min(inside_body(ready, shape, body)) > 0.9
+    assert ready.ops.ssilk.play_live() == {"FINISHED"}
+    assert playing.live(seeing).colliders.own == (shape.name,)
+    assert ready.ops.ssilk.stop_live() == {"FINISHED"}
+    with_it, near = live(ready, seeing)
+    assert near is None and np.abs(with_it - alone).max() < EXACT
+    capfd.readouterr()
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    assert f"cloth does not meet '{shape.name}', inside the body in each frame." in capfd.readouterr().out
+    assert np.abs(shown(ready, seeing, FRAMES) - alone).max() < EXACT
+    seeing.ssilk.colliders = ready.data.collections.new("Chosen")
+    seeing.ssilk.colliders.objects.link(shape)
+    chosen, near = live(ready, seeing)
+    assert near is not None and near[..., :3].any()
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    assert "does not meet" not in capfd.readouterr().out
+    assert np.abs(shown(ready, seeing, FRAMES) - chosen).max() < EXACT

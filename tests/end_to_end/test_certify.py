@@ -102,6 +102,8 @@ def test_other_frames_are_those_of_the_bake_without(there):
 
 def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
     assert main(["verify", "certified.usda"]) == 0
+    told, free = capsys.readouterr().err, f"0 of {FRAMES} frames intersect, 0 show covered skin"
+    assert f"certificate of the file: {free}\n" in told and f"counted in it: {free}\n" in told
     stage = Usd.Stage.Open("certified.usda")
     for prim in stage.Traverse():
         if prim.IsA(UsdSkel.Animation):

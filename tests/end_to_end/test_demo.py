@@ -76,8 +76,8 @@ def drafted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def rigged(garment: str, folder: Path) -> Scene:
     """Return the scene of the stage that the demo's own command rigs, unless a demo has rigged it already."""
-    chosen = Namespace(output=folder, garment=garment, settings=[])
-    rig = demo._trained(chosen)[0]
+    chosen = Namespace(output=folder, garment=garment, settings=[], pretrained=True)
+    rig = demo._shipped(chosen)[0]
     assert rig[0] == "rig"
     if not Path(rig[-1]).exists():
         write_garment(folder / "wardrobe" / f"{garment}.usdc", wardrobe()[garment].mesh)
@@ -128,7 +128,8 @@ def typed(said: str) -> list[list[str]]:
 def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     assert main(["demo", "--pretrained", "-o", str(tmp_path)]) == 0
     said = capsys.readouterr().err
-    assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
+    assert [command[0] for command in typed(said)] == ["rig", "bake", "bake", "view", "view"]
+    assert "warning" not in said
     made = load_model(shipped.shipped_path("cape")).provenance
     chain = [made]
     while "base" in chain[-1]:
@@ -141,14 +142,16 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
     assert "of the stepper alone" in trained and not alone[-1]
     assert f"shipped cape: {trained} on {len(made['motions'])} motions, seed" in said
     assert {path.name for path in tmp_path.iterdir()} == {
-        *("wardrobe", "motions", "shot.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")
+        *("wardrobe", "motions", "shot.usdc", "cape_stage.usdc", "lbs.usdc"),
+        *("cape_shipped.usdc", "shipped.png", "shipped.mp4"),
     }
 
 
 def test_the_draft_is_trained_and_filmed_beside_what_ships(drafted):
     folder, said = drafted
     commands = typed(said)
-    assert [command[0] for command in commands[4:]] == ["rig", "train", "bake", "view", "view"]
+    both = [*("rig", "bake", "bake", "view", "view"), *("train", "bake", "view", "view")]
+    assert [command[0] for command in commands] == both
     names = ("lbs.usdc", "cape_draft.usdc", "cape_shipped.usdc")
     assert commands[-1][1:4] == [str(folder / name) for name in names]
     for name in ("cape_draft.safetensors", "shipped.mp4", "draft.mp4", "draft.png"):

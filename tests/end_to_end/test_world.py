@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -191,6 +193,7 @@ def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
 
 def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys):
     clip = Usd.Stage.Open("floored.usda")
+    clip.RemovePrim("/Set/Floor")
     box = UsdGeom.Cube.Define(clip, "/Set/Box")
     box.CreateSizeAttr(0.6)
     place = box.AddTranslateOp()
@@ -207,10 +210,68 @@ def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys)
     middles = [np.argwhere(each)[:, 1].mean() for each in with_box]
     assert middles[0] + 10 < middles[1]  # it moves
     capsys.readouterr()
+    for gone in "model.safetensors", "rigged.usda":  # neither model nor character is needed for a picture
+        Path(gone).unlink()
+    np.testing.assert_array_equal(prop_pixels("shot.usdc"), with_box)
+    assert "warning" not in capsys.readouterr().err
+    for shot in "shot.usdc", "layers/shots/floored/shot.usda":
+        assert main(["view", shot, "-o", "page.html"]) == 0
+        assert [mesh["points"] for mesh in played_meshes("page.html")][-1] == 36
+    assert "checked> /Set/Box<" in Path("page.html").read_text()
+    clip.RemovePrim("/Set/Box")
+    clip.GetRootLayer().Save()
+    assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
+    gone = "warning: shot.usdc: the colliders that it met are not drawn: floored.usda: it has no /Set/Box any more"
+    assert gone in capsys.readouterr().err
     Path("floored.usda").unlink()
     assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
     told = capsys.readouterr().err
-    assert "warning: shot.usdc: the colliders that it met are not drawn: the motion that it was baked" in told
+    assert "warning: shot.usdc: the colliders that it met are not drawn: the stage of its colliders is not" in told
+
+
+def played_meshes(page: str) -> list[dict[str, object]]:
+    """What a page says of the meshes that it plays."""
+    about = re.search(r'data-about="([^"]*)"', Path(page).read_text())
+    return json.loads(html.unescape(about[1]))["meshes"]
+
+
+def test_pages_simulations_and_skinned_caches_count_and_show_colliders_as_bakes_do(stage, capsys):
+    clip = Usd.Stage.Open("floored.usda")
+    box = UsdGeom.Cube.Define(clip, "/Set/Box")
+    box.CreateSizeAttr(0.4)
+    box.AddTranslateOp().Set((0.5, 0.95, 0))
+    UsdPhysics.CollisionAPI.Apply(box.GetPrim())
+    clip.GetRootLayer().Save()
+    # A cache that knows of no colliders goes through those of its motion.
+    assert main([*SIMULATE, "plain.usda", "-o", "plain_sim.usdc"]) == 0
+    skin = ["skin", "plain_sim.usdc", "--stage", "rigged.usda", "--motion", "floored.usda", "-o", "skinned.usdc"]
+    capsys.readouterr()
+    assert main(skin) == 0
+    told, found = capsys.readouterr().err, points_of("skinned.usdc")
+    under = found[..., 1] < FLOOR - 5e-3
+    boxed = np.abs(found - [0.5, 0.95, 0]).max(axis=-1) < 0.2 - 5e-3
+    share = (under | boxed).mean(axis=1)
+    said = read_provenance("skinned.usdc")["sunk_cloth"]
+    assert share.min() > 0.1 and said["mean"] == pytest.approx(share.mean(), rel=1e-3)
+    assert f"cloth inside colliders: {share.mean():.3%}, the mean of 5 frames" in told
+    for more in ["--points"], []:
+        command = [each for each in SIMULATE if each != "--points"]
+        assert main([*command, "floored.usda", "-o", "sim.usdc", *more]) == 0
+        assert "cloth inside colliders: 0.000%, the mean of 5 frames" in capsys.readouterr().err
+        said = read_provenance("sim.usdc")
+        assert said["sunk_cloth"]["mean"] == 0 and list(said["colliders"]["prims"]) == ["/Set/Floor", "/Set/Box"]
+    for shot in "skinned.usdc", "sim.usdc":
+        assert main(["report", shot, "-o", "page.html"]) == 0
+        assert ": cloth in colliders: " in capsys.readouterr().err
+        assert "checked> /Set/Box<" in Path("page.html").read_text()
+    model = ["report", "model.safetensors", "--stage", "rigged.usda", "--motion", "floored.usda", "-o", "model.html"]
+    assert main(model) == 0
+    told = capsys.readouterr().err
+    assert "the network does not see colliders" in told and ": cloth in colliders: " in told
+    assert "checked> /Set/Box<" in Path("model.html").read_text()
+    assert main(["bake", *model[1:-2], "-o", "shot.usdc"]) == 0
+    mean = read_provenance("shot.usdc")["sunk_cloth"]["mean"]
+    assert f": cloth in colliders: {mean:.3%} of the vertices" in told
 
 
 SHEET = ["--columns", "2", "--size", "200x200", "--azimuth", "0"]
@@ -247,6 +308,11 @@ def test_a_network_goes_on_without_a_collider_that_cannot_be_read(stage, capsys,
     assert ("the network sees /Set/Floor\n" in told) is sees
     np.testing.assert_array_equal(points_of("network.usdc"), points_of("whole.usdc"))
     assert main(["verify", "network.usdc"]) == 0
+    capsys.readouterr()
+    assert main([*BAKE, "floored.usda", "-o", "lbs.usdc", "--lbs"]) == 0
+    told = capsys.readouterr().err
+    assert told.count(left_out) == 1 and "/Set/Flat: no triangle of it has an area" in told
+    assert "does not see" not in told and "/Set/Bad" not in read_provenance("lbs.usdc")["sunk_cloth"]["colliders"]
     for command in ([*BAKE, "floored.usda", "--refine", "1"], [*SIMULATE, "floored.usda"]):
         assert main([*command, "-o", "solved.usdc"]) == 2
         assert "/Set/Bad: its faces change over time" in capsys.readouterr().err

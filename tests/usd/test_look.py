@@ -296,7 +296,7 @@ def test_what_is_lost_is_told_by_name(hero, tmp_path):
                   polygon_indices=deformer.scene.garment.mesh.indices_of_corners[:-4], uvs=None)  # fmt: skip
     garment = replace(deformer.scene.garment, mesh=cut)
     other = replace(deformer, scene=replace(deformer.scene, garment=garment))
-    assert "Shawl loses its look" in shoot(other, tmp_path / "other.usda").left_out
+    assert "Shawl loses its look, if it had any: " in shoot(other, tmp_path / "other.usda").left_out
 
 
 def test_variants_that_are_not_selected_are_told_by_name(hero, tmp_path):

@@ -11,7 +11,7 @@ more room between cloth and cloth.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from importlib.util import find_spec
@@ -26,7 +26,7 @@ from ...physics.intersections.pairs import need_predicates
 from ...scene.assets import Floats, GarmentPose
 from ...scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from .opened import add_provenance, open_shot, provenance_of
-from .result import CertificateSummary, FrameSpan
+from .result import CertificateSummary, FrameSpan, certified_frames
 from .rollout import BakeRollout, Certificate
 
 if TYPE_CHECKING:
@@ -132,8 +132,22 @@ def proven(rollout: BakeRollout, path: Path, report: Reporter = silent) -> BakeR
     return None
 
 
-def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = silent) -> Callable[[int], bool]:
-    """Check that the frames of a file are as free as it says; return which of them it says were moved.
+@dataclass(frozen=True)
+class CheckedCertificate:
+    """A certificate that a file says of itself, and what was counted in it again.
+
+    Attributes:
+        moved: frames that it says were moved.
+        said, counted: what the file says, and what was found in it now, in the same words.
+    """
+
+    moved: frozenset[int]
+    said: str
+    counted: str
+
+
+def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = silent) -> CheckedCertificate:
+    """Check that the frames of a file are as free as it says; return what it says and what was counted.
 
     Raises:
         VerificationError: it does not say how free it is, or another frame is not.
@@ -146,14 +160,16 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
         raise VerificationError(f"{path}: it was baked with --certify, but has no certificate; bake it again.")
     moved, left = (_frames_said(said.get(name, ())) for name in ("moved frames", "frames left"))
     shot, samples = open_shot(path), rollout.request.samples_per_frame
-    times = shot.sample_times(samples)
+    times, intersecting, showing = shot.sample_times(samples), 0, 0
     for frame, faults in _faults_in(shot, Certifier(rollout.deformer.scene), rollout, samples, report):
+        intersecting, showing = intersecting + (len(faults.pairs) > 0), showing + (len(faults.skin) > 0)
         if frame not in left:
             raise VerificationError(
                 f"{path}: {len(faults.pairs)} pairs of triangles intersect and {len(faults.skin)} points of covered "
                 f"skin show at time code {times[frame]:g}, where its certificate says that none does."
             )
-    return moved.__contains__
+    counted = certified_frames(len(times), intersecting, showing)
+    return CheckedCertificate(frozenset(moved), str(said.get("found", "nothing")), counted)
 
 
 def _frames_said(said: object) -> set[int]:

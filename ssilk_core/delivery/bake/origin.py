@@ -10,10 +10,13 @@ from pathlib import Path
 
 from ...errors import fail
 from ...files import relative_path, sha256, split_location
+from ...scene.assets import ShotWorld
 from .opened import provenance_of
 from .record import RECORD
 from .request import BakeRequest
 from .rollout import BakeRollout
+
+COLLIDERS = "colliders"  # what a shot says of those that its cloth met, under this name
 
 
 def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
@@ -27,7 +30,41 @@ def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
         "recovered": rollout.recovered,
         **solved,
         **refined,
+        **met_metadata(rollout.around.seen, output),
     }
+
+
+def met_metadata(world: ShotWorld | None, output: Path) -> dict[str, object]:
+    """Return what a shot says of the colliders that its cloth met, so that they are found again; they are of one
+    stage."""
+    if world is None or not world.colliders:
+        return {}
+    stage = split_location(world.colliders[0].path)[0]
+    prims = [each.name for each in world.colliders]
+    return {COLLIDERS: {"stage": _from_folder(stage, output.absolute().parent), "prims": prims}}
+
+
+@dataclass(frozen=True)
+class ColliderOrigin:
+    """The colliders that the cloth of a shot met: the present path of their stage, and their prims in it."""
+
+    stage: str
+    prims: tuple[str, ...]
+
+
+def read_met(shot: Path) -> ColliderOrigin | None:
+    """Return the colliders that a shot says its cloth met; None where it says of none.
+
+    Raises:
+        SsilkError: not a readable shot, or their stage is not found.
+    """
+    said = provenance_of(shot).get(COLLIDERS)
+    if not isinstance(said, Mapping):
+        return None
+    near = str(said.get("stage"))
+    if (found := _existing(shot, near, None)) is None:
+        fail(str(shot), f"the stage of its colliders is not at {near}", "it is looked for as seen from the shot")
+    return ColliderOrigin(str(found), tuple(map(str, said.get("prims", ()))))
 
 
 def _from_folder(location: str, folder: Path) -> str:
@@ -85,12 +122,16 @@ def read_origin(
     hashes = {name: provenance.get(f"{name}_sha256") for name in ("model", "motion")}
     found: dict[str, str] = {}
     for name, path in stored.inputs.items():
-        found[name] = str(elsewhere.get(name) or _existing(shot, name, path, hashes.get(name)))
+        place = elsewhere.get(name) or _existing(shot, path, hashes.get(name))
+        if place is None:
+            what = f"the {name} that it was baked from is not at {path}"
+            fail(str(shot), what, f"--{name} gives its present path")
+        found[name] = str(place)
     return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
 
 
-def _existing(shot: Path, name: str, near: str, held: object) -> Path:
-    """Return the place of an input where there is a file.
+def _existing(shot: Path, near: str, held: object) -> Path | None:
+    """Return the place of an input where there is a file; None where there is none.
 
     It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
     from each folder above the shot, because some inputs may have stayed where they were. Of several files the first
@@ -103,11 +144,9 @@ def _existing(shot: Path, name: str, near: str, held: object) -> Path:
     tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
     places = [shot.parent / near, Path(near), Path(tail), *(above / tail for above in shot.absolute().parents)]
     there = [path for path in places if _file(path).is_file() and not _is_baked(_file(path), shot)]
-    if not there:
-        fail(str(shot), f"the {name} that it was baked from is not at {near}", f"--{name} gives its present path")
     if len({_file(path).resolve() for path in there}) == 1:
         return there[0]
-    return next((path for path in there if sha256(_file(path)) == held), there[0])
+    return next((path for path in there if sha256(_file(path)) == held), next(iter(there), None))
 
 
 def _file(place: Path) -> Path:

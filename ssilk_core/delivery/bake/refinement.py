@@ -47,10 +47,10 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     if rollout.refinement is not None:
         return rollout
     if not rollout.request.refine:
-        if not rollout.request.lbs:
-            tell_surrounded(rollout.around, rollout.sight, rollout.fabric.drag, report)
-            if words := _too_strong(rollout.source):
-                report(Message(f"{rollout.request.motion}: {words}", "warning"))
+        sight = None if rollout.request.lbs else rollout.sight
+        tell_surrounded(rollout.around, sight, rollout.fabric.drag, report)
+        if sight and (words := _too_strong(rollout.source)):
+            report(Message(f"{rollout.request.motion}: {words}", "warning"))
         return rollout
     from ...physics.refine import RefinementMeans
 

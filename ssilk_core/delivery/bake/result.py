@@ -46,6 +46,8 @@ class Verification:
         allowed_error_m: the bound there [m].
         mean_energy_j: mean energy of the refined frames [J]; None where vertices were compared.
         rms_error_m: RMS distance from the points that the shot stands for [m]; None where it holds its own vertices.
+        stated_faults: what the certificate of the file says of how free its frames are, where that was checked.
+        counted_faults: what was found of it.
     """
 
     frames: int
@@ -53,9 +55,15 @@ class Verification:
     allowed_error_m: float | None = None
     mean_energy_j: float | None = None
     rms_error_m: float | None = None
+    stated_faults: str | None = None
+    counted_faults: str | None = None
 
     def figures(self) -> dict[str, object]:
         """Return figures for people."""
+        stated = {"certificate of the file": self.stated_faults, "counted in it": self.counted_faults}
+        return {**self._compared(), **{name: value for name, value in stated.items() if value is not None}}
+
+    def _compared(self) -> dict[str, object]:
         if self.mean_energy_j is not None:
             return {
                 "frames of lower energy than the network's": self.frames,
@@ -193,6 +201,11 @@ class LatentSummary:
         }
 
 
+def certified_frames(frames: int, intersecting: int, showing: int) -> str:
+    """Return in words in how many frames triangles intersect others, and covered skin shows."""
+    return f"{intersecting:,} of {frames:,} frames intersect, {showing:,} show covered skin"
+
+
 @dataclass(frozen=True, kw_only=True)
 class CertificateSummary:
     """What was found in each frame of a written file whose frames were moved until nothing is wrong in them.
@@ -229,7 +242,7 @@ class CertificateSummary:
         return f"{count} frames have no free position: {'; '.join(spans)}"
 
     def __str__(self) -> str:
-        said = f"{self.intersecting:,} of {self.frames:,} frames intersect, {self.showing:,} show covered skin"
+        said = certified_frames(self.frames, self.intersecting, self.showing)
         return f"{said}; {self.unfree}" if self.left else said
 
     def figures(self) -> dict[str, object]:

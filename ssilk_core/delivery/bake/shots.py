@@ -19,6 +19,8 @@ STAGE = "shot.usda"  # of a shot, with all its garments
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
 
+STAGE = "shot.usda"  # of a shot
+
 
 def write_shot_stage(
     folder: Path,

@@ -19,10 +19,11 @@ from ...scene.kinematics import held_at_cuts, sample_motion
 from ...scene.riders import Rider, RiderJoints
 from ..targets import GLB
 from .bodies import worn
-from .counted import state_counts
+from .counted import MetWorld, state_counts
 from .glb import warn_of_sets, write_glb_shot
 from .nearness import need_near
 from .opened import open_shot
+from .origin import met_metadata
 from .result import SKINNED, BakeResult, ShotShapes, Verification
 from .riders import verify_riders
 from .verification import compare_trajectories, need_valid
@@ -88,6 +89,7 @@ def skin_trajectories(
     origin: Mapping[str, object],
     about: Mapping[str, object] | None = None,
     riders: Sequence[Rider] = (),
+    met: MetWorld | None = None,
     hidden: Sequence[tuple[int, bool]] = (),
     include_body: bool = True,
     verify: bool = True,
@@ -106,6 +108,7 @@ def skin_trajectories(
         origin: where the points come from, as the file says it; without a cache it cannot be compared again.
         about: what else the file says of itself.
         riders: what rides on the garment.
+        met: what surrounds the character; cloth in its colliders is counted.
         hidden: from which frames on the garment is hidden (True) or seen (False).
         tolerance: how near joints and blendshapes come to the points; `FitTolerance()` by default.
         source: what the points come from, for messages.
@@ -128,6 +131,7 @@ def skin_trajectories(
     if path.suffix == GLB:
         warn_of_sets(found.deformer, path, report)
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
+    said |= met_metadata(met.world, path) if met else {}
     verification: Verification | None = None
     ridden = RiderJoints(found.deformer, riders, found.deformer.skin.indices.shape[1])
     poses = ridden.poses(motion, found.poses)
@@ -142,7 +146,9 @@ def skin_trajectories(
             else:
                 summary = write_shot(layer, ridden.deformer, motion, poses, units=units, **common)
             name = Path(split_location(motion.path)[0]).stem
-            counts = state_counts(layer, found.deformer.scene, motion, name=name, device=device, riders=riders)
+            counts = state_counts(
+                layer, found.deformer.scene, motion, name=name, device=device, met=met, riders=riders
+            )
         if verify:
             need_valid(unverified, report)
             shot = open_shot(unverified)
@@ -157,7 +163,7 @@ def skin_trajectories(
         proxies=summary.proxy_count - len(ridden.names), blendshapes=summary.shape_count,
         size_bytes=path.stat().st_size,
         verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
-        intersections=counts.intersections, entered=counts.entered,
+        intersections=counts.intersections, sunk=counts.sunk, entered=counts.entered,
     )  # fmt: skip
 
 

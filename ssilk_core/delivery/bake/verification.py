@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
@@ -29,6 +29,7 @@ from .rollout import BakeRollout
 
 if TYPE_CHECKING:
     from ssilk_usd.checking.shot import PosedGarment
+    from ssilk_usd.shots.play import Shot
 
     from ...scene.decomposition import FitTolerance
 
@@ -116,15 +117,24 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     Raises:
         VerificationError: a check fails, or a vertex is further off than allowed.
     """
+    need_valid(path, report)
+    shot = open_shot(path)
+    verify_riders(shot, shot.sample_times(rollout.request.samples_per_frame), rollout.rider_joints(), report)
+    if not (rollout.request.certify and rollout.certificate is None):
+        return _verify_points(rollout, path, shot, None, report)
+    checked = verify_certificate(rollout, path, report)
+    found = _verify_points(rollout, path, shot, checked.moved, report)
+    return replace(found, stated_faults=checked.said, counted_faults=checked.counted)
+
+
+def _verify_points(
+    rollout: BakeRollout, path: Path, shot: Shot | GlbShot, moved: Container[int] | None, report: Reporter
+) -> Verification:
+    """Compare the points of a file with the rollout that it should hold, but for frames that a certificate moved."""
     from ssilk_usd.checking.shot import compare_points
 
-    need_valid(path, report)
-    shot, samples = open_shot(path), rollout.request.samples_per_frame
+    samples = rollout.request.samples_per_frame
     times = shot.sample_times(samples)
-    verify_riders(shot, times, rollout.rider_joints(), report)
-    moved: Callable[[int], bool] | None = None
-    if rollout.request.certify and rollout.certificate is None:
-        moved = verify_certificate(rollout, path, report)
     if rollout.request.latent_iterations and rollout.latents is None:
         return _verify_extent(shot, times, path, rollout, report, "solved in latents")
     if rollout.request.refine and rollout.refinement is None:
@@ -152,14 +162,14 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
 
 
 def _with_moved(
-    shot: PosedGarment, times: Sequence[float], expected: Iterator[Floats], moved: Callable[[int], bool] | None
+    shot: PosedGarment, times: Sequence[float], expected: Iterator[Floats], moved: Container[int] | None
 ) -> Iterator[Floats]:
     """Yield what a shot should hold (V, 3) [m], with its own points in frames that a certificate says were moved.
 
     The last digits of where they were moved to depend on the machine.
     """
     for frame, points in enumerate(expected):
-        is_moved = moved is not None and frame < len(times) and moved(frame)
+        is_moved = moved is not None and frame < len(times) and frame in moved
         yield shot.garment_points(times[frame]) if is_moved else points
 
 

@@ -148,7 +148,7 @@ class ShotSurroundings:
             return world  # networks that see none are baked without libigl, too
         from ...physics.world.own_shapes import OwnShapes
 
-        shapes, asked = OwnShapes(self._scene, self.motion), self.found.asked
+        shapes, asked = OwnShapes.of(self._scene, self.motion), self.found.asked
         own = [each for each in world.colliders if each.path not in asked and shapes.has(each)]
         if not own:
             return world
@@ -194,15 +194,18 @@ class Sight:
         return cls(who, file.config.descriptors == "relative", blown, sees)
 
 
-def tell_surrounded(around: ShotSurroundings, sight: Sight, drag: float, report: Reporter) -> None:
+def tell_surrounded(around: ShotSurroundings, sight: Sight | None, drag: float, report: Reporter) -> None:
     """Report what a network sees of the colliders around its character, and warn of what it misses.
 
+    Colliders that cannot be read are told in any case: they are not counted either.
+
     Args:
+        sight: None of linear blend skinning, of which nobody expects to see anything.
         drag: of the garment's fabric, by which air moves it.
     """
     world = around.seen
     around.tell(report)
-    if world is None:
+    if world is None or sight is None:
         return
     there = {"colliders": bool(world.colliders), "wind": bool(world.air), "its gravity": world.gravity is not None}
     sees = {"colliders": sight.colliders, "wind": sight.pull and drag > 0, "its gravity": sight.pull}

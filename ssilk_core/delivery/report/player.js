@@ -47,7 +47,7 @@ class Surface {
     Object.assign(this, about);
     const cut = 4 * this.triangles * 3;
     this.faces = new Uint32Array(bytes.slice(0, cut).buffer);
-    this.values = unpacked(bytes.subarray(cut), frames, 3 * this.points);
+    this.values = unpacked(bytes.subarray(cut), this.place ? 1 : frames, 3 * this.points);
     this.shown = true;
     this.places = new Float32Array(3 * this.points);
     this.normals = new Float32Array(3 * this.points);
@@ -64,7 +64,9 @@ class Surface {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, this.faces, gl.STATIC_DRAW);
   }
 
-  pose(gl, before, share, origins) {
+  // What has a place of its own stays there, and has one frame.
+  pose(gl, now, part, path) {
+    const [before, share, origins] = this.place ? [0, 0, [this.place]] : [now, part, path];
     const width = 3 * this.points, after = Math.min(before + 1, origins.length - 1);
     for (let i = 0; i < width; i++) {
       const axis = i % 3;

@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...events import Countdown, Reporter, silent
-from ...scene.assets import Floats
+from ...scene.assets import Floats, Ints
+from ..view.colours import PROP
 from ..view.player import PlayerMesh, ShotPlayer
+from ..view.props import FigureBox, ShotProps
 from ..view.shots import mesh_colours, need_matching
+from .props import PlayedProp, played_props
 
 FPS = 30.0  # frames per second that a page holds at most; between them, points go straight
 MAX_VALUES = 30_000_000  # coordinates that a page holds at most; of longer shots fewer frames
@@ -27,11 +30,17 @@ WORDS = {"play": "Play", "pause": "Pause", "frame": "Frame",
          "hint": "Drag to turn, scroll to come closer; space plays, the arrow keys step."}  # fmt: skip
 
 
-def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Reporter = silent) -> str:
+def played(
+    players: Sequence[ShotPlayer],
+    labels: Sequence[str] = (),
+    report: Reporter = silent,
+    props: Sequence[ShotProps | None] = (),
+) -> str:
     """Return HTML that plays shots of one length and rate, side by side.
 
     Args:
         labels: a word for each shot.
+        props: of each shot, where its cloth met any.
 
     Raises:
         SsilkError: shots that do not match, or without frames.
@@ -42,25 +51,35 @@ def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Re
     frames, fps = range(0, len(times), step), players[0].fps / step
     origins, shown = zip(*_posed(players, frames, report))
     path = np.array(origins)
-    meshes, parts, words, floor = [], [], [], []
-    for index, (word, mesh, colour) in enumerate(_described(players, labels)):
-        points = np.stack([each[index] for each in shown])
-        if not (mesh.is_garment or mesh.is_rider):
-            floor.append((points[..., 1].min(axis=1) + path[:, 1]).min())
-        quantum, values = quantised(points)
-        data = np.asarray(mesh.faces).astype("<u4").tobytes() + packed(values)
-        parts.append(base64.b64encode(zlib.compress(data, 9)).decode())
-        meshes.append({"points": points.shape[1], "triangles": len(mesh.faces), "step": quantum,
-                       "colour": colour.round(4).tolist()})  # fmt: skip
+    described = list(_described(players, labels))
+    skins = [index for index, (_, mesh, _) in enumerate(described) if not (mesh.is_garment or mesh.is_rider)]
+    lows = [float((own[index][:, 1] + origin[1]).min()) for own, origin in zip(shown, path) for index in skins]
+    lowest = min(lows, default=float(np.concatenate(shown[0])[:, 1].min() + path[0, 1]))
+    boxes = [[FigureBox.of(np.concatenate(each) + origin) for each, origin in zip(own, path)]
+             for own in _of_players(players, shown)]  # fmt: skip
+    size = float(np.median([box.size for own in boxes for box in own]))
+    floors = (met.ground(lowest, size) for met in props if met)
+    ground = next((floor for floor in floors if floor is not None), lowest)
+    parts, meshes, words = [], [], []
+    for index, (word, mesh, colour) in enumerate(described):
+        quantum, values = quantised(np.stack([each[index] for each in shown]))
+        parts.append(_stored(mesh.faces, values))
+        meshes.append(_about_mesh(values, mesh.faces, quantum, colour))
         words.append(word)
+    for side, (met, label) in enumerate(zip(props, (*labels, *[""] * len(props)))):
+        for prop in played_props(met, frames, boxes[side], ground, APART * side, report) if met else ():
+            place, quantum, values = _prop_values(prop, path)
+            parts.append(_stored(prop.faces, values))
+            meshes.append({**_about_mesh(values, prop.faces, quantum, PROP), **place})
+            words.append(f"{label}: {prop.name}" if label else prop.name)
     about = {
         "fps": fps, "start": times[0], "step": (times[1] - times[0]) * step if len(times) > 1 else 1.0,
-        "ground": float(min(floor or [np.concatenate(shown[0])[:, 1].min() + path[0, 1]])),
+        "ground": ground,
         "distance": round(2.1 * float(np.ptp(np.concatenate(shown[0]), axis=0).max()), 3),
         "origins": path.round(6).tolist(), "centres": _smoothed(path, fps).round(4).tolist(),
         "meshes": meshes, "words": WORDS,
     }  # fmt: skip
-    boxes = "".join(f'<label><input type="checkbox" checked> {escape(word)}</label> ' for word in words)
+    ticks = "".join(f'<label><input type="checkbox" checked> {escape(word)}</label> ' for word in words)
     texts = "".join(f'<script type="text/plain">{part}</script>' for part in parts)
     speeds = "".join(
         f'<option value="{speed:g}"{" selected" if speed == 1 else ""}>{speed:g}×</option>'
@@ -71,9 +90,37 @@ def played(players: Sequence[ShotPlayer], labels: Sequence[str] = (), report: Re
         f'aria-label="the shot, playing"></canvas>'
         f'<div class="controls"><button type="button">{WORDS["play"]}</button>'
         f'<input type="range" min="0" value="0" step="any" aria-label="time"><output></output>'
-        f'<select aria-label="speed">{speeds}</select></div><div class="controls">{boxes}</div>'
+        f'<select aria-label="speed">{speeds}</select></div><div class="controls">{ticks}</div>'
         f'<p class="note">…</p>{texts}</div>'
     )
+
+
+def _of_players(players: Sequence[ShotPlayer], shown: Sequence[Sequence[Floats]]) -> list[list[list[Floats]]]:
+    """Return the meshes of each shot alone, in each frame."""
+    ends = np.cumsum([len(player.meshes) for player in players]).tolist()
+    spans = [slice(end - len(player.meshes), end) for player, end in zip(players, ends)]
+    return [[list(each[span]) for each in shown] for span in spans]
+
+
+def _stored(faces: Ints, values: NDArray[np.int16]) -> str:
+    """Return triangles (T, 3) and points (F, P, 3) as text."""
+    data = np.asarray(faces).astype("<u4").tobytes() + packed(values)
+    return base64.b64encode(zlib.compress(data, 9)).decode()
+
+
+def _about_mesh(values: NDArray[np.int16], faces: Ints, quantum: float, colour: NDArray) -> dict[str, object]:
+    return {"points": values.shape[1], "triangles": len(faces), "step": quantum,
+            "colour": np.asarray(colour).round(4).tolist()}  # fmt: skip
+
+
+def _prop_values(prop: PlayedProp, path: Floats) -> tuple[dict[str, object], float, NDArray[np.int16]]:
+    """Return what a page says of the place of a prop, and its points from there; one that stays has one frame."""
+    if len(prop.points) > 1:
+        quantum, values = quantised(prop.points - path[:, None])
+        return {}, quantum, values
+    place = prop.points[0].mean(axis=0).round(6)
+    quantum, values = quantised(prop.points - place)
+    return {"place": place.tolist()}, quantum, values
 
 
 def _step(players: Sequence[ShotPlayer]) -> int:

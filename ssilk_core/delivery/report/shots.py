@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from ...events import Countdown, Reporter, silent
+from ...events import Countdown, Message, Reporter, silent
 from ...physics.world.sunk import SunkCloth
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
@@ -16,6 +16,7 @@ from ...scene.fabrics import Fabric
 from ...scene.mesh.joined import joined
 from ..view.camera import follow_cameras
 from ..view.player import ShotPlayer
+from ..view.props import FigureBox, ShotProps
 from ..view.render import Image, render
 from ..view.shots import shot_surfaces
 from .layers import LayersMeter, layers_section
@@ -47,6 +48,7 @@ def shot_sections(
     report: Reporter = silent,
     *,
     sunk: Mapping[int, SunkCloth] | None = None,
+    props: ShotProps | None = None,
 ) -> list[Section]:
     """Return the sections about a shot.
 
@@ -55,6 +57,7 @@ def shot_sections(
         garments: those to measure.
         bodies: the meshes that garments collide with, at rest, by their index in the player.
         sunk: what bakes counted inside colliders, of garments that had any, likewise.
+        props: these colliders.
     """
     whole = joined(list(bodies.values()))
     meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps) for each in garments]
@@ -71,14 +74,21 @@ def shot_sections(
     first, *others = [
         part
         for each, meter in zip(garments, meters)
-        for part in _sections(player, each, meter, (sunk or {}).get(each.index))
+        for part in _sections(player, each, meter, (sunk or {}).get(each.index), props)
     ]
     over = layers.figures("the shot")
     between = [layers_section(over)] if over else []
-    return [first, Section("The shot", played([player]), plays=True), *between, *others]
+    return [first, Section("The shot", _playing(player, props, report), plays=True), *between, *others]
 
 
-def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None) -> list[Section]:
+def _playing(player: ShotPlayer, props: ShotProps | None, report: Reporter) -> str:
+    """Return HTML that plays a shot; what it tells is reported, and no progress, which the measuring has told."""
+    return played([player], (), lambda event: report(event) if isinstance(event, Message) else None, [props])
+
+
+def _sections(
+    player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None, props: ShotProps | None
+) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # a raised garment is no worse
     apart = max(1, round(APART * player.fps))
@@ -111,7 +121,7 @@ def _sections(player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk:
 
     pictures = "".join(
         figure(
-            picture(player, frame),
+            picture(player, frame, props),
             f"{letter}: frame {player.frame_times[frame]:g}, at {times[frame]:.2f} s, "
             f"{bad[frame]:.4g} J without gravity{shown_skin(frame)}",
             times[frame],
@@ -141,9 +151,16 @@ def _spread(values: Floats) -> list[str]:
     return [f"{value:.4g}" for value in (values.mean(), np.median(values), np.quantile(values, 0.95), values.max())]
 
 
-def picture(player: ShotPlayer, frame: int) -> Image:
-    """Return a picture of one frame of a shot, framed to the figure."""
+def picture(player: ShotPlayer, frame: int, props: ShotProps | None = None) -> Image:
+    """Return a picture of one frame of a shot, framed to the figure, with the colliders that its cloth met."""
     surfaces = shot_surfaces(player, frame)
     points = np.concatenate([surface.points for surface in surfaces])
     (camera,) = follow_cameras([points], player.fps, WIDTH / HEIGHT)
-    return render(surfaces, camera, WIDTH, HEIGHT, ground=float(points[:, 1].min()))
+    ground = float(points[:, 1].min())
+    if props is not None:
+        figure = FigureBox.of(points)
+        floor = props.ground(ground, figure.size)
+        ground = ground if floor is None else floor
+        way = props.in_the_way([figure], [camera], [frame])
+        surfaces += tuple(props.surfaces(frame, figure, camera, ground, way))
+    return render(surfaces, camera, WIDTH, HEIGHT, ground=ground)

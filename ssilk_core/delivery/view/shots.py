@@ -18,7 +18,7 @@ from .ordered_map import ordered_map
 from .output import FILM, PICTURE, check_suffix, write_film, write_image
 from .panels import add_captions, compare, contact_sheet
 from .player import PlayerMesh, ShotPlayer
-from .props import ShotProps
+from .props import FigureBox, ShotProps
 from .render import Image, render
 from .surface import Surface
 
@@ -166,27 +166,33 @@ def _panels(
     label_every: int = 1,
 ) -> Iterator[Picture]:
     """Yield the panels of each frame in turn, one for each player."""
-    cameras, ground = _survey(players, look, props)
+    cameras, ground, figures = _survey(players, look, props)
+    all_frames = range(len(cameras))
+    ways = [met.in_the_way(own, cameras, all_frames) if met else {} for met, own in zip(props, figures)]
     for number, frame in enumerate(frames):
         for shot, player in enumerate(players):
             label = labels[shot] if shot < len(labels) and number % label_every == 0 else ""
             surfaces, met = shot_surfaces(player, frame), props[shot] if shot < len(props) else None
             if met:
-                figure = np.concatenate([surface.points for surface in surfaces])
-                surfaces += tuple(met.surfaces(frame, figure, cameras[frame], ground))
+                surfaces += tuple(met.surfaces(frame, figures[shot][frame], cameras[frame], ground, ways[shot]))
             yield Picture(surfaces, cameras[frame], ground, label, f"{frame / player.fps:.2f} s")
 
 
 def _survey(
     players: Sequence[ShotPlayer], look: Look, props: Sequence[ShotProps | None]
-) -> tuple[list[Camera], float]:
-    """Return one camera for each frame, the same whichever frames are drawn, and the height of the floor."""
+) -> tuple[list[Camera], float, list[list[FigureBox]]]:
+    """Return one camera for each frame, the same whichever frames are drawn, the height of the floor, and the boxes
+    around the figure of each shot."""
     lows: list[float] = []
     sizes: list[float] = []
+    figures: list[list[FigureBox]] = [[] for _ in players]
 
     def frames() -> Iterator[Floats]:
         for frame in range(len(players[0].frame_times)):
-            surfaces = [surface for player in players for surface in shot_surfaces(player, frame)]
+            shown = [shot_surfaces(player, frame) for player in players]
+            for own, boxes in zip(shown, figures):
+                boxes.append(FigureBox.of(np.concatenate([surface.points for surface in own])))
+            surfaces = [surface for own in shown for surface in own]
             skins = [surface for surface in surfaces if not surface.two_sided] or surfaces
             lows.append(min(surface.points[:, 1].min() for surface in skins))
             every = np.concatenate([surface.points for surface in surfaces])
@@ -195,10 +201,10 @@ def _survey(
 
     cameras = follow_cameras(frames(), players[0].fps, look.width / look.height, azimuth=look.azimuth)
     if look.ground is not None:
-        return cameras, look.ground
+        return cameras, look.ground, figures
     lowest, size = float(np.median(lows)), float(np.median(sizes))
     floors = (met.ground(lowest, size) for met in props if met)
-    return cameras, next((floor for floor in floors if floor is not None), lowest)
+    return cameras, next((floor for floor in floors if floor is not None), lowest), figures
 
 
 def shot_surfaces(player: ShotPlayer, frame: int) -> tuple[Surface, ...]:

@@ -9,9 +9,12 @@ inside, and of a chair what its cushion overlaps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
-from ...scene.assets import Collider, Floats, Motion, Scene
+from ...scene.assets import Collider, Floats, Ints, Motion, Scene
 from ...scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices
 from .colliders import voting_points
 from .surface import CollisionSurface, PosedSurface, Search, boxes
@@ -24,30 +27,58 @@ STEPS = (6, 16)  # samples along a side of its box, at least and at most
 FEWEST = 16  # samples of a volume; of thinner shapes the area is looked at
 
 
+@dataclass(frozen=True, eq=False)
+class BodyInFrame:
+    """A body in a frame, in the world [m].
+
+    Attributes:
+        points: of its surface, shape (B, 3).
+        voters: vertices of the garment, which tell the outside of its open parts, shape (P, 3).
+    """
+
+    points: Floats
+    voters: Floats
+
+
 class OwnShapes:
     """Tells which colliders stand for the character's body.
 
     Args:
-        motion: at whose frames colliders are placed.
+        faces: triangles of the body, shape (T, 3).
+        frames: of the shot, at which colliders are placed.
+        posed: returns the body in a frame.
         search: finds nearest points on triangles.
     """
 
-    def __init__(self, scene: Scene, motion: Motion, search: Search = boxes) -> None:
-        self._scene, self._motion, self._search = scene, motion, search
+    def __init__(self, faces: Ints, frames: int, posed: Callable[[int], BodyInFrame], search: Search = boxes) -> None:
+        self._faces, self._frames, self._pose, self._search = faces, frames, posed, search
         self._surface: CollisionSurface | None = None
-        self._posed: dict[int, tuple[Floats, Floats]] = {}  # body and voters
+        self._posed: dict[int, BodyInFrame] = {}
         self._prepared: dict[int, tuple[PosedSurface, Floats]] = {}
+
+    @classmethod
+    def of(cls, scene: Scene, motion: Motion) -> OwnShapes:
+        """Return what tells it of the character of a scene over a motion, as its skeleton poses its bodies."""
+        body, skeleton = scene.character.merged_body(), scene.character.skeleton
+
+        def posed(frame: int) -> BodyInFrame:
+            part = motion.picked(np.array([frame]))
+            matrices = skinning_matrices(motion_transforms(part, skeleton.parents), skeleton.bind_transforms)
+            rest = body_at_rest(scene.character, part)
+            return BodyInFrame(skin_points(rest, body.skin, matrices)[0], voting_points(part, scene)[0])
+
+        return cls(body.mesh.faces, motion.frame_count, posed)
 
     def has(self, collider: Collider) -> bool:
         """Return whether a collider is inside the body, whenever it collides."""
-        present = np.flatnonzero(np.broadcast_to(collider.present, self._motion.frame_count))
+        present = np.flatnonzero(np.broadcast_to(collider.present, self._frames))
         frames = present[np.unique(np.linspace(0, len(present) - 1, min(LOOKED_AT, len(present))).astype(int))]
         return bool(len(frames)) and all(self._is_inside(collider, frame) for frame in frames.tolist())
 
     def _is_inside(self, collider: Collider, frame: int) -> bool:
         points = collider.points[min(frame, len(collider.points) - 1)]
         place = collider.placements[min(frame, len(collider.placements) - 1)]
-        body, _ = self._body(frame)
+        body = self._body(frame).points
         middle = place[:3, :3] @ ((points.min(axis=0) + points.max(axis=0)) / 2) + place[:3, 3]
         if not ((middle > body.min(axis=0)) & (middle < body.max(axis=0))).all():
             return False
@@ -55,25 +86,18 @@ class OwnShapes:
         surface, sides = self._skin(frame)
         return float((surface.distance(samples, sides).distance < 0).mean()) >= INSIDE
 
-    def _body(self, frame: int) -> tuple[Floats, Floats]:
-        """Return the points of the body in a frame, and vertices of the garment that tell its outside."""
+    def _body(self, frame: int) -> BodyInFrame:
         if frame not in self._posed:
-            motion, scene = self._motion.picked(np.array([frame])), self._scene
-            body, skeleton = scene.character.merged_body(), scene.character.skeleton
-            matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-            points = skin_points(body_at_rest(scene.character, motion), body.skin, matrices)[0]
-            self._posed[frame] = points, voting_points(motion, scene)[0]
+            self._posed[frame] = self._pose(frame)
         return self._posed[frame]
 
     def _skin(self, frame: int) -> tuple[PosedSurface, Floats]:
         """Return the surface of the body in a frame, and on which side the outside of each part is."""
         if frame not in self._prepared:
-            if self._surface is None:
-                mesh = self._scene.character.merged_body().mesh
-                self._surface = CollisionSurface(mesh.path, mesh.points, mesh.faces)
-            points, voters = self._body(frame)
-            posed = self._surface.at(points, self._search)
-            self._prepared[frame] = posed, posed.outside(voters)
+            body = self._body(frame)
+            self._surface = self._surface or CollisionSurface("the body", body.points, self._faces)
+            posed = self._surface.at(body.points, self._search)
+            self._prepared[frame] = posed, posed.outside(body.voters)
         return self._prepared[frame]
 
 

@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from ssilk_core.delivery.view.camera import Camera
-from ssilk_core.delivery.view.props import EDGE, REACH, ShotProps, cut_out
+from ssilk_core.delivery.view.cut import cut_by_plane, cut_to_box, split
+from ssilk_core.delivery.view.props import EDGE, REACH, FigureBox, ShotProps
 from ssilk_core.delivery.view.shots import Look, sheet_of_shots
 from ssilk_core.scene.assets import Collider, ShotWorld
 from ssilk_core.scene.kinematics import rigid
@@ -36,8 +37,8 @@ def wall(z: float) -> Collider:
 
 
 def shown(*colliders: Collider, frame: int = 0, ground: float = -1.0, camera: Camera = CAMERA):
-    props = ShotProps(ShotWorld(10.0, colliders), lambda frame: frame / 10)
-    return props.surfaces(frame, FIGURE, camera, ground)
+    props, figure = ShotProps(ShotWorld(10.0, colliders), lambda frame: frame / 10), FigureBox.of(FIGURE)
+    return props.surfaces(frame, figure, camera, ground, props.in_the_way([figure], [camera], [frame]))
 
 
 def area(points: np.ndarray, faces: np.ndarray) -> float:
@@ -51,19 +52,66 @@ def test_a_vast_floor_is_shown_around_the_figure_in_small_triangles():
     size = 2.0
     assert edges.max() <= EDGE * size and len(corners) < 20_000
     across = corners[..., [0, 2]].reshape(-1, 2)
-    assert (np.abs(across) <= REACH * size + EDGE * size).all()
-    behind = corners[corners[..., 2].max(axis=1) <= 0.3]  # nothing of this side is before the figure
-    wide = 2 * REACH * size * (REACH * size + 0.3)
-    assert area(behind.reshape(-1, 3), np.arange(3 * len(behind)).reshape(-1, 3)) == pytest.approx(wide, rel=0.1)
+    assert np.abs(across).max() == pytest.approx(REACH * size)
+    assert area(surface.points, surface.faces) == pytest.approx((2 * REACH * size) ** 2)
 
 
-def test_small_triangles_keep_their_shared_vertices_and_area():
+def test_a_plane_cuts_triangles_straight_and_keeps_their_sides():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
-    points, faces = cut_out(np.asarray(ball.vertices), ball.faces, np.zeros(3), 1.0, 0.2)
-    assert len(points) == len(ball.vertices) and np.array_equal(faces, ball.faces)
-    coarse = trimesh.creation.box((1, 1, 1))
-    points, faces = cut_out(np.asarray(coarse.vertices), coarse.faces, np.zeros(3), 1.0, 0.3)
-    assert area(points, faces) == pytest.approx(6) and len(faces) > 12
+    corners, rows = cut_by_plane(ball.triangles, np.array([0.0, 0.6, 0.8]), 0.1)
+    height = corners @ [0.0, 0.6, 0.8]
+    assert height.min() == pytest.approx(0.1) and len(np.unique(rows)) < len(ball.faces)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("nk,nk->n", normals, ball.face_normals[rows]) >= 0).all()
+    other, _ = cut_by_plane(ball.triangles, np.array([0.0, -0.6, -0.8]), -0.1)
+    assert soup_area(corners) + soup_area(other) == pytest.approx(ball.area)
+    assert soup_area(corners) == pytest.approx(2 * np.pi * 0.5 * 0.4, rel=0.01)  # of a spherical cap
+
+
+def test_what_is_in_a_box_is_cut_out_and_split_without_loss():
+    box = trimesh.creation.box((1, 1, 1))
+    corners = cut_to_box(box.triangles, np.array([-9.0, -0.25, -9]), np.array([9.0, 0.25, 9]))
+    assert soup_area(corners) == pytest.approx(2)
+    small = split(corners, 0.3)
+    assert soup_area(small) == pytest.approx(2) and len(small) > len(corners)
+    assert np.linalg.norm(small - np.roll(small, 1, axis=1), axis=2).max() <= 0.3
+
+
+def soup_area(corners: np.ndarray) -> float:
+    return area(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def boxed(size: float, at: tuple[float, float, float]) -> Collider:
+    box = trimesh.creation.box(size * np.ones(3))
+    points = np.asarray(box.vertices) + at
+    return Collider("set.usda:/Set/Box", box.faces, points[None], np.eye(4)[None], HERE)
+
+
+@pytest.mark.parametrize(
+    "at", [(1.2, 0.3, 0.4), (0.0, 0.3, 0.5), (0.3, 0.3, 1.4)], ids=["beside", "across", "before"]
+)
+def test_a_box_near_the_camera_is_whole(at):
+    """Beside the figure, through the plane before it, and before its feet: no part of it is torn off."""
+    (surface,) = shown(boxed(0.6, at))
+    assert area(surface.points, surface.faces) == pytest.approx(6 * 0.6**2)
+
+
+def test_a_room_and_a_fence_that_hide_the_figure_are_cut_straight_before_it_in_all_frames():
+    room = boxed(2.9, (0, 1.0, 0.4))  # its near wall is 1.35 m before the figure
+    (surface,) = shown(room)
+    used = surface.points[surface.faces]
+    assert used[..., 2].max() == pytest.approx(0.5) and used[..., 2].min() == pytest.approx(-1.05)
+    planks = [quad([(x, 0, 2), (x + 0.19, 0, 2), (x + 0.19, 2, 2), (x, 2, 2)]) for x in np.arange(-0.4, 0.4, 0.2)]
+    assert len(shown(planks[0])) == 1 and shown(*planks) == []
+    figure, away = FigureBox.of(FIGURE), FigureBox.of(FIGURE + [5.0, 0, 0])
+    side = Camera(CAMERA.position + [5.0, 0, 0], CAMERA.target + [5.0, 0, 0])
+    props = ShotProps(ShotWorld(10.0, tuple(planks)), lambda frame: frame / 10)
+    way = props.in_the_way([figure, away], [CAMERA, side], [0, 1])
+    middle = Camera(np.array([1.0, 1.0, 8.0]), np.array([1.0, 1.0, 0.0]))
+    beside = FigureBox.of(FIGURE + [1.0, 0, 0])
+    hides_less = props.in_the_way([beside], [middle], [2])
+    assert not any(each.any() for each in hides_less.values())
+    assert props.surfaces(2, beside, middle, -1.0, way) == [] != props.surfaces(2, beside, middle, -1.0, hides_less)
 
 
 def test_what_stands_between_camera_and_figure_is_left_out():
@@ -86,7 +134,9 @@ def test_props_are_where_their_world_has_them_and_when():
 def test_a_level_floor_is_the_ground_of_the_picture():
     props = ShotProps(ShotWorld(10.0, (floor(-0.3), floor(7.0), floor(0.0, 0.5), wall(-2.0))), lambda frame: 0.0)
     assert props.ground(0.1, 2.0) == pytest.approx(-0.3) and props.ground(7.1, 2.0) == pytest.approx(7.0)
-    drawn = [surface.points[surface.faces][..., 1].max() for surface in props.surfaces(0, FIGURE, CAMERA, -0.3)]
+    figure = FigureBox.of(FIGURE)
+    surfaces = props.surfaces(0, figure, CAMERA, -0.3, props.in_the_way([figure], [CAMERA], [0]))
+    drawn = [surface.points[surface.faces][..., 1].max() for surface in surfaces]
     assert len(drawn) == 2 and min(drawn) == 0  # the small one and the wall
     assert ShotProps(ShotWorld(10.0, (wall(-2.0),)), float).ground(0.0, 2.0) is None
 

@@ -67,13 +67,13 @@ def capsule(radius: float, height: float = 0.2) -> trimesh.Trimesh:
 @pytest.mark.parametrize(("radius", "is_own"), [(0.03, True), (0.063, True), (0.08, False)])
 def test_capsules_of_a_limb_are_its_own_though_they_stick_out_a_little(dressed, motion, radius, is_own):
     found = posed("/Ragdoll/Arm", capsule(radius, 0.08), carried(motion, 1))
-    assert OwnShapes(dressed, motion).has(found) is is_own
+    assert OwnShapes.of(dressed, motion).has(found) is is_own
 
 
 def test_a_box_that_fills_the_trunk_is_its_own_and_open_shapes_are_judged_by_their_area(dressed, motion):
     box = trimesh.creation.box((0.29, 0.62, 0.19))
     box.apply_translation([0, 1, 0])
-    shapes = OwnShapes(dressed, motion)
+    shapes = OwnShapes.of(dressed, motion)
     assert shapes.has(posed("/Ragdoll/Trunk", box, carried(motion, 0)))
     tube = capsule(0.045)
     opened = trimesh.Trimesh(tube.vertices, tube.faces[: len(tube.faces) // 2])
@@ -84,7 +84,7 @@ def test_a_box_that_fills_the_trunk_is_its_own_and_open_shapes_are_judged_by_the
 def test_a_bracelet_is_a_prop_though_it_goes_with_the_arm_and_cuts_into_it(dressed, motion, inner):
     tube = 0.006
     ring = along_the_arm(trimesh.creation.torus(major_radius=inner + tube, minor_radius=tube))
-    assert not OwnShapes(dressed, motion).has(posed("/Bracelet", ring, carried(motion, 1)))
+    assert not OwnShapes.of(dressed, motion).has(posed("/Bracelet", ring, carried(motion, 1)))
 
 
 def test_a_chair_in_which_the_body_sits_is_a_prop(dressed, motion):
@@ -93,12 +93,12 @@ def test_a_chair_in_which_the_body_sits_is_a_prop(dressed, motion):
     back.apply_translation([0, 1, -0.1])  # and 3 cm into this
     still = replace(motion, rotations=motion.rotations[:1], translations=motion.translations[:1])
     for part in (seat, back, trimesh.util.concatenate([seat, back])):
-        assert not OwnShapes(dressed, still).has(posed("/Chair", part, np.eye(4)[None]))
+        assert not OwnShapes.of(dressed, still).has(posed("/Chair", part, np.eye(4)[None]))
 
 
 def test_what_the_body_walks_through_is_a_prop_and_so_is_what_the_arm_leaves(dressed, motion):
     inside = capsule(0.03)
-    shapes = OwnShapes(dressed, motion)
+    shapes = OwnShapes.of(dressed, motion)
     assert not shapes.has(posed("/Post", inside, np.eye(4)[None]))
     assert not shapes.has(posed("/Wrong", inside, carried(motion, 0)))
     first = np.arange(FRAMES) == 0

@@ -18,7 +18,7 @@ from pxr import Usd, UsdPhysics
 from ssilk_core.errors import fail
 from ssilk_core.events import Reporter, silent
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import UP, Air, Character, Floats, Motion, ShotWorld
+from ssilk_core.scene.assets import UP, Air, Character, Collider, Floats, Motion, ShotWorld
 
 from ..names import GUST_LENGTH, GUST_SEED, GUSTS, WIND
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, location, open_stage, stage_name, value
@@ -134,6 +134,21 @@ def find_world(
     air = _air(scene, seconds, asked, units)
     by_name = frozenset(map(location, there.asked))
     return FoundWorld(there.stage, tuple(met), codes, motion.fps, gravity, air, by_name)
+
+
+@explains_damage
+def read_named(source: str, paths: Sequence[str], seconds: Floats) -> list[Collider]:
+    """Return prims of a stage that were found to collide once, at times (F,) of its own [s].
+
+    Raises:
+        SsilkError: one is not there any more, or cannot be a collider.
+    """
+    stage = open_stage(source)
+    prims = [stage.GetPrimAtPath(path) for path in paths]
+    if gone := [path for path, prim in zip(paths, prims) if not prim]:
+        fail(source, f"it has no {', '.join(gone[:3])} any more", "colliders stay where cloth met them")
+    codes = seconds * stage.GetTimeCodesPerSecond()
+    return read_colliders(met_prims(prims, codes, silent), codes)
 
 
 @explains_damage

@@ -138,7 +138,7 @@ def copy_looks(
     found = [(mesh, path, look_source(mesh, opened)) for mesh, path in meshes]
     for mesh, _, look in found:
         if look is None:
-            left.add(mesh.path.rpartition("/")[2], f"its look, since {source} has no mesh of its polygons")
+            left.add(mesh.path.rpartition("/")[2], f"its look, if it had any: {source} has no mesh of its polygons")
         elif twin := _twin(mesh, look, opened):
             text = f"its look, unless it is that of {look.prim.GetPath()}: {twin.GetPath()} has the same polygons"
             left.add(mesh.path.rpartition("/")[2], text)
