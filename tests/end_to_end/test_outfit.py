@@ -169,6 +169,21 @@ def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
             assert away < 1e-5, (name, frame)
 
 
+def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):
+    """Nor is any written then: the copy of the coat would be the file of the skirt, which is the inner one."""
+    write_outfit(toy)
+    Path("cloth").mkdir()
+    Usd.Stage.Open("rigged.usda").Export("cloth/coat.usdc")
+    listed = Path("outfit.toml").read_text()
+    Path("outfit.toml").write_text(listed.replace('"/Hero/Skirt"', '"cloth/coat.usdc:/Hero/Skirt"'))
+    before = Path("cloth/coat.usdc").read_bytes()
+    capsys.readouterr()
+    assert main(shlex.split("inspect outfit.toml --fix cloth")) == 2
+    assert "cloth/coat.usdc: the output is also an input" in capsys.readouterr().err
+    assert Path("cloth/coat.usdc").read_bytes() == before
+    assert [path.name for path in Path("cloth").iterdir()] == ["coat.usdc"]
+
+
 def baked_garments(folder: str) -> set[str]:
     stage = Usd.Stage.Open(f"{folder}/shots/walk/shot.usda")
     return {prim.GetName() for prim in stage.GetPrimAtPath("/Shot").GetChildren()}
