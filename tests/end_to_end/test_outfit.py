@@ -68,6 +68,11 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     other = baked(capsys, "coat.safetensors tights.safetensors", "other")
     (text,) = [text for text in told(other) if "trained over" in text]
     assert "walk/coat: it was trained over 'skirt', and tights of this shot is another model" in text
+    together = baked(capsys, "coat.safetensors tights.safetensors", "other.glb --target glb")
+    (text,) = [text for text in told(together) if "trained over" in text]
+    assert "other.glb: coat: it was trained over 'skirt', and tights of this shot is another model" in text
+    together = baked(capsys, "coat.safetensors skirt.safetensors", "both.glb --target glb")
+    assert not any("trained over" in text for text in told(together))
 
 
 LIST = """

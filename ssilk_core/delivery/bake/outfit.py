@@ -14,7 +14,7 @@ import numpy as np
 
 from ...errors import VerificationError, fail
 from ...events import Event, Message, Reporter, Result, silent
-from ...files import replacing
+from ...files import replacing, sha256
 from ...network.checkpoint import ModelFile, load_model
 from ...physics.intersections.figures import EVERY, LAYERS, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
@@ -23,7 +23,7 @@ from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
 from .bodies import WornModel, worn
-from .layered import tell_layers
+from .layered import over_others, tell_layers
 from .opened import add_provenance, provenance_of
 from .origin import read_origin
 from .request import BakeRequest
@@ -78,6 +78,7 @@ def bake_outfit(
             join_glbs(parts, unverified)
             _need_unchanged(parts, unverified, folder, output)
             models = _worn(requests, names)
+            _tell_other_models(models, requests, output, report)
             layers = _layers(models, parts, report)
             add_provenance(unverified, {LAYERS: [each.to_metadata() for each in layers]} if layers else {})
     for each in layers:
@@ -171,6 +172,19 @@ def _worn(requests: Sequence[BakeRequest], names: Sequence[str]) -> dict[str, Wo
 
     stage = open_stage(requests[0].stage)
     return {name: worn(load_model(each.model), stage, each.root) for name, each in zip(names, requests)}
+
+
+def _tell_other_models(
+    models: Mapping[str, WornModel], requests: Sequence[BakeRequest], output: Path, report: Reporter
+) -> None:
+    """Warn of garments that were trained over others than they are worn with, as folders of layers do."""
+    known = {
+        name: (sha256(request.model), dict(each.file.provenance.get("over") or {}))
+        for (name, each), request in zip(models.items(), requests)
+    }
+    for name in known:
+        if text := over_others(name, known):
+            report(Message(f"{output}: {name}: {text}", "warning"))
 
 
 def _layers(models: Mapping[str, WornModel], parts: Mapping[str, Path], report: Reporter) -> list[LayerFigures]:
