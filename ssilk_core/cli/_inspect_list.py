@@ -100,8 +100,15 @@ def _options_of(
         "motion": [*options.motion, *map(Path, _listed(table, "motions"))],
         "preset": options.preset or table.get("preset"),
         "over": [*(_location(tables[name]) for name in entry.over), *entry.models(table)],
-        "over_names": [*entry.over, *(Path(model).stem for model in entry.models(table))],
+        "over_names": [*entry.over, *_model_names(entry, entry.models(table))],
     })  # fmt: skip
+
+
+def _model_names(entry: WardrobeEntry, models: Sequence[str]) -> list[str]:
+    """Return what findings call model files beneath a garment: as trainings do, their folders where names recur."""
+    stems = [*entry.over, *(Path(model).stem for model in models)]
+    paths = [Path(model).absolute() for model in models]
+    return [path.parent.name if stems.count(path.stem) > 1 else path.stem for path in paths]
 
 
 def _location(table: Mapping[str, Any]) -> str:

@@ -189,6 +189,19 @@ def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):
     assert [path.name for path in Path("cloth").iterdir()] == ["coat.usdc"]
 
 
+def test_a_list_over_models_of_one_name_is_inspected_as_it_is_trained(toy, copy, capsys):
+    write_outfit(toy)
+    for folder in "first", "second":
+        Path(folder).mkdir()
+        Path(folder, "skirt.safetensors").write_bytes(Path("skirt.safetensors").read_bytes())
+    listed = Path("outfit.toml").read_text().partition("[skirt]")[0]
+    over = '["first/skirt.safetensors", "second/skirt.safetensors"]'
+    Path("outfit.toml").write_text(listed.replace('["skirt"]', over))
+    found = inspected(capsys, "outfit.toml")["garments"]["coat"]["findings"]
+    crossed = [each["found"] for each in found if each["code"] == "garments-cross"]
+    assert len(crossed) == 2 and "first" in crossed[0] and "second" in crossed[1]
+
+
 def baked_garments(folder: str) -> set[str]:
     stage = Usd.Stage.Open(f"{folder}/shots/walk/shot.usda")
     return {prim.GetName() for prim in stage.GetPrimAtPath("/Shot").GetChildren()}
