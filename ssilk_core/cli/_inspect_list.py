@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import fail
 from ..events import Reporter, Result
+from ..files import need_not_input
 from ..training.wardrobe.listing import WardrobeEntry, garment_file, read_list, write_list
 from ._inspected import Inspected
 
@@ -31,6 +32,8 @@ def inspect_list(
             fail(f"--{name}", f"{options.stage} is a list", "its tables say what each garment is", "leave it out")
     folder, entries = options.stage.parent, read_list(options.stage)
     copy = _need_folder(options.fix, options.stage) if options.fix else None
+    if copy:
+        _need_no_inputs(copy.parent, [(entry.name, entry.located(folder)) for entry in entries], options.motion)
     tables: dict[str, dict[str, Any]] = {}
     found: dict[str, Inspected] = {}
     for entry in entries:
@@ -38,7 +41,7 @@ def inspect_list(
         own = _options_of(entry, table, tables, options)
         if copy:
             prim = garment_file(table)[1]
-            own.fix = copy.parent / f"{entry.name}.usdc"
+            own.fix = _copy_in(copy.parent, entry.name)
             table["garment"] = f"{own.fix}:{prim}" if prim else str(own.fix)
         found[entry.name] = inspect(own, report)
         if not options.json:
@@ -64,6 +67,25 @@ def _need_folder(folder: Path, path: Path) -> Path:
     return folder / path.name
 
 
+def _copy_in(folder: Path, name: str) -> Path:
+    return folder / f"{name}.usdc"
+
+
+def _need_no_inputs(folder: Path, tables: Sequence[tuple[str, Mapping[str, Any]]], motions: Sequence[Path]) -> None:
+    """Raise `SsilkError` where a copy would replace what a garment of a list is read from, before one is written."""
+    inputs = [*motions]
+    for _, table in tables:
+        clips = [*_listed(table, "motions"), *_listed(table, "valid")]
+        inputs += map(Path, (table["stage"], garment_file(table)[0], *clips))
+    for name, _ in tables:
+        need_not_input(_copy_in(folder, name), *inputs)
+
+
+def _listed(table: Mapping[str, Any], key: str) -> list[str]:
+    value = table.get(key, [])
+    return value if isinstance(value, list) else [value]
+
+
 def _options_of(
     entry: WardrobeEntry,
     table: Mapping[str, Any],
@@ -71,16 +93,22 @@ def _options_of(
     options: argparse.Namespace,
 ) -> argparse.Namespace:
     """Return the options that inspect a garment of a list."""
-    listed = table["motions"] if isinstance(table["motions"], list) else [table["motions"]]
     return argparse.Namespace(**{
         **vars(options),
         "stage": Path(table["stage"]),
         "garment": table.get("garment"),
-        "motion": [*options.motion, *map(Path, listed)],
+        "motion": [*options.motion, *map(Path, _listed(table, "motions"))],
         "preset": options.preset or table.get("preset"),
         "over": [*(_location(tables[name]) for name in entry.over), *entry.models(table)],
-        "over_names": [*entry.over, *(Path(model).stem for model in entry.models(table))],
+        "over_names": [*entry.over, *_model_names(entry, entry.models(table))],
     })  # fmt: skip
+
+
+def _model_names(entry: WardrobeEntry, models: Sequence[str]) -> list[str]:
+    """Return what findings call model files beneath a garment: as trainings do, their folders where names recur."""
+    stems = [*entry.over, *(Path(model).stem for model in models)]
+    paths = [Path(model).absolute() for model in models]
+    return [path.parent.name if stems.count(path.stem) > 1 else path.stem for path in paths]
 
 
 def _location(table: Mapping[str, Any]) -> str:

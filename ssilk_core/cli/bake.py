@@ -2,9 +2,8 @@
 """Bake trained garments over motions as UsdSkel, and verify it by re-skinning the files.
 
 One garment over one motion goes into one file: joints, blendshapes and their animation, no vertex caches. A glb takes
-several garments of a character. A folder
-takes any number of both, as layers: an asset for each garment, a small layer for each garment in each shot, and a
-stage for each shot. Layers that are current are left alone.
+several garments of a character. A folder takes any number of both, as layers: an asset for each garment, a small
+layer for each garment in each shot, and a stage for each shot. Layers that are current are left alone.
 
 A file that fails verification (exit code 3) is not kept, and an older file of its name stays as it was. --lbs bakes
 the same garments under linear blend skinning, to compare with.

@@ -15,6 +15,7 @@ from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.physics.intersections.layers import ClothLayers
 
 TRAIN = "train rigged.usda --motions clip.usda"
 
@@ -375,3 +376,27 @@ def test_in_a_folder_of_layers_a_name_stays_with_its_body(world, capsys):
     assert next(Path("shots/assets").rglob("*.usd*")).read_bytes() == asset
     assert run(f"{shot} --stage rigged.usda --shot-name other --garment-name slim -o shots/") == 0
     assert run(f"{shot} --stage heavier.usda --shot-name third -o shots/") == 0
+
+
+def test_garments_of_a_family_in_one_glb_are_compared_where_they_lie_on_their_body(world, monkeypatch):
+    """Not where they lie on the first one, which what lies over what is told by as well."""
+    shutil.copy("family.safetensors", "other.safetensors")
+    met, by_cover = [], ClothLayers.by_cover
+
+    def watched(one, other, body):
+        met.append((one[1].points, other[1].points, body))
+        return by_cover(one, other, body)
+
+    monkeypatch.setattr(ClothLayers, "by_cover", watched)
+    bake = "bake family.safetensors other.safetensors --motion clip.usda --target glb"
+    assert run(f"{bake} --stage taller.usda -o both.glb") == 0
+    ((one, other, body),) = met
+    assert body.points[:, 1].max() == pytest.approx(1.7 * 1.15, abs=1e-3)
+    for points in one, other:
+        assert points[:, 1].max() == pytest.approx(1.3 * 1.15, abs=0.02)
+    stage = Usd.Stage.Open("rigged.usda")
+    stage.RemovePrim("/Hero/Body")
+    stage.Export("bare.usda")
+    shutil.copy("model.safetensors", "second.safetensors")
+    bare = "bake model.safetensors second.safetensors --motion clip.usda --target glb --stage bare.usda -o bare.glb"
+    assert run(bare) == 0 and met[1][2] is None

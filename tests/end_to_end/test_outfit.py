@@ -68,6 +68,11 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     other = baked(capsys, "coat.safetensors tights.safetensors", "other")
     (text,) = [text for text in told(other) if "trained over" in text]
     assert "walk/coat: it was trained over 'skirt', and tights of this shot is another model" in text
+    together = baked(capsys, "coat.safetensors tights.safetensors", "other.glb --target glb")
+    (text,) = [text for text in told(together) if "trained over" in text]
+    assert "other.glb: coat: it was trained over 'skirt', and tights of this shot is another model" in text
+    together = baked(capsys, "coat.safetensors skirt.safetensors", "both.glb --target glb")
+    assert not any("trained over" in text for text in told(together))
 
 
 LIST = """
@@ -167,6 +172,34 @@ def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
         for frame, time in enumerate(shot.frame_times):
             away = np.abs(reader.skinned(meshes[name], frame) - shot.garment_points(time)).max()
             assert away < 1e-5, (name, frame)
+
+
+def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):
+    """Nor is any written then: the copy of the coat would be the file of the skirt, which is the inner one."""
+    write_outfit(toy)
+    Path("cloth").mkdir()
+    Usd.Stage.Open("rigged.usda").Export("cloth/coat.usdc")
+    listed = Path("outfit.toml").read_text()
+    Path("outfit.toml").write_text(listed.replace('"/Hero/Skirt"', '"cloth/coat.usdc:/Hero/Skirt"'))
+    before = Path("cloth/coat.usdc").read_bytes()
+    capsys.readouterr()
+    assert main(shlex.split("inspect outfit.toml --fix cloth")) == 2
+    assert "cloth/coat.usdc: the output is also an input" in capsys.readouterr().err
+    assert Path("cloth/coat.usdc").read_bytes() == before
+    assert [path.name for path in Path("cloth").iterdir()] == ["coat.usdc"]
+
+
+def test_a_list_over_models_of_one_name_is_inspected_as_it_is_trained(toy, copy, capsys):
+    write_outfit(toy)
+    for folder in "first", "second":
+        Path(folder).mkdir()
+        Path(folder, "skirt.safetensors").write_bytes(Path("skirt.safetensors").read_bytes())
+    listed = Path("outfit.toml").read_text().partition("[skirt]")[0]
+    over = '["first/skirt.safetensors", "second/skirt.safetensors"]'
+    Path("outfit.toml").write_text(listed.replace('["skirt"]', over))
+    found = inspected(capsys, "outfit.toml")["garments"]["coat"]["findings"]
+    crossed = [each["found"] for each in found if each["code"] == "garments-cross"]
+    assert len(crossed) == 2 and "first" in crossed[0] and "second" in crossed[1]
 
 
 def baked_garments(folder: str) -> set[str]:

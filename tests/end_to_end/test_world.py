@@ -6,6 +6,7 @@ from __future__ import annotations
 import html
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,7 +21,9 @@ from ssilk_usd.shots.play import Shot
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
 from ssilk_core.delivery.bake.load import load_rollout
+from ssilk_core.delivery.bake.met import props_of
 from ssilk_core.delivery.bake.world import ShotSurroundings
+from ssilk_core.events import silent
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.parameters import seeing_more
 from ssilk_core.network.proximity import proximity
@@ -227,6 +230,20 @@ def test_films_and_sheets_show_the_colliders_that_a_bake_met(toy, stage, capsys)
     assert main(["view", "shot.usdc", "-o", "alone.png", *SHEET]) == 0
     told = capsys.readouterr().err
     assert "warning: shot.usdc: the colliders that it met are not drawn: the stage of its colliders is not" in told
+
+
+def test_colliders_of_a_single_shot_of_any_name_and_of_several_garments_in_one_glb_are_shown(stage, capsys):
+    """A file that is called as the stages of folders are is a shot of its own, and a glb says it of each garment."""
+    shutil.copy("model.safetensors", "second.safetensors")
+    bake = ["--stage", "rigged.usda", "--motion", "floored.usda"]
+    assert main(["bake", "model.safetensors", *bake, "-o", "shot.usda"]) == 0
+    assert main(["bake", "model.safetensors", "second.safetensors", *bake, "-o", "both.glb", "--target", "glb"]) == 0
+    for shot in Path("shot.usda"), Path("both.glb"):
+        met = props_of(shot, silent)
+        assert met and [each.name for each in met.world.colliders] == ["/Set/Floor"], shot
+    capsys.readouterr()
+    assert main(["report", "shot.usda", "-o", "page.html"]) == 0
+    assert ": cloth in colliders: " in capsys.readouterr().err
 
 
 def played_meshes(page: str) -> list[dict[str, object]]:

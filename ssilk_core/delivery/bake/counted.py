@@ -31,7 +31,7 @@ from ..view.player import ShotPlayer
 from .entered import EnteredCloth, EnteredCounter
 from .opened import add_provenance, open_shot, provenance_of
 from .rollout import BakeRollout
-from .shots import STAGE, finished, place_of
+from .shots import finished, is_stage, place_of
 
 if TYPE_CHECKING:
     import torch
@@ -168,7 +168,7 @@ def stated_sunk(path: Path, garments: Mapping[int, str]) -> dict[int, SunkCloth]
     Raises:
         SsilkError: not a readable shot, or it says so otherwise than this version does.
     """
-    if path.name == STAGE:
+    if is_stage(path):
         records = finished(*place_of(path))
         results = {name: record.result.sunk for name, record in records.items() if record and record.result.sunk}
         named = {number: prim.split("/")[2:3] for number, prim in garments.items()}

@@ -25,18 +25,30 @@ def tell_other_layers(folder: Path, shot: str, report: Reporter) -> None:
     """Warn of garments of a shot that were trained over others than lie beneath them there."""
     found = _whole(finished(folder, shot))
     for name, record in found.items():
-        beside = _beside(found, name)
-        known = {*record.over.values(), record.inputs["model"].sha256}
-        others = [
-            other
-            for other, own in beside.items()
-            if own.inputs["model"].sha256 not in known and record.inputs["model"].sha256 not in own.over.values()
-        ]
-        if record.over and others:
-            listed = ", ".join(f"'{each}'" for each in record.over)
-            text = f"it was trained over {listed}, and {', '.join(others)} of this shot is another model"
-            todo = "train it over what it is worn with ('ssilk train --over'), or cloth may pass through cloth"
-            report(Message(f"{shot}/{name}: {text}; {todo}", "warning"))
+        together = {name: record, **_beside(found, name)}
+        models = {each: (own.inputs["model"].sha256, own.over) for each, own in together.items()}
+        if text := over_others(name, models):
+            report(Message(f"{shot}/{name}: {text}", "warning"))
+
+
+def over_others(name: str, models: Mapping[str, tuple[str, Mapping[str, str]]]) -> str:
+    """Return in words that a garment was trained over others than it is worn with; empty where it was not.
+
+    Args:
+        models: of it and of those that it is worn with, by name: the SHA-256 of each, and those of the models that it
+            was trained over, by their names.
+    """
+    model, over = models[name]
+    others = [
+        other
+        for other, (own, beneath) in models.items()
+        if own not in {*over.values(), model} and model not in beneath.values()
+    ]
+    if not (over and others):
+        return ""
+    listed = ", ".join(f"'{each}'" for each in over)
+    text = f"it was trained over {listed}, and {', '.join(others)} of this shot is another model"
+    return f"{text}; train it over what it is worn with ('ssilk train --over'), or cloth may pass through cloth"
 
 
 def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -> list[LayerFigures]:

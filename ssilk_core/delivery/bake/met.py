@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...errors import SsilkError
 from ...events import Message, Reporter
 from ...scene.assets import ShotWorld
+from ..gltf.outfit import GARMENTS, garments_in
 from ..view.props import ShotProps
-from .opened import open_shot
+from .opened import open_shot, provenance_of
 from .origin import ColliderOrigin, read_met
-from .shots import STAGE, finished
+from .shots import finished, is_stage, place_of
 
 
 def props_of(shot: Path, report: Reporter) -> ShotProps | None:
@@ -27,7 +30,7 @@ def props_of(shot: Path, report: Reporter) -> ShotProps | None:
     """
     player = open_shot(shot)
     try:
-        met = dict.fromkeys(found for layer in _layers(shot) if (found := read_met(layer)))
+        met = dict.fromkeys(found for layer, said in _garments(shot) if (found := read_met(layer, said)))
         seconds = np.array(player.frame_times) / player.fps
         world = _read(list(met), seconds, player.fps) if met and len(seconds) else None
     except SsilkError as error:
@@ -37,12 +40,16 @@ def props_of(shot: Path, report: Reporter) -> ShotProps | None:
     return ShotProps(world, lambda frame: frame / player.fps) if world else None
 
 
-def _layers(shot: Path) -> list[Path]:
-    """Return the files that say what a shot met."""
-    if shot.name != STAGE:
-        return [shot]
-    home = shot.absolute().parent
-    return [home / name / "anim.usdc" for name, record in finished(home.parent.parent, home.name).items() if record]
+def _garments(shot: Path) -> Iterator[tuple[Path, Mapping[str, Any]]]:
+    """Yield what a shot says of each of its garments, and the file that says it."""
+    if is_stage(shot):
+        home = shot.absolute().parent
+        layers = [home / name / "anim.usdc" for name, record in finished(*place_of(shot)).items() if record]
+        yield from ((layer, provenance_of(layer)) for layer in layers)
+        return
+    said = provenance_of(shot)
+    several = [said[GARMENTS][name] for name in garments_in(said)]
+    yield from ((shot, own) for own in several or [said])
 
 
 def _read(met: list[ColliderOrigin], seconds: np.ndarray, fps: float) -> ShotWorld:

@@ -52,13 +52,13 @@ class ColliderOrigin:
     prims: tuple[str, ...]
 
 
-def read_met(shot: Path) -> ColliderOrigin | None:
-    """Return the colliders that a shot says its cloth met; None where it says of none.
+def read_met(shot: Path, provenance: Mapping[str, object]) -> ColliderOrigin | None:
+    """Return the colliders that a shot, or one of its garments, says its cloth met; None where it says of none.
 
     Raises:
-        SsilkError: not a readable shot, or their stage is not found.
+        SsilkError: their stage is not found.
     """
-    said = provenance_of(shot).get(COLLIDERS)
+    said = provenance.get(COLLIDERS)
     if not isinstance(said, Mapping):
         return None
     near = str(said.get("stage"))

@@ -14,15 +14,16 @@ import numpy as np
 
 from ...errors import VerificationError, fail
 from ...events import Event, Message, Reporter, Result, silent
-from ...files import replacing
+from ...files import replacing, sha256
 from ...network.checkpoint import ModelFile, load_model
 from ...physics.intersections.figures import EVERY, LAYERS, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
-from ...scene.assets import Mesh
+from ...scene.mesh.joined import joined
 from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
-from .layered import tell_layers
+from .bodies import WornModel, worn
+from .layered import over_others, tell_layers
 from .opened import add_provenance, provenance_of
 from .origin import read_origin
 from .request import BakeRequest
@@ -76,8 +77,9 @@ def bake_outfit(
         with replacing(output) as unverified:
             join_glbs(parts, unverified)
             _need_unchanged(parts, unverified, folder, output)
-            models = dict(zip(names, (load_model(each.model) for each in requests)))
-            layers = _layers(models, parts, _body_of(requests[0]), report)
+            models = _worn(requests, names)
+            _tell_other_models(models, requests, output, report)
+            layers = _layers(models, parts, report)
             add_provenance(unverified, {LAYERS: [each.to_metadata() for each in layers]} if layers else {})
     for each in layers:
         report(Result("bake", {"garment": each.outer, "over": each.inner, **each.summary("time code")}))
@@ -164,27 +166,43 @@ def _need_unchanged(parts: Mapping[str, Path], joined: Path, folder: Path, outpu
                 )
 
 
-def _body_of(request: BakeRequest) -> Mesh:
-    """Return the body of a request's character in the bind pose, which tells the outside of cloth."""
-    from ssilk_usd.reading.character import read_character
+def _worn(requests: Sequence[BakeRequest], names: Sequence[str]) -> dict[str, WornModel]:
+    """Return the garments as they lie on the character of their stage, which may be any of a model's family."""
+    from ssilk_usd.opening.stage import open_stage
 
-    return read_character(request.stage, root=request.root).merged_body().mesh
+    stage = open_stage(requests[0].stage)
+    return {name: worn(load_model(each.model), stage, each.root) for name, each in zip(names, requests)}
 
 
-def _layers(
-    models: Mapping[str, ModelFile], parts: Mapping[str, Path], body: Mesh, report: Reporter
-) -> list[LayerFigures]:
-    """Count how the garments lie over one another, in every `EVERY`-th frame, as their files have them."""
+def _tell_other_models(
+    models: Mapping[str, WornModel], requests: Sequence[BakeRequest], output: Path, report: Reporter
+) -> None:
+    """Warn of garments that were trained over others than they are worn with, as folders of layers do."""
+    known = {
+        name: (sha256(request.model), dict(each.file.provenance.get("over") or {}))
+        for (name, each), request in zip(models.items(), requests)
+    }
+    for name in known:
+        if text := over_others(name, known):
+            report(Message(f"{output}: {name}: {text}", "warning"))
+
+
+def _layers(models: Mapping[str, WornModel], parts: Mapping[str, Path], report: Reporter) -> list[LayerFigures]:
+    """Count how the garments lie over one another, in every `EVERY`-th frame, as their files have them.
+
+    The body of their character in the bind pose tells the outside of cloth.
+    """
     if not can_find():
         report(Message(f"cloth through other garments is {NOT_COUNTED}", "warning"))
         return []
     from ...physics.intersections.layers import ClothLayers
 
     found = []
+    body = joined([each.mesh for each in next(iter(models.values())).scene.character.bodies])
     shots = {name: GlbShot(path) for name, path in parts.items()}
     for one, other in combinations(models, 2):
         meshes = {name: models[name].scene.garment.mesh for name in (one, other)}
-        order = [pair for pair in ((one, other), (other, one)) if _is_over(models[pair[0]], shots[pair[1]])]
+        order = [pair for pair in ((one, other), (other, one)) if _is_over(models[pair[0]].file, shots[pair[1]])]
         layers = (
             ClothLayers(order[0], meshes[order[0][0]], meshes[order[0][1]], body)
             if order

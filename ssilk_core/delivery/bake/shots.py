@@ -14,12 +14,10 @@ from ...events import Message, Reporter, silent
 from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
 
-STAGE = "shot.usda"  # of a shot, with all its garments
-
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
 
-STAGE = "shot.usda"  # of a shot
+STAGE = "shot.usda"  # of a shot, with all its garments
 
 
 def write_shot_stage(
