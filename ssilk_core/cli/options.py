@@ -159,8 +159,13 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
                       help="models written by 'ssilk train', or the list that 'ssilk wardrobe' left beside its "
                            "models, which stands for all of these; ROOT is the SkelRoot that wears it, where the "
                            "stage has several")  # fmt: skip
-    verb.add_argument("--stage", type=Path, action="append", required=True,
-                      help="USD file with the characters (repeatable: another body of the models' families)")  # fmt: skip
+    verb.add_argument(
+        "--stage",
+        type=Path,
+        action="append",
+        required=True,
+        help="USD file with the characters (repeatable: one for each body of a family)",
+    )
     motions = verb.add_mutually_exclusive_group(required=True)
     motions.add_argument(
         "--motion",

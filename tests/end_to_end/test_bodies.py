@@ -402,7 +402,6 @@ def test_two_stages_of_one_name_are_told_apart_by_a_pattern(world, capsys, comma
 def test_a_job_bakes_garments_in_shots_on_bodies_and_a_bad_body_fails_alone(world, capsys):
     shutil.copy("clip.usda", "walk.usda")
     write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
-    whole = Path("huge.usda").read_bytes()
     farm = f"farm family.safetensors --motion clip.usda walk.usda {BODIES} --stage huge.usda --bundle job"
     assert run(farm) == 0
     assert len(json.loads(Path("job/job.json").read_text())["tasks"]) == 6
@@ -422,8 +421,8 @@ def test_a_job_bakes_garments_in_shots_on_bodies_and_a_bad_body_fails_alone(worl
             np.testing.assert_allclose(found[name], points, rtol=0, atol=1e-5)
     before = layer_files("shots")
     write_member(world / "huge.usda", lambda points: points * [1.2, 1, 1.2])
-    assert Path("huge.usda").read_bytes() != whole
-    assert run(farm) == 0 and run("task job/job.json -o shots") == 0 and run("task job/job.json -o shots --check") == 0
+    assert run(farm) == 0
+    assert run("task job/job.json -o shots") == 0 and run("task job/job.json -o shots --check") == 0
     after = layer_files("shots")
     assert before.items() <= after.items() and "assets/huge_family/asset.usda" in after
 
@@ -448,7 +447,6 @@ def test_levels_of_quality_are_of_the_garment_on_their_own_body(world):
     assert run(bake) == 0
     assert run(f"{bake} --level-of family --garment-name family_lbs --lbs") == 0
     for body in ("rigged", "heavier"):
-        prim = Usd.Stage.Open(f"shots/shots/{body}_clip/shot.usda").GetPrimAtPath(f"/Shot/{body}_family")
         stage = Usd.Stage.Open(f"shots/shots/{body}_clip/shot.usda")
         levels = stage.GetPrimAtPath(f"/Shot/{body}_family").GetVariantSet("level")
         assert set(levels.GetVariantNames()) == {"default", "lbs"}
