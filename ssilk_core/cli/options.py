@@ -21,6 +21,7 @@ from ..delivery.bake.request import (
     MAX_SAMPLES_PER_FRAME,
     REFINED_OUTPUTS,
 )
+from ..delivery.bake.task import named_by_bodies
 from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
@@ -158,7 +159,13 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
                       help="models written by 'ssilk train', or the list that 'ssilk wardrobe' left beside its "
                            "models, which stands for all of these; ROOT is the SkelRoot that wears it, where the "
                            "stage has several")  # fmt: skip
-    verb.add_argument("--stage", type=Path, required=True, help="USD file with the characters")
+    verb.add_argument(
+        "--stage",
+        type=Path,
+        action="append",
+        required=True,
+        help="USD file with the characters (repeatable: one for each body of a family)",
+    )
     motions = verb.add_mutually_exclusive_group(required=True)
     motions.add_argument(
         "--motion",
@@ -213,6 +220,9 @@ def _add_names(verb: argparse.ArgumentParser) -> None:
                             "where one is named)")  # fmt: skip
     names.add_argument("--garment-name", metavar="PATTERN",
                        help="such as cape, or '{parent}' (default: the model's, with ROOT in front)")  # fmt: skip
+    names.add_argument("--body-name", metavar="PATTERN",
+                       help="such as heavy, or '{parent}': what names of shots and garments begin with, one for each "
+                            "stage (default: the stage's where several are given, else none)")  # fmt: skip
     names.add_argument("--level-of", metavar="GARMENT",
                        help="these are levels of quality of a garment of the shot: variants of its prim")  # fmt: skip
     names.add_argument("--asset-version", metavar="PATTERN",
@@ -289,7 +299,7 @@ def add_level(verb: argparse.ArgumentParser, size: str, *, plays: bool = False) 
 
 
 def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
-    """Return a request for each model over each motion, as the options of `add_bake` say."""
+    """Return a request for each model on each body over each motion, as the options of `add_bake` say."""
     shots: list[tuple[str | None, naming.ListedShot]]
     if options.shots:
         if options.shot_name:
@@ -302,10 +312,10 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
         (model, split_location(model), _name(options.garment_name, model, "--garment-name"))
         for model in _models(options.model)
     ]
-    return [
+    requests = [
         BakeRequest(
             model=model,
-            stage=options.stage,
+            stage=str(stage),
             motion=shot.motion,
             root=root,
             fps=options.fps,
@@ -335,8 +345,16 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             asset_identifier=_name(options.asset_identifier, whole, "--asset-identifier"),
         )
         for whole, (model, root), garment in worn
+        for stage in options.stage
         for name, shot in shots
     ]
+    if not options.body_name and len(options.stage) == 1:
+        return requests
+    bodies = {
+        str(stage): naming.pattern_name(options.body_name or "{stem}", str(stage), "--body-name")
+        for stage in options.stage
+    }
+    return named_by_bodies(requests, bodies)
 
 
 def _models(named: Iterable[str]) -> list[str]:

@@ -188,12 +188,15 @@ def test_on_its_first_body_a_family_bakes_what_a_model_of_that_body_alone_does(w
 
 
 def shown(path: str, frame: float) -> dict[str, np.ndarray]:
-    """Points (V, 3) of skinned meshes in a frame of a shot, as UsdSkel deforms them with their blendshapes."""
+    """Points (V, 3) in the world in a frame of a shot, as UsdSkel deforms meshes with their blendshapes."""
     stage, found = Usd.Stage.Open(path), {}
     assert UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Mesh):
-            found[prim.GetName()] = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(frame))
+            mesh = UsdGeom.Mesh(prim)
+            to_world = np.array(mesh.ComputeLocalToWorldTransform(frame))  # shots in layers move their SkelRoot
+            points = np.array(mesh.GetPointsAttr().Get(frame))
+            found[prim.GetName()] = points @ to_world[:3, :3] + to_world[3, :3]
     return found
 
 
@@ -400,3 +403,80 @@ def test_garments_of_a_family_in_one_glb_are_compared_where_they_lie_on_their_bo
     shutil.copy("model.safetensors", "second.safetensors")
     bare = "bake model.safetensors second.safetensors --motion clip.usda --target glb --stage bare.usda -o bare.glb"
     assert run(bare) == 0 and met[1][2] is None
+
+
+def layer_files(folder: str) -> dict[str, str]:
+    return {str(path.relative_to(folder)): sha256(path) for path in Path(folder).rglob("*") if path.is_file()}
+
+
+BODIES = "--stage rigged.usda --stage heavier.usda"
+
+
+@pytest.mark.parametrize("command", ["bake family.safetensors", "farm family.safetensors --bundle job"])
+def test_two_stages_of_one_name_are_told_apart_by_a_pattern(world, capsys, command):
+    (world / "cast").mkdir()
+    shutil.copy("heavier.usda", "cast/rigged.usda")
+    asked = f"{command} --motion clip.usda --stage rigged.usda --stage cast/rigged.usda -o shots/"
+    assert run(asked) == 2
+    told = capsys.readouterr().err
+    assert "'rigged.usda' and 'cast/rigged.usda' would both be the body 'rigged'" in told and "--body-name" in told
+    assert not Path("shots").exists() and not Path("job").exists()
+    assert run(f"{asked} --body-name '{{parent}}'") == 0
+
+
+def test_a_job_bakes_garments_in_shots_on_bodies_and_a_bad_body_fails_alone(world, capsys):
+    shutil.copy("clip.usda", "walk.usda")
+    write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
+    farm = f"farm family.safetensors --motion clip.usda walk.usda {BODIES} --stage huge.usda --bundle job"
+    assert run(farm) == 0
+    assert len(json.loads(Path("job/job.json").read_text())["tasks"]) == 6
+    capsys.readouterr()
+    assert run("task job/job.json -o shots") == 4
+    told = capsys.readouterr()
+    assert (told.out + told.err).count("beyond the bodies that the model was trained for") == 2
+    assert run("task job/job.json -o shots --check") == 3
+    names = {"clip", "walk"}
+    assert {path.parent.name for path in Path("shots/shots").glob("*/shot.usda")} == {
+        f"{body}_{name}" for body in ("rigged", "heavier") for name in names
+    }
+    for body in ("rigged", "heavier"):
+        assert run(f"{BAKE} --stage {body}.usda -o {body}_alone.usdc") == 0
+        found = shown(f"shots/shots/{body}_walk/shot.usda", 7)
+        for name, points in shown(f"{body}_alone.usdc", 7).items():
+            np.testing.assert_allclose(found[name], points, rtol=0, atol=1e-5)
+    before = layer_files("shots")
+    write_member(world / "huge.usda", lambda points: points * [1.2, 1, 1.2])
+    assert run(farm) == 0
+    assert run("task job/job.json -o shots") == 0 and run("task job/job.json -o shots --check") == 0
+    after = layer_files("shots")
+    assert before.items() <= after.items() and "assets/huge_family/asset.usda" in after
+
+
+def test_one_stage_names_no_body_and_a_body_alone_joins_the_others(world, capsys):
+    bake = "bake family.safetensors --motion clip.usda -o shots/"
+    assert run(f"{bake} {BODIES}") == 0
+    before = layer_files("shots")
+    assert run(f"{bake} --stage taller.usda --body-name '{{stem}}'") == 0
+    assert run(f"{bake} --stage taller.usda") == 0
+    names = {name.split("/")[1] for name in layer_files("shots").keys() - before.keys()}
+    assert names == {"taller_clip", "taller_family", "clip", "family"}
+    assert before.items() <= layer_files("shots").items()
+    capsys.readouterr()
+    assert run(f"{bake} {BODIES} --json") == 0
+    results = [json.loads(line)["detail"] for line in capsys.readouterr().out.splitlines() if '"result"' in line]
+    assert results and all(detail.get("current") for detail in results), results
+
+
+def test_levels_of_quality_are_of_the_garment_on_their_own_body(world):
+    bake = f"bake family.safetensors --motion clip.usda -o shots/ {BODIES}"
+    assert run(bake) == 0
+    assert run(f"{bake} --level-of family --garment-name family_lbs --lbs") == 0
+    for body in ("rigged", "heavier"):
+        stage = Usd.Stage.Open(f"shots/shots/{body}_clip/shot.usda")
+        levels = stage.GetPrimAtPath(f"/Shot/{body}_family").GetVariantSet("level")
+        assert set(levels.GetVariantNames()) == {"default", "lbs"}
+
+
+def test_several_bodies_go_into_no_file(world, capsys):
+    assert run(f"bake family.safetensors --motion clip.usda {BODIES} -o shot.usdc") == 2
+    assert "bodies in one file" in capsys.readouterr().err and not Path("shot.usdc").exists()

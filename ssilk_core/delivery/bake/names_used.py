@@ -105,7 +105,7 @@ def need_same_body(folder: Path, task: BakeTask, use: GarmentUse) -> None:
             str(folder),
             f"the garment '{task.garment}' was baked on another body of its model's family",
             "the shots of a name share one asset, which lies on one body",
-            "name it otherwise for each body with --garment-name, or use the name all the same with --replace",
+            "name each body with --body-name, or use the name all the same with --replace",
         )
 
 

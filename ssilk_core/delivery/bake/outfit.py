@@ -129,7 +129,7 @@ def holds_several(shot: Path) -> bool:
 
 def _need_together(requests: Sequence[BakeRequest], names: Sequence[str], output: Path) -> None:
     if output.suffix != GLB:
-        found = f"{len(requests)} garments or shots in one file"
+        found = f"{len(requests)} garments, shots or bodies in one file"
         fail(str(output), found, "several garments over one motion go into a .glb or a folder", "name one of these")
     if len({(each.stage, each.motion, each.root) for each in requests}) > 1:
         fail(str(output), "several motions or characters", "a glb has one of each", "name a folder")

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from ...errors import fail
@@ -156,6 +156,31 @@ def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> Non
     capped = {(each.model, each.target) for each in requests if each.receiver.influences and not each.lbs}
     for model, target in sorted(capped):
         check_influences(load_model(model).scene.rig.skin.indices.shape[1], target, model)
+
+
+def named_by_bodies(requests: Iterable[BakeRequest], bodies: Mapping[str, str]) -> list[BakeRequest]:
+    """Return requests whose garments and shots have the names of their bodies in front.
+
+    Both have it: the shots of a garment share one asset, which lies on one body, and a shot shows one body for each
+    motion.
+
+    Args:
+        bodies: name of the body of each stage that a request has.
+
+    Raises:
+        SsilkError: two stages would have one name.
+    """
+    names = {stage: prim_name(name) for stage, name in bodies.items()}
+    need_unique([(name, stage) for stage, name in names.items()], "--stage", "body", "--body-name")
+    return [
+        replace(
+            request,
+            garment=f"{names[request.stage]}_{garment_name(request)}",
+            shot=f"{names[request.stage]}_{_shot_name(request)}",
+            level_of=f"{names[request.stage]}_{prim_name(request.level_of)}" if request.level_of else None,
+        )
+        for request in requests
+    ]
 
 
 def garment_name(request: BakeRequest) -> str:

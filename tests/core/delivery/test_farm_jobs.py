@@ -28,6 +28,7 @@ from ssilk_core.delivery.bake.record import (
     write_record,
 )
 from ssilk_core.delivery.bake.request import INPUTS
+from ssilk_core.delivery.bake.task import named_by_bodies
 from ssilk_core.delivery.farm.job import FarmJob, numbers, read_job, write_job
 from ssilk_core.delivery.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.errors import SsilkError
@@ -65,6 +66,24 @@ def test_tasks_of_one_model_follow_each_other():
 def test_no_two_tasks_write_the_same_file(models, motions, says):
     with pytest.raises(SsilkError, match=says):
         plan_layers(requests([(model, None) for model in models], motions))
+
+
+def test_bodies_are_a_dimension_of_names_beside_shots_and_garments():
+    stages = {"/s/tall.usd": "tall", "/s/2 heavy.usd": "2 heavy"}
+    asked = [replace(REQUEST, stage=stage, motion=name, level_of="coat") for stage in stages for name in ("a", "b")]
+    tasks = plan_layers(named_by_bodies(asked, stages))
+    assert [task.name for task in tasks] == [
+        f"{body}_{shot}/{body}_cape" for body in ("tall", "_2_heavy") for shot in ("a", "b")
+    ]
+    assert [task.level_of for task in tasks] == ["tall_coat", "tall_coat", "_2_heavy_coat", "_2_heavy_coat"]
+    assert {task.request.shot or task.request.garment for task in tasks} == {None}
+
+
+@pytest.mark.parametrize("names", [("a-b", "a_b"), ("tall", "Tall")])
+def test_two_bodies_of_one_name_are_refused(names):
+    stages = {f"/s/{number}.usd": name for number, name in enumerate(names)}
+    with pytest.raises(SsilkError, match=r"'/s/0.usd' and '/s/1.usd' would both be the bod.*--body-name"):
+        named_by_bodies([replace(REQUEST, stage=stage) for stage in stages], stages)
 
 
 def test_names_of_other_letters_stay_apart():
