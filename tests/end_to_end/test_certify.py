@@ -14,8 +14,9 @@ from ssilk_usd.shots.layers_animation import with_points
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
-from ssilk_core.delivery.bake import certificate, hiding
-from ssilk_core.delivery.bake.certificate import need_certifier
+from ssilk_core.delivery.bake import hiding
+from ssilk_core.delivery.bake.certificate import blendshapes
+from ssilk_core.delivery.bake.certificate.requirements import need_certifier
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.pairs import self_intersections
@@ -124,13 +125,13 @@ def test_a_refined_shot_verifies_where_frames_of_it_were_moved(there):
 @pytest.fixture
 def missing_at_first(monkeypatch):
     """Shapes that move nothing, until frames get one each: the first file is as wrong as without a certificate."""
-    found = certificate._shapes_of
+    found = blendshapes.shapes_of
 
     def shapes(offsets, *, exact):
         shapes, weights = found(offsets, exact=exact)
         return (shapes if exact else 0 * shapes), weights
 
-    monkeypatch.setattr(certificate, "_shapes_of", shapes)
+    monkeypatch.setattr(blendshapes, "shapes_of", shapes)
 
 
 def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first):
@@ -187,7 +188,7 @@ def test_what_does_not_go_together_is_refused(there, capsys, more, said):
 
 
 def test_a_missing_library_is_told_before_work(there, capsys, monkeypatch):
-    monkeypatch.setattr("ssilk_core.delivery.bake.certificate.NEEDED", ("no_such_library",))
+    monkeypatch.setattr("ssilk_core.delivery.bake.certificate.requirements.NEEDED", ("no_such_library",))
     assert main([*BAKE, "-o", "none.usda", "--certify"]) == 2
     assert "pip install 'ssilk[certify]'" in capsys.readouterr().err and not (there / "none.usda").exists()
 
