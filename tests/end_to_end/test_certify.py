@@ -118,8 +118,27 @@ def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
 
 def test_a_refined_shot_verifies_where_frames_of_it_were_moved(there):
     assert main([*BAKE[:-1], "-o", "refined.usda", "--certify", "--refine", "2"]) == 0
-    assert read_provenance("refined.usda")["certificate"]["moved frames"]
+    assert read_provenance("refined.usda")["certificate"]["moved frames"] and crossing("refined.usda") == []
     assert main(["verify", "refined.usda"]) == 0
+
+
+def test_hero_is_certified_from_where_the_solver_leaves_it(there):
+    hero = [*BAKE[:-1], "-o", "heroic.usda", "--certify", "--quality", "hero", "--range", "0-4"]
+    assert main(hero) == 0
+    said = read_provenance("heroic.usda")["certificate"]
+    assert said["found"] == "0 of 5 frames intersect, 0 show covered skin" and said["frames wrong before"]
+    assert crossing("heroic.usda") == []
+
+
+def test_refined_frames_that_joints_cannot_reach_have_no_certificate(there, capsys, monkeypatch):
+    def folded(*args, **options):
+        raise SsilkError("bow.usda: joints and blendshapes are 7 mm RMS off.")
+
+    monkeypatch.setattr("ssilk_core.scene.decomposition.decompose", folded)
+    assert main([*BAKE[:-1], "-o", "none.usda", "--certify", "--refine", "1", "--range", "0-1"]) == 2
+    told = capsys.readouterr().err
+    assert "--certify: refined frames do not fit joints and blendshapes (bow.usda: joints and" in told
+    assert told.endswith("leave --certify out.\n") and not (there / "none.usda").exists()
 
 
 @pytest.fixture
