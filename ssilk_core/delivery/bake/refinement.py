@@ -65,8 +65,8 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         shot = _decomposed(rollout, points, add_shapes)
     except SsilkError as error:  # what the solver made is kept
         if rollout.request.certify:
-            found = f"refined frames do not fit joints and blendshapes ({str(error).removesuffix('.')})"
-            fail("--certify", found, "what a certificate moves is put on these", "leave --certify out")
+            misfit = f"refined frames do not fit joints and blendshapes ({str(error).removesuffix('.')})"
+            fail("--certify", misfit, "what a certificate moves is put on these", "leave --certify out")
         report(Message(f"{error} They are written as points.", "warning"))
         as_points = replace(rollout, request=replace(rollout.request, refined_output="points"))
         return replace(
