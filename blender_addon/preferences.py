@@ -100,4 +100,10 @@ def unready(context: bpy.types.Context) -> str:
     return met.mismatch
 
 
+def no_certificates(context: bpy.types.Context) -> str:
+    """Return why no bake can be certified, besides why none can run; empty if it can."""
+    met = handshake(preferences(context))
+    return met.no_certificates if met else ""
+
+
 CLASSES = (Preferences,)

@@ -46,7 +46,7 @@ from ..playback.models import (
     trainings_folder,
 )
 from ..playback.overrides import overriding, told
-from ..preferences import interpreter, preferences, unready
+from ..preferences import interpreter, no_certificates, preferences, unready
 from ..scene.armature import read_joints
 from ..scene.classes import current_classes
 from ..scene.garment import armature_of, bodies_of, unplayable_here
@@ -182,6 +182,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         garment = context.object
         if not self.to_timeline and not self.to_usd:
             raise SetupError("Choose where to bake to: the timeline, USD, or both.")
+        if garment.ssilk.certify and (missing := no_certificates(context)):
+            raise SetupError(f"{missing}, or switch Certify off.")
         self.model, armature = model_of(garment), armature_of(garment)
         solves = self.quality != WHOLE and QUALITIES[self.quality].refine
         if solves and garment.ssilk.hold > 1:
@@ -325,12 +327,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         # Which of them are the body's own is known by now.
         collider = ["--collider", COLLIDERS] if self.meets else []
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
+        certify = ["--certify"] if garment.ssilk.certify else []
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
                 "--motion", str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}",
-                *level, *rate, *collider, "--json",
+                *level, *rate, *collider, *certify, "--json",
             ]
         ]  # fmt: skip
 
@@ -343,7 +346,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        said = f"{lost(work.result)}{self.reshaped}{self.left_out}"
+        said = f"{lost(work.result)}{certificate(work.result)}{self.reshaped}{self.left_out}"
         return f"'{self.pair.name}' is baked: {' and '.join(where)}{said}."
 
 
@@ -380,6 +383,11 @@ def lost(figures: Mapping[str, Any]) -> str:
         f"; bones and {count} shape keys are within {typical:.2g} mm (RMS), {most:.2g} mm at most, "
         "of what was simulated"
     )
+
+
+def certificate(figures: Mapping[str, Any]) -> str:
+    """Return in words how many frames are free of intersections and of skin; empty where that was not asked."""
+    return f"; {figures['certificate']}" if "certificate" in figures else ""
 
 
 def reclassed(garment: bpy.types.Object, model: Path) -> str:

@@ -26,7 +26,7 @@ def device():
 
 
 if __name__ == "__main__":
-    names = ("ssilk", "torch", "usd-core", "libigl", "scipy")
+    names = ("ssilk", "torch", "usd-core", "libigl", "scipy", "ipctk")
     versions = {"python": platform.python_version(), **{name: version(name) for name in names}}
     print(json.dumps({"event": "result", "task": "probe", "detail": {"versions": versions, "device": device()}}))
     sys.stdout.flush()

@@ -48,6 +48,13 @@ class Handshake:
         return ""
 
     @property
+    def no_certificates(self) -> str:
+        """One sentence that says what bakes with a certificate lack; empty if nothing."""
+        if self.versions.get("ipctk"):
+            return ""
+        return f"To certify bakes, install ssilk[certify] in {self.python}, then check it again in the preferences"
+
+    @property
     def summary(self) -> str:
         """Versions and device in one line."""
         shown = [f"{name} {self.versions[name]}" for name in ("ssilk", "python", "torch") if self.versions.get(name)]

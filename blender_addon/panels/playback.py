@@ -14,6 +14,7 @@ from ..playback.live import Live
 from ..playback.models import no_model, sees_colliders
 from ..playback.overrides import overriding
 from ..playback.solving import SOLVED
+from ..preferences import no_certificates
 from ..scene.garment import armature_of
 from .base import PlayableGarmentPanel, draw_text, saying_errors
 
@@ -130,6 +131,10 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout.prop(context.object.ssilk, "colliders")
         for line in filter(None, (unseen_line(context.object), *unmet(context.object))):
             draw_text(layout, line, icon="INFO")
+        if line := no_certificates(context):
+            draw_text(layout, line, icon="INFO")
+        else:
+            layout.prop(context.object.ssilk, "certify")
         layout.operator("ssilk.bake", icon="REC")
         draw_bones(layout, context.object)
         layout.operator("ssilk.to_bones", icon="BONE_DATA")

@@ -123,6 +123,12 @@ class GarmentSettings(bpy.types.PropertyGroup):
         max=MAX_HOLD,
         override=SHOTS,
     )
+    certify: BoolProperty(
+        name="Certify",
+        description="Move baked frames as little as it takes until the garment does not pass through itself and no "
+        "skin shows that it covers; a wrong frame takes seconds",
+        override=SHOTS,
+    )
     bones: CollectionProperty(
         type=BoneMatch,
         description="Bones of the training that the artist has found again",

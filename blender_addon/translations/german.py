@@ -346,6 +346,12 @@ WORDS = {
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
     ),
+    "Certify": "Zertifizieren",
+    "Move baked frames as little as it takes until the garment does not pass through itself and no skin shows that "
+    "it covers; a wrong frame takes seconds": (
+        "Gebackene Bilder so wenig wie nötig bewegen, bis das Kleidungsstück sich nicht mehr durchdringt und keine "
+        "Haut durchscheint, die es bedeckt; ein falsches Bild dauert Sekunden"
+    ),
     "Tightness": "Enge",
     "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, once classes "
     "were found automatically": (

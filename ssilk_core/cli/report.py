@@ -110,8 +110,8 @@ def _shot(path: Path, report: Reporter, props: ShotProps | None = None) -> list[
     from ssilk_usd.shots.read import read_parts
     from ssilk_usd.writing.body_faces import open_with_full_bodies
 
-    from ..delivery.bake.counted import stated_sunk
     from ..delivery.bake.met import props_of
+    from ..delivery.bake.stated import stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
 

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     from ssilk_usd.reading.world import AskedWorld
     from ssilk_usd.shots.points import PointCache
 
-    from ..delivery.bake.counted import MetWorld, ShotCounts
+    from ..delivery.bake.counted import MetWorld
     from ..delivery.bake.result import BakeResult, ShotShapes
+    from ..delivery.bake.stated import ShotCounts
     from ..physics.intersections.figures import SelfIntersections
     from ..physics.simulate import SimulationOptions
     from ..physics.simulate.simulator import SimulatedFrame

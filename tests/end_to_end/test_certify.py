@@ -14,8 +14,9 @@ from ssilk_usd.shots.layers_animation import with_points
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
-from ssilk_core.delivery.bake import certificate, hiding
-from ssilk_core.delivery.bake.certificate import need_certifier
+from ssilk_core.delivery.bake import hiding
+from ssilk_core.delivery.bake.certificate import blendshapes
+from ssilk_core.delivery.bake.certificate.requirements import need_certifier
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.pairs import self_intersections
@@ -117,20 +118,39 @@ def test_it_verifies_and_one_that_someone_bent_does_not(there, capsys):
 
 def test_a_refined_shot_verifies_where_frames_of_it_were_moved(there):
     assert main([*BAKE[:-1], "-o", "refined.usda", "--certify", "--refine", "2"]) == 0
-    assert read_provenance("refined.usda")["certificate"]["moved frames"]
+    assert read_provenance("refined.usda")["certificate"]["moved frames"] and crossing("refined.usda") == []
     assert main(["verify", "refined.usda"]) == 0
+
+
+def test_hero_is_certified_from_where_the_solver_leaves_it(there):
+    hero = [*BAKE[:-1], "-o", "heroic.usda", "--certify", "--quality", "hero", "--range", "0-4"]
+    assert main(hero) == 0
+    said = read_provenance("heroic.usda")["certificate"]
+    assert said["found"] == "0 of 5 frames intersect, 0 show covered skin" and said["frames wrong before"]
+    assert crossing("heroic.usda") == []
+
+
+def test_refined_frames_that_joints_cannot_reach_have_no_certificate(there, capsys, monkeypatch):
+    def folded(*args, **options):
+        raise SsilkError("bow.usda: joints and blendshapes are 7 mm RMS off.")
+
+    monkeypatch.setattr("ssilk_core.scene.decomposition.decompose", folded)
+    assert main([*BAKE[:-1], "-o", "none.usda", "--certify", "--refine", "1", "--range", "0-1"]) == 2
+    told = capsys.readouterr().err
+    assert "--certify: refined frames do not fit joints and blendshapes (bow.usda: joints and" in told
+    assert told.endswith("leave --certify out.\n") and not (there / "none.usda").exists()
 
 
 @pytest.fixture
 def missing_at_first(monkeypatch):
     """Shapes that move nothing, until frames get one each: the first file is as wrong as without a certificate."""
-    found = certificate._shapes_of
+    found = blendshapes.shapes_of
 
     def shapes(offsets, *, exact):
         shapes, weights = found(offsets, exact=exact)
         return (shapes if exact else 0 * shapes), weights
 
-    monkeypatch.setattr(certificate, "_shapes_of", shapes)
+    monkeypatch.setattr(blendshapes, "shapes_of", shapes)
 
 
 def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first):
@@ -187,7 +207,7 @@ def test_what_does_not_go_together_is_refused(there, capsys, more, said):
 
 
 def test_a_missing_library_is_told_before_work(there, capsys, monkeypatch):
-    monkeypatch.setattr("ssilk_core.delivery.bake.certificate.NEEDED", ("no_such_library",))
+    monkeypatch.setattr("ssilk_core.delivery.bake.certificate.requirements.NEEDED", ("no_such_library",))
     assert main([*BAKE, "-o", "none.usda", "--certify"]) == 2
     assert "pip install 'ssilk[certify]'" in capsys.readouterr().err and not (there / "none.usda").exists()
 

@@ -15,7 +15,8 @@ from ...files import FileHashes, remove_unfinished_in, replacing, sha256
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
-from .certificate import certified, need_certifier, proven
+from .certificate.certified import certified, proven
+from .certificate.requirements import need_certifier
 from .counted import state_rollout_counts
 from .hiding import hidden_polygons_of
 from .inputs import InputFiles, InputHashes, need_pinned

@@ -42,7 +42,7 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         add_shapes: to those of the model, instead of in their place: assets are the same for all shots.
 
     Raises:
-        SsilkError: a number of iterations that is not allowed.
+        SsilkError: a number of iterations that is not allowed, or a certificate for points that joints cannot reach.
     """
     if rollout.refinement is not None:
         return rollout
@@ -64,6 +64,9 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
     try:
         shot = _decomposed(rollout, points, add_shapes)
     except SsilkError as error:  # what the solver made is kept
+        if rollout.request.certify:
+            misfit = f"refined frames do not fit joints and blendshapes ({str(error).removesuffix('.')})"
+            fail("--certify", misfit, "what a certificate moves is put on these", "leave --certify out")
         report(Message(f"{error} They are written as points.", "warning"))
         as_points = replace(rollout, request=replace(rollout.request, refined_output="points"))
         return replace(

@@ -18,7 +18,7 @@ from ...files import sha256
 from ...scene.assets import Floats
 from ..gltf.play import GlbShot
 from ..targets import GLB
-from .certificate import verify_certificate
+from .certificate.verified import verify_certificate
 from .load import load_rollout
 from .opened import open_shot, provenance_of
 from .origin import read_origin

@@ -13,8 +13,9 @@ from ...files import need_not_input, need_writable, replacing, split_location
 from ...scene.kinematics import lbs_deformer, lbs_poses
 from ...scene.riders import RiderJoints
 from ..targets import GLB
-from .certificate import certified, need_certifier, proven
-from .counted import ShotCounts, state_rollout_counts
+from .certificate.certified import certified, proven
+from .certificate.requirements import need_certifier
+from .counted import state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import hidden_polygons_of
 from .latents import solved
@@ -25,6 +26,7 @@ from .result import BakeResult, Verification
 from .riders import need_joints
 from .rollout import BakeRollout
 from .sizing import load_sized
+from .stated import ShotCounts
 from .verification import verify_file
 
 if TYPE_CHECKING:

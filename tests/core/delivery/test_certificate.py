@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ssilk_core.delivery.bake.certificate import LARGEST, _frames_said, _parts, _shapes_of
+from ssilk_core.delivery.bake.certificate.blendshapes import LARGEST, parts_of, shapes_of
+from ssilk_core.delivery.bake.certificate.verified import frames_said
 from ssilk_core.delivery.bake.result import CertificateSummary, FrameSpan
 
 VERTICES, MOVED = 400, slice(40, 140)
@@ -24,7 +25,7 @@ def displacements(frames: int, kinds: int) -> np.ndarray:
 @pytest.mark.parametrize("kinds", [1, 3])
 def test_frames_share_shapes_where_their_displacements_are_alike(kinds):
     offsets = displacements(30, kinds)
-    shapes, weights = _shapes_of(offsets, exact=False)
+    shapes, weights = shapes_of(offsets, exact=False)
     assert len(shapes) <= kinds + 1  # and where their ranges begin
     assert weights.min() >= 0 and weights.max() <= 1
     left = np.linalg.norm(np.einsum("fk,kvc->fvc", weights, shapes) - offsets, axis=2)
@@ -37,12 +38,12 @@ def test_frames_share_shapes_where_their_displacements_are_alike(kinds):
 def test_each_frame_has_its_shape_where_that_is_asked_or_less():
     offsets = displacements(6, 6)
     for exact in (True, False):
-        shapes, weights = _shapes_of(offsets, exact=exact)
+        shapes, weights = shapes_of(offsets, exact=exact)
         assert (shapes == offsets.astype(np.float32)).all() and (weights == np.eye(6)).all()
 
 
 def test_frames_with_a_shape_each_are_parts_of_their_own():
-    assert list(_parts([(3, 9), (12, 12)], {5, 6, 12})) == [(3, 4), (5, 6), (7, 9), (12, 12)]
+    assert list(parts_of([(3, 9), (12, 12)], {5, 6, 12})) == [(3, 4), (5, 6), (7, 9), (12, 12)]
 
 
 def test_one_line_says_what_holds_and_where_it_does_not():
@@ -57,4 +58,4 @@ def test_one_line_says_what_holds_and_where_it_does_not():
         "3 of 2,400 frames intersect, 0 show covered skin; 3 frames have no free position: 1043 to 1045, "
         "up to 4 pairs of triangles, such as with triangle 7 beside LeftThumb"
     )
-    assert _frames_said(caught.to_metadata()["frames left"]) == {42, 43, 44}
+    assert frames_said(caught.to_metadata()["frames left"]) == {42, 43, 44}

@@ -45,8 +45,8 @@ def with_body_shapes(
 ) -> Motion:
     """Return a motion with the blendshapes of its character's meshes that it weighs otherwise than their stage does.
 
-    A shape that a shot's animation does not name is off in that shot. A motion that shows no such mesh leaves a shape
-    that it does not name as it is.
+    A shape that a shot's animation does not name is off in that shot. A motion that shows no such mesh leaves a mesh as
+    it is whose shapes it does not name; of one that it names any of, the others are off, as where it is bound.
 
     Args:
         source: the character's stage.
@@ -124,12 +124,13 @@ class _Shot:
         return self._finite(np.array(rows), mesh)
 
     def named_weights(self, names: list[str], unnamed: Floats) -> Floats:
-        """Return the weights of blendshapes by name in each frame, others as in `unnamed` (K,), shape (F, K)."""
+        """Return the weights of blendshapes by name in each frame, as `unnamed` (K,) where none is named, (F, K)."""
         animation = UsdSkel.Animation(self.animation)
         every = [str(name) for name in animation.GetBlendShapesAttr().Get() or ()]
         rows = np.tile(unnamed, (len(self.codes), 1))
         own = [index for index, name in enumerate(names) if name in every]
         if own:
+            rows[:] = 0  # UsdSkel gives those of a mesh no weight that an animation does not name
             columns = [every.index(names[index]) for index in own]
             for row, code in zip(rows, self.codes.tolist()):
                 given = animation.GetBlendShapeWeightsAttr().Get(code)

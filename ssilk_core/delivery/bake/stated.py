@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a shot says of what was counted in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...errors import fail
+from ...physics.intersections.figures import NOT_COUNTED, SelfIntersections
+from ...physics.skin.figures import ShownSkin
+from ...physics.world.sunk import SunkCloth
+from ...scene.plain import from_plain
+from .entered import EnteredCloth
+from .opened import provenance_of
+from .shots import finished, is_stage, place_of
+
+# Under these names.
+SHOWN_SKIN, INTERSECTIONS, SUNK, ENTERED = "shown_skin", "intersections", "sunk_cloth", "riders_in_cloth"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShotCounts:
+    """What was counted in a written file.
+
+    Attributes:
+        shown_skin: the share of the covered skin that shows; None where the garment covers nothing.
+        intersections: the share of triangles that intersect others of the garment; None without libigl.
+        sunk: the share of vertices inside colliders; None where there are no colliders.
+        entered: riders that enter their cloth.
+    """
+
+    shown_skin: ShownSkin | None
+    intersections: SelfIntersections | None
+    sunk: SunkCloth | None = None
+    entered: tuple[EnteredCloth, ...] = ()
+
+    def to_metadata(self) -> dict[str, object]:
+        """Return what a shot says of them. Where cloth was not counted, it says why."""
+        skin = {SHOWN_SKIN: self.shown_skin.to_metadata()} if self.shown_skin else {}
+        cloth = self.intersections.to_metadata() if self.intersections else {"none": NOT_COUNTED}
+        sunk = {SUNK: self.sunk.to_metadata()} if self.sunk else {}
+        entered = {ENTERED: {each.rider: each.to_metadata() for each in self.entered}} if self.entered else {}
+        return {**skin, INTERSECTIONS: cloth, **sunk, **entered}
+
+
+def stated_sunk(path: Path, garments: Mapping[int, str]) -> dict[int, SunkCloth]:
+    """Return what bakes counted inside colliders, of garments of a shot or of a stage of layers that have it.
+
+    Args:
+        garments: paths of their meshes in the stage, by any number.
+
+    Raises:
+        SsilkError: not a readable shot, or it says so otherwise than this version does.
+    """
+    if is_stage(path):
+        records = finished(*place_of(path))
+        results = {name: record.result.sunk for name, record in records.items() if record and record.result.sunk}
+        named = {number: prim.split("/")[2:3] for number, prim in garments.items()}
+        return {number: results[name[0]] for number, name in named.items() if name and name[0] in results}
+    said = provenance_of(path).get(SUNK)
+    if not isinstance(said, Mapping) or "none" in said or len(garments) != 1:
+        return {}
+    try:
+        found = from_plain(SunkCloth, {"colliders": {}, **said})
+    except (TypeError, ValueError) as error:
+        fail(str(path), f"its cloth inside colliders is told in another way ({error})", "a shot of this version",
+             "bake it again")  # fmt: skip
+    return dict.fromkeys(garments, found)
