@@ -179,6 +179,9 @@ class Train(tasks.OutsideOperator, bpy.types.Operator):
         tell_changing_shapes(self, garment, played)
         if mixed := mixed_motions(armature, played):
             self.report({"WARNING"}, mixed)
+        if chosen := [f"'{each.name}'" for each in beneath(garment) if each.ssilk.model]:
+            text = "a training lies over garments that were trained in this file, and not over a chosen model"
+            self.report({"WARNING"}, f"{' and '.join(chosen)} beneath '{garment.name}' has a chosen model; {text}.")
         self.pair = Pair.of(garment, armature)
         title, steps = f"Sampling motions for '{garment.name}'", self.steps()
         return Work(title, lambda _: (), parent=bpy.app.tempdir, steps=steps)

@@ -110,8 +110,8 @@ def test_an_outfit_is_trained_in_order_each_over_those_beneath_and_baked(ready, 
     assert {each.name for each in pillar.modifiers} <= {"Armature", "SSILK Under Skirt", "SSILK Under Coat"}
 
 
-def test_one_garment_alone_is_trained_over_what_is_there(ready, skirt, coat, tmp_path):
-    """An inner garment without a model is left out; with the order the other way round nothing is beneath."""
+def test_one_garment_alone_is_trained_over_what_is_there(ready, skirt, coat, tmp_path, capfd):
+    """An inner garment without a model is left out, and one with a chosen model is told."""
     from blender_addon.outside import jobs
     from blender_addon.playback.models import job_of
 
@@ -122,7 +122,10 @@ def test_one_garment_alone_is_trained_over_what_is_there(ready, skirt, coat, tmp
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "alone.blend"))
     bpy.ops.ssilk.find_motions()
     coat.ssilk.training.preset, coat.ssilk.training.iterations = "draft", 4
+    skirt.ssilk.model = str(tmp_path / "chosen.safetensors")
+    capfd.readouterr()
     assert bpy.ops.ssilk.train() == {"FINISHED"}
+    assert "'Skirt' beneath 'Coat' has a chosen model" in capfd.readouterr().out
     assert jobs.models_beneath(job_of(coat)) == []
     assert (ended(coat).state, ended(coat).error) == ("done", "")
 

@@ -270,13 +270,17 @@ def test_shapes_that_are_on_in_the_stage_count_from_there(copy):
     assert not UsdSkel.BindingAPI(Usd.Stage.Open("baked.usda").GetPrimAtPath("/Hero/Body")).GetBlendShapesAttr().Get()
 
 
-def test_a_clip_alone_leaves_a_shape_that_it_does_not_name(copy):
+def test_a_clip_alone_shapes_bodies_as_where_it_is_bound_and_leaves_those_of_which_it_names_no_shape(copy, capsys):
     stage, weights = fuller(copy / "fuller.usda"), {0.0: [0.0], 4.0: [1.0]}
-    clip = alone(copy / "clip_alone.usda", ["breathe"], weights)
-    assert main(["bake", "model.safetensors", "--stage", stage, "-o", "baked.usda", "--motion", clip]) == 0
-    rows = {code: [0.4, *row] for code, row in weights.items()}
-    path = shot(copy / "shot.usda", rows, under="fuller.usda", names=("heavy", "breathe"))
+    bake = ["bake", "model.safetensors", "--stage", stage, "-o", "baked.usda", "--motion"]
+    assert main([*bake, alone(copy / "clip_alone.usda", ["breathe"], weights)]) == 0
+    told = capsys.readouterr().err
+    assert "'heavy'" in told and "heavy_off" not in told
+    path = shot(copy / "shot.usda", weights, under="fuller.usda", names=("breathe",))
     np.testing.assert_allclose(seen("baked.usda"), seen(path), atol=2e-6)
+    assert main([*bake, alone(copy / "smile_alone.usda", ["smile"], weights)]) == 0
+    same = shot(copy / "same.usda", [0.4, 0.75], under="fuller.usda", names=("heavy", "breathe"))
+    np.testing.assert_allclose(seen("baked.usda"), seen(same), atol=2e-6)
 
 
 def test_a_pillar_that_breathes_and_holds_still_is_a_motion(copy):

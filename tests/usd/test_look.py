@@ -307,7 +307,9 @@ def test_variants_that_are_not_selected_are_told_by_name(hero, tmp_path):
             sets.AddVariant(each)
         sets.SetVariantSelection("b")
     stage.Save()
-    of_hero, of_cape = (f"the variant set {name}, of which 'b' is kept" for name in ("bodyType", "shadingVariant"))
+    of_hero, of_cape = (
+        f"the variant set {name}, in which its stage has 'b'" for name in ("bodyType", "shadingVariant")
+    )
     left = write_rigged_stage(hero, worn(hero).scene, tmp_path / "rigged.usda")
     assert left == f"Hero loses {of_hero}; Cape loses {of_cape}"
     left = shoot(worn(hero), tmp_path / "shot.usda").left_out
@@ -377,7 +379,7 @@ def test_a_variant_set_without_selection_is_told_so(hero, tmp_path):
     stage.GetPrimAtPath("/Hero/Cape").GetVariantSets().AddVariantSet("shade").AddVariant("a")
     stage.Save()
     assert shoot(worn(hero), tmp_path / "shot.usda").left_out == (
-        "Cape loses the variant set shade, of which none is kept"
+        "Cape loses the variant set shade, in which its stage has none"
     )
 
 
@@ -600,7 +602,7 @@ def left_out_of_a_collection(stage: Usd.Stage) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (varied, "Cape_cloth loses the variant set colour, of which 'blue' is kept"),
+        (varied, "Cape_cloth loses the variant set colour, in which its stage has 'blue'"),
         (connected, "Cape loses rigging:worn to /Hero/Rivet.worn, which is not written with it"),
         (of_a_material, "Cape_cloth loses rigging:rig to /Hero/Rig, which is not written with it"),
         (chosen_over_time, "Cape loses the animation of trim.indices, which keeps its first value"),

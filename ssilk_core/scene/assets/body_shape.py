@@ -11,6 +11,8 @@ import numpy as np
 from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
+OFF = "_off"  # ends the name of a shape that a shot weighs less than its character's stage does
+
 
 @dataclass(frozen=True, eq=False)
 class BodyShape:
@@ -19,7 +21,7 @@ class BodyShape:
     `Motion.shape_weights` say how much of it is on in each frame, from none (0) to the most in the shot (1).
 
     Attributes:
-        name: of the blendshape, and of the in-between.
+        name: of the blendshape, and of the in-between; ends in `OFF` where the shot takes it off.
         body: which mesh, as an index into bodies followed by stand-ins.
         rows: indices of the points that it moves, shape (R,).
         offsets: of these in the bind pose [m], where it is on the most, shape (R, 3).

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .body_shape import shaped
+from .body_shape import OFF, shaped
 from .character import Character
 from .motion import Motion
 
@@ -46,7 +46,7 @@ def reshaped(character: Character, motion: Motion) -> list[Reshaped]:
             moved = shaped(points, shapes, weights[part], number)
             most[part] = np.linalg.norm(moved, axis=2).max(axis=1, initial=0)
         far = sorted(shapes, key=lambda shape: -np.linalg.norm(shape.offsets, axis=1).max(initial=0))
-        names = tuple(shape.name for shape in far[:NAMED])
+        names = tuple(dict.fromkeys(shape.name.removesuffix(OFF) for shape in far))[:NAMED]
         path = body.mesh.path.rpartition("/")[2]
         found.append(Reshaped(path, float(most.max()), int(most.argmax()), names))
     return sorted(found, key=lambda each: -each.metres)

@@ -16,6 +16,7 @@ from pxr import Usd, UsdSkel
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import BodyShape, Character, Floats, Ints, Mesh, Motion
+from ssilk_core.scene.assets.body_shape import OFF
 
 from ..opening.stage import StageLike, explains_damage, location, open_stage, value
 from .carried import carried_by
@@ -45,8 +46,8 @@ def with_body_shapes(
 ) -> Motion:
     """Return a motion with the blendshapes of its character's meshes that it weighs otherwise than their stage does.
 
-    A shape that a shot's animation does not name is off in that shot. A motion that shows no such mesh leaves a mesh as
-    it is whose shapes it does not name; of one that it names any of, the others are off, as where it is bound.
+    A shape that a shot's animation does not name is off in that shot. So it is where a motion shows no such mesh and
+    names others of its shapes. Where it names none, the mesh is left as it is.
 
     Args:
         source: the character's stage.
@@ -254,7 +255,7 @@ def _shapes(own: Usd.Prim, mesh: Mesh, number: int, skel: SkelSource, shot: _Sho
 def _parts(part: _SubShape, number: int, course: Floats) -> list[tuple[BodyShape, Floats]]:
     """Return what a shape with any weights (F,) adds and takes away, each with weights from 0 to 1."""
     found = []
-    for sign, word in ((1.0, ""), (-1.0, "_off")):
+    for sign, word in ((1.0, ""), (-1.0, OFF)):
         own = np.maximum(sign * course, 0)
         most = float(own.max(initial=0))
         if most * part.reach > UNSEEN:

@@ -192,7 +192,8 @@ def variants_of(prim: Usd.Prim) -> list[str]:
     ]
     kept = {name: sets.GetVariantSelection(name) for name in names}
     return [
-        f"the variant set {name}, of which {repr(kept[name]) if kept[name] else 'none'} is kept" for name in names
+        f"the variant set {name}, in which its stage has {repr(kept[name]) if kept[name] else 'none'}"
+        for name in names
     ]
 
 
