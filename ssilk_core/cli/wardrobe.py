@@ -88,9 +88,19 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def _keep_list(entries: Sequence[WardrobeEntry], path: Path, folder: Path) -> None:
-    """Copy a list beside the models that it stands for, unless it lies there."""
-    if not folder.samefile(path.absolute().parent):
-        write_list(folder / path.name, {entry.name: entry.located(path.parent) for entry in entries})
+    """Copy a list beside the models that it stands for, unless it lies there.
+
+    Raises:
+        SsilkError: a list of that name lies there, in which are other garments.
+    """
+    if folder.samefile(path.absolute().parent):
+        return
+    kept, own = folder / path.name, {entry.name for entry in entries}
+    before = {entry.name for entry in read_list(kept)} if kept.exists() else own
+    if not (before <= own or own <= before):
+        found = f"another list, of {', '.join(sorted(before))}"
+        fail(str(kept), found, "a list lies beside its models under its name", "rename one, or name another folder")
+    write_list(kept, {entry.name: entry.located(path.parent) for entry in entries})
 
 
 def _train(

@@ -146,6 +146,12 @@ def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
     said = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     skipped = [each["name"] for each in said if "finished before; skipped" in each.get("said", {}).get("text", "")]
     assert skipped == ["skirt"] and load_model("models/cloak.safetensors").provenance["over"] == over
+    Path("late").mkdir()  # another list of that name
+    Path("late/outfit.toml").write_text(other.replace('garment = "', 'garment = "../apart/'))
+    listed = Path("models/outfit.toml").read_bytes()
+    assert main(shlex.split("wardrobe late/outfit.toml -o models --device cpu")) == 2
+    assert "models/outfit.toml: another list, of coat, skirt" in capsys.readouterr().err
+    assert Path("models/outfit.toml").read_bytes() == listed
     layers = baked(capsys, "models/outfit.toml", "layers")
     assert baked_garments("layers") == {"coat", "skirt"}
     figures = [event["detail"] for event in layers if event["event"] == "result" and "over" in event["detail"]]
