@@ -90,7 +90,7 @@ def build_family_bank(
 def _family_arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, family: BodyFamily) -> dict[str, np.ndarray]:
     """Return what a `FamilyBank` has of the frames of one clip beside those of the base, by name, float32.
 
-    Rotations are the same on all bodies, and positions are sums along chains of joints. So only those are summed anew.
+    Rotations are the same on all bodies, so that only positions are summed anew along chains of joints.
     """
     world = motion_transforms(clip, skeleton.parents)
     turned = skinning_matrices(world, skeleton.bind_transforms)[..., :3, :3]

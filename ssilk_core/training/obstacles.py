@@ -236,8 +236,8 @@ class ObstacleDrawer:
 
         Floors and walls, which come first, stay as far from it in frames (T, N); it stays outside of all.
         """
-        assert (worn := self.worn) is not None
-        now, place = self._clearance(obstacles, frames), worn.clone()
+        assert isinstance(self.bank, FamilyBank)
+        now, place = self._clearance(obstacles, frames), self.bank.place.clone()
         self._put_on(before)
         then = self._clearance(obstacles, frames)
         self._put_on(place)

@@ -395,7 +395,7 @@ def test_training_for_a_family_that_sees_colliders_goes_on_again(scene, family, 
     """What obstacles were drawn around is part of the state."""
     runs = []
     for split in (False, True):
-        parts, stepper, _ = colliding_parts(scene, family, toy_motion(scene, 40), tmp_path / "m.safetensors")
+        _, stepper, _ = colliding_parts(scene, family, toy_motion(scene, 40), tmp_path / "m.safetensors")
         for iteration in range(3):
             stepper.run(iteration)
             if split and iteration == 1:
