@@ -21,6 +21,7 @@ from torch import Tensor, nn
 
 from ..network.feedback import spread_rows
 from ..network.model.descriptors import proximity_features, proximity_length
+from ..network.model.feedback import BodyFrames
 from ..network.model.network import GarmentModel
 from ..network.proximity import proximity_reach
 from ..physics.skinning import Skinning
