@@ -133,6 +133,11 @@ class Near:
         height = (away * self.points[:count]).sum(1) - self.distance[:count]
         return torch.cat([away, height[:, None]], dim=1)
 
+    def stopping(self, body: BodyFrames, count: int, length: int) -> BodyFrames:
+        """Return a body in windows of `length` frames, with the planes at the first points."""
+        planes = self.planes(count)
+        return BodyFrames(body.matrices, body.bend, planes.unflatten(-1, (length, -1)).movedim(-2, 0))
+
 
 class ObstacleDrawer:
     """Draws obstacles around the characters of a bank, and tells what the network sees of them.
