@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of a network's parameters, to check a file without building the network, and what becomes of trained ones."""
+"""Shapes of a network's parameters, to check files without building networks, and what becomes of trained ones."""
 
 from __future__ import annotations
 

@@ -2,9 +2,10 @@
 """Garments beneath the one that is trained: what it lies on besides the body.
 
 Each inner garment plays by its own trained network, which stays as it is, over the same poses and under the same
-gravity: in the windows of dynamic training it rolls along, in single poses it is in its quasi-static state. So the
-outer garment meets what it will be baked with. It sees the obstacles that the outer one meets. An inner garment is there in a share `WORN` of the windows and poses,
-drawn for each by itself, so that the outer one also learns to be worn without.
+gravity: in the windows of dynamic training it rolls along, in single poses it is in its quasi-static state. It sees
+the obstacles that the outer garment meets. So the outer garment meets what it will be baked with. An inner garment is
+there in a share `WORN` of the windows and poses, drawn for each by itself, so that the outer one also learns to be
+worn without.
 """
 
 from __future__ import annotations
