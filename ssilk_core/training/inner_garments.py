@@ -2,9 +2,10 @@
 """Garments beneath the one that is trained: what it lies on besides the body.
 
 Each inner garment plays by its own trained network, which stays as it is, over the same poses and under the same
-gravity: in the windows of dynamic training it rolls along, in single poses it is in its quasi-static state. So the
-outer garment meets what it will be baked with. An inner garment is there in a share `WORN` of the windows and poses,
-drawn for each by itself, so that the outer one also learns to be worn without.
+gravity: in the windows of dynamic training it rolls along, in single poses it is in its quasi-static state. It sees
+the obstacles that the outer garment meets. So the outer garment meets what it will be baked with. An inner garment is
+there in a share `WORN` of the windows and poses, drawn for each by itself, so that the outer one also learns to be
+worn without.
 """
 
 from __future__ import annotations
@@ -20,14 +21,17 @@ from torch import Tensor
 from ..errors import fail
 from ..events import Message, Reporter, silent
 from ..network.checkpoint import ModelFile, load_model, network
+from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel
 from ..physics.collision import Contacts, PosedBody, reachable_cloth
-from ..physics.collision.inner_cloth import InnerCloth, Planes
+from ..physics.collision.inner_cloth import DEEPEST, InnerCloth, Planes
 from ..physics.collision.samples import ContactSamples
 from ..physics.intersections.layers import ClothLayers, LayerCounts
-from ..scene.assets import Motion, Scene, Skeleton
+from ..physics.intersections.pairs import need_predicates
+from ..scene.assets import PINNED, TIGHT, Motion, Scene, Skeleton
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .motion_bank import MotionBank, build_bank, roll_states
+from .obstacles import Near, ObstacleDrawer, Obstacles
 from .windows import WindowSampler
 
 WORN = 0.75
@@ -71,6 +75,33 @@ class InnerModel:
         return cls(name or path.stem, digest, file)
 
 
+def loosened(scene: Scene, inner: Sequence[InnerModel]) -> Scene:
+    """Return the scene of an outer garment that is tight where it was pinned over cloth that moves.
+
+    Pinned cloth follows the body alone, and nothing moves it out of a hood or a sleeve that does not. It lies over a
+    garment where it is at most `DEEPEST` from it in the bind pose. Over cloth that is pinned itself it stays pinned.
+
+    Raises:
+        SsilkError: libigl is missing.
+    """
+    pinned = np.flatnonzero(scene.classes == PINNED)
+    if not len(pinned):
+        return scene
+    need_predicates()
+    import igl
+
+    classes = scene.classes.copy()
+    points = np.ascontiguousarray(scene.garment.mesh.points[pinned])
+    for each in inner:
+        garment = each.file.scene.garment
+        square, face, _ = igl.point_mesh_squared_distance(points, garment.mesh.points, garment.mesh.faces)
+        moves = (each.file.scene.classes[garment.mesh.faces] != PINNED).any(axis=1)
+        classes[pinned[(square < DEEPEST**2) & moves[face]]] = TIGHT
+    if np.array_equal(classes, scene.classes):
+        return scene
+    return replace(scene, garment=replace(scene.garment, classes=classes))
+
+
 def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None:
     """Raise `SsilkError` unless inner models were trained for the character of a scene, at a rate [1/s].
 
@@ -105,12 +136,28 @@ def other_character(own: Skeleton, skeleton: Skeleton) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Garment:
-    """One inner garment: its network, the motions as it sees them, and its surface."""
+    """One inner garment: its network, the motions and obstacles as it sees them, and its surface.
+
+    Attributes:
+        sight: tells what it sees of obstacles; None where it sees none.
+    """
 
     model: GarmentModel
     bank: MotionBank
     held: MotionBank
     cloth: InnerCloth
+    sight: ObstacleDrawer | None
+
+    def near(self, obstacles: Obstacles | None, frames: Tensor, down: Tensor) -> Near | None:
+        """Return what is near in frames (N,) under gravity and wind (N, 3) [g]; None where it sees nothing."""
+        return None if obstacles is None or self.sight is None else self.sight.near(obstacles, frames, down)
+
+    def static(self, frames: Tensor, down: Tensor, near: Near | None) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,), with the proximity of obstacles where there are any."""
+        static = self.bank.static_descriptor(frames, down)
+        if near is None or self.sight is None:
+            return static
+        return torch.cat([self.sight.seen(near, frames), static], dim=1)
 
     def positions(self, z: Tensor, character: Tensor) -> Tensor:
         """Decode latents (N, latent) to the positions (W, 3, N) that the outer garment can touch [m]."""
@@ -181,7 +228,11 @@ class InnerGarments:
                 )
             self.names.append(each.name)
             self.layers.append(ClothLayers((outer.path.rpartition("/")[2], each.name), outer, mesh, body))
-            self._garments.append(_Garment(model, *banks, cloth))
+            sight = None
+            if model.proximity:
+                hub = place_of_hub(skeleton, model.joints)
+                sight = ObstacleDrawer(model, banks[0], hub, 0.0, torch.Generator(device))  # it draws none
+            self._garments.append(_Garment(model, *banks, cloth, sight))
             self._tell_beneath(each.name, cloth, scene, samples, mesh.points, report)
         self.vertex_count = sum(len(one.cloth.vertices) for one in self._garments)
         self._states: dict[int, list[Tensor]] = {}
@@ -215,21 +266,34 @@ class InnerGarments:
             }
 
     @torch.no_grad()
-    def poses(self, frames: Tensor, single_down: Tensor, generator: torch.Generator) -> Beneath:
-        """Return quasi-static inner garments in single poses (M,) under gravity and wind (M, 3) [g]."""
+    def poses(
+        self, frames: Tensor, single_down: Tensor, generator: torch.Generator, obstacles: Obstacles | None = None
+    ) -> Beneath:
+        """Return quasi-static inner garments in single poses (M,) under gravity and wind (M, 3) [g].
+
+        Args:
+            obstacles: in these poses, which they see as the outer garment does.
+        """
         positions, worn = [], []
         for one in self._garments:
-            z = one.model.initial(one.bank.static_descriptor(frames, single_down))
+            z = one.model.initial(one.static(frames, single_down, one.near(obstacles, frames, single_down)))
             positions.append(one.positions(z, one.bank.character(frames)))
             worn.append(_drawn(len(frames), generator, frames.device))
         return Beneath(positions, worn)
 
     @torch.no_grad()
-    def window(self, sampler: WindowSampler, frames: Tensor, single_down: Tensor) -> Beneath:
+    def window(
+        self,
+        sampler: WindowSampler,
+        frames: Tensor,
+        single_down: Tensor,
+        single_obstacles: Obstacles | None = None,
+    ) -> Beneath:
         """Roll along one window of every slot, and keep the states for the next.
 
         Args:
             frames, single_down: single poses beside the windows (M,), and their gravity and wind (M, 3) [g].
+            single_obstacles: around these, where there are any.
 
         Returns:
             The garments in the frames of the windows from the third on, then in the single poses.
@@ -238,16 +302,21 @@ class InnerGarments:
         device = sampler.first.device
         times = sampler.first + torch.arange(length, device=device)[:, None]
         down = sampler.gravity().flatten(0, 1)
-        single = self.poses(frames, single_down, sampler.generator)
+        single = self.poses(frames, single_down, sampler.generator, single_obstacles)
+        obstacles = sampler.obstacles and sampler.obstacles.repeated(length)
         positions, worn = [], []
         for number, one in enumerate(self._garments):
             kept, is_worn = (sampler.inner[f"inner.{number}.{name}"] for name in ("latents", "worn"))
             bank, flat = one.bank, times.reshape(-1)
-            static = bank.static_descriptor(flat, down)
+            near = one.near(obstacles, flat, down)
+            static = one.static(flat, down, near)
             pose = bank.described(static, flat, down, _headings(sampler, bank, down))
             target = one.model.initial(static).reshape(length, batch, -1)
             start = torch.where(sampler.carried[None, :, None], kept, target[:2])
-            z = one.model.roll([*start], target[2:], pose.reshape(length, batch, -1)[2:], bank.body(times))
+            body = bank.body(times)
+            if near is not None:
+                body = near.stopping(body, one.model.feedback.stopped, length)
+            z = one.model.roll([*start], target[2:], pose.reshape(length, batch, -1)[2:], body)
             here = torch.where(sampler.carried, is_worn, _drawn(batch, sampler.generator, device))
             kept.copy_(torch.stack(z[-2:]))
             is_worn.copy_(here)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ import numpy as np
 from ..errors import fail
 from ..network.checkpoint import ModelFile
 from ..network.settings import PROXIMITY_POINTS, ModelConfig
-from ..scene.assets import LOOSE, PINNED, Motion, Scene
+from ..scene.assets import LOOSE, PINNED, TIGHT, Motion, Scene
 from ..scene.fabrics import Fabric
 from ..scene.family import DressedFamily
 from ..scene.mesh.stitches import find_stitches
-from .inner_garments import InnerModel, need_wearable
+from .inner_garments import InnerModel, loosened, need_wearable
 from .perturb import perturb_motions
 from .recombine import recombine_motions
 from .settings import TrainConfig
@@ -29,6 +29,7 @@ STEPPER_SETTINGS = (
     "velocity_allowance",
 )  # fmt: skip
 SAME = 1e-4  # [m], and without unit; model files may store single precision
+FARTHEST_MOVED = 0.1  # [m] that rest points of a model that is trained on may have moved; settling moves less
 MOST_POSES = 1_000_000  # of all training motions at the model's rate; only extra motions are left out for it
 
 
@@ -47,10 +48,12 @@ class TrainJob:
         minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
         base: a trained model of the same scene that training goes on from; None to train anew. That of a family may
             be of its first body alone, or of the same family.
-        whole: whether all networks of `base` learn, with its settings. Otherwise its initialiser and decoder stay as
-            they are while a new stepper learns.
-        over: trained garments that are worn beneath this one, in some of the windows.
+        whole: whether all networks of `base` learn, with its settings, and its garment may have been moved.
+            Otherwise its initialiser and decoder stay as they are while a new stepper learns.
+        over: trained garments that are worn beneath this one, in some of the windows. What is pinned over cloth that
+            moves becomes tight in `scene` (`inner_garments.loosened`).
         family: bodies to train for, the scene's as the base; None for that one alone.
+        loosened: how many vertices become tight.
     """
 
     scene: Scene
@@ -68,6 +71,7 @@ class TrainJob:
     whole: bool = False
     over: Sequence[InnerModel] = ()
     family: DressedFamily | None = None
+    loosened: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         if self.family:
@@ -78,8 +82,12 @@ class TrainJob:
                 self.scene.garment.mesh.path, found, "a model of one body trains on", "name its bodies with --family"
             )
         need_wearable(self.over, self.scene, self.model.fps)
+        if self.over:
+            scene = loosened(self.scene, self.over)
+            object.__setattr__(self, "loosened", int((scene.classes != self.scene.classes).sum()))
+            object.__setattr__(self, "scene", scene)
         if self.base:
-            _need_same_scene(self.base, self.scene)
+            _need_same_scene(self.base, self.scene, moved=self.whole)
         if self.base and self.base.bodies and self.family:
             _need_same_family(self.base.bodies.family, self.family, self.scene.garment.mesh.path)
         if self.base and self.whole:
@@ -183,29 +191,33 @@ class TrainJob:
         )
 
 
-def _need_same_scene(base: ModelFile, scene: Scene) -> None:
-    """Raise `SsilkError` unless a model was trained on this garment, with this rig and skeleton."""
-    own = base.scene
+def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
+    """Raise `SsilkError` unless a model was trained on this garment, with this rig and skeleton.
+
+    Args:
+        moved: whether the garment may lie elsewhere, as after it was settled, and be tight where it was pinned.
+    """
+    own, mesh = base.scene, scene.garment.mesh
     alike = own.joint_names == scene.joint_names and all(
         np.array_equal(mine, theirs)
-        for mine, theirs in (
-            (own.garment.mesh.faces, scene.garment.mesh.faces),
-            (own.classes, scene.classes),
-            (own.parents, scene.parents),
-        )
+        for mine, theirs in ((own.garment.mesh.faces, mesh.faces), (own.parents, scene.parents))
     )
-    alike = alike and all(
-        np.allclose(mine, theirs, atol=SAME)
-        for mine, theirs in (
-            (own.garment.mesh.points, scene.garment.mesh.points),
-            (own.bind_transforms, scene.bind_transforms),
-        )
-    )
+    alike = alike and np.allclose(own.bind_transforms, scene.bind_transforms, atol=SAME)
+    if alike:
+        away = np.linalg.norm(own.garment.mesh.points - mesh.points, axis=1).max(initial=0)
+        changed = own.classes != scene.classes
+        if moved:
+            alike = away <= FARTHEST_MOVED
+            changed &= ~((own.classes == PINNED) & (scene.classes == TIGHT))
+        else:
+            alike = away <= SAME
+        alike = alike and not changed.any()
     if not alike:
         fail(
-            scene.garment.mesh.path,
+            mesh.path,
             "another garment, rig or skeleton than the given model was trained on",
-            "training goes on from a model of the same scene",
+            "training goes on from a model of the same scene"
+            + (f", whose rest points may have moved by {1000 * FARTHEST_MOVED:g} mm" if moved else ""),
             "train anew",
         )
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..network.model.feedback import BodyFrames
 from ..network.model.network import GarmentModel
 from ..physics.collision import CollisionBody, Contacts, signed_distance_to_planes
 from ..physics.collision.contacts import no_planes
@@ -212,8 +211,7 @@ class Objective:
             start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
         body = bank.body(times.reshape(length, batch))
         if near is not None:
-            planes = near.planes(model.feedback.stopped).unflatten(-1, (length, batch)).movedim(-2, 0)
-            body = BodyFrames(body.matrices, body.bend, planes)
+            body = near.stopping(body, model.feedback.stopped, length)
         with torch.set_grad_enabled(sampler.config.bptt):
             z = model.roll([*(start + noise)], target[2:], pose[2:], body)
         rolled = torch.cat(z[2:])
@@ -232,7 +230,7 @@ class Objective:
         asked = torch.cat([times[2 * batch :], frames])
         character = bank.character(asked)
         x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
-        beneath = self.inner.window(sampler, frames, single_down) if self.inner else None
+        beneath = self.inner.window(sampler, frames, single_down, single_obstacles) if self.inner else None
         pulled = torch.cat([down[2 * batch :], single_down])
         met = None
         if sampler.obstacles and single_obstacles:

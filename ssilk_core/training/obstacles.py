@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from ..network.feedback import spread_rows
 from ..network.model.descriptors import proximity_features, proximity_length
+from ..network.model.feedback import BodyFrames
 from ..network.model.network import GarmentModel
 from ..network.proximity import proximity_reach
 from ..physics.skinning import Skinning
@@ -136,6 +137,11 @@ class Near:
         away = self.away[:count]
         height = (away * self.points[:count]).sum(1) - self.distance[:count]
         return torch.cat([away, height[:, None]], dim=1)
+
+    def stopping(self, body: BodyFrames, count: int, length: int) -> BodyFrames:
+        """Return a body in windows of `length` frames, with the planes at the first points."""
+        planes = self.planes(count)
+        return BodyFrames(body.matrices, body.bend, planes.unflatten(-1, (length, -1)).movedim(-2, 0))
 
 
 class ObstacleDrawer:

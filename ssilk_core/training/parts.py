@@ -16,7 +16,7 @@ from ..network.bodies import joined, unseen
 from ..network.checkpoint import ModelFile
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
-from ..network.parameters import seeing_more
+from ..network.parameters import on_moved_garment, seeing_more
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
@@ -142,7 +142,8 @@ def build_parts(
     report(Message(f"the network and its inputs are built on {device}"))
     model = GarmentModel(scene, job.model, joints, job.train.seed, job.family)
     if job.base and job.whole:
-        known = seeing_more(job.base.parameters, scene, job.base.config, job.model)
+        known = on_moved_garment(job.base.parameters, job.base.scene, scene, job.base.config)
+        known = seeing_more(known, scene, job.base.config, job.model)
         if job.family:
             # To a model of one body coordinates count nothing yet.
             own = job.base.bodies.columns if job.base.bodies else unseen(known, job.family.bodies.size)
@@ -182,6 +183,9 @@ def build_parts(
         samples, beside = energy.cloth.samples, (bank, held, joints, kind)
         found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
         inner = found if len(found) else None
+        if job.loosened:
+            count = f"{job.loosened} pinned vertices lie over cloth that moves"
+            report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
     members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
     validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner, members)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)

@@ -101,8 +101,8 @@ class Stepper:
         """Do a step of static training: P and D on single random poses."""
         frames, pull, direction = self.sampler.poses(self.config.pretraining_batch)
         inner = self.objective.inner
-        beneath = inner.poses(frames, pull, self.sampler.generator) if inner else None
         obstacles = self.sampler.obstacles_at(frames, direction)
+        beneath = inner.poses(frames, pull, self.sampler.generator, obstacles) if inner else None
         terms = self.objective.static(frames, pull, beneath, obstacles)
         means = {name: value.mean() for name, value in terms.items()}
         self._descend(total(terms, self._half), means, {"frames": frames, "directions": pull})

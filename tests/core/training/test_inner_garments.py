@@ -12,7 +12,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, silent
 from ssilk_core.network.checkpoint import load_model, model_file, save_model
 from ssilk_core.network.settings import ModelConfig
-from ssilk_core.scene.assets import Scene
+from ssilk_core.scene.assets import PINNED, TIGHT, Scene
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.training import inner_garments
 from ssilk_core.training.inner_garments import InnerModel
@@ -83,6 +83,45 @@ def test_inner_garments_roll_along_as_they_play_alone(asked, inner):
         worn = kept
         sampler.advance(sampler.latents)
         assert sampler.carried.all()
+
+
+def test_pinned_cloth_is_tight_where_it_lies_over_cloth_that_moves(asked, inner):
+    """Nothing could push it out of that; over pinned cloth, and far from any, it stays pinned."""
+    pinned = asked.scene.classes.copy()
+    pinned[:5] = pinned[10:15] = PINNED
+    worn = replace(asked.scene, garment=replace(asked.scene.garment, classes=pinned))
+    found = replace(asked, scene=worn)
+    assert found.loosened == 10 and (found.scene.classes[:15] == TIGHT).all() and asked.loosened == 5
+    held = replace(inner.file.scene.garment, classes=np.full(len(pinned), PINNED))
+    still = replace(inner, file=replace(inner.file, scene=replace(inner.file.scene, garment=held)))
+    assert replace(asked, scene=worn, over=[still]).scene is worn
+    away = replace(inner, file=replace(inner.file, scene=moved(inner.file.scene, [0, 0, 0.2])))
+    assert replace(asked, scene=worn, over=[away]).loosened == 0
+
+
+def test_inner_garments_see_the_obstacles_that_the_outer_one_meets(asked, scene, toy_model, tmp_path):
+    path = tmp_path / "sees.safetensors"
+    seeing = toy_model(scene, scale=0.05, proximity_points=3)
+    save_model(path, model_file(seeing, Fabric("toy", thickness=2e-3), {"seed": 3}))
+    train_config = replace(SHORT, collider_fraction=1.0)
+    parts = build_parts(replace(asked, train=train_config, over=[InnerModel.load(path)]), CPU)
+    stepper = parts.stepper(train_config, 0)
+    sampler, one = stepper.sampler, parts.inner._garments[0]
+    frames, direction = torch.arange(20), torch.tensor([0.0, -1.0, 0.0]).expand(20, 3)
+    obstacles = sampler.obstacles_at(frames, direction)
+    found = parts.inner.poses(frames, direction, sampler.generator, obstacles).positions[0]
+    near = one.sight.near(obstacles, frames, direction)
+    static = torch.cat([one.sight.seen(near, frames), one.bank.static_descriptor(frames, direction)], dim=1)
+    expected = one.positions(one.model.initial(static), one.bank.character(frames))
+    torch.testing.assert_close(found, expected)
+    blind = parts.inner.poses(frames, direction, sampler.generator).positions[0]
+    assert (found - blind).abs().max() > 1e-4
+    state = sampler.generator.get_state()
+    rolled = [parts.inner.window(sampler, frames, direction, obstacles).positions[0]]
+    sampler.obstacles, sampler.inner["inner.0.latents"] = None, torch.zeros_like(sampler.inner["inner.0.latents"])
+    sampler.generator.set_state(state)
+    rolled.append(parts.inner.window(sampler, frames, direction, obstacles).positions[0])
+    assert (rolled[0] - rolled[1])[..., :-20].abs().max() > 1e-4  # of the windows
 
 
 def test_a_garment_learns_with_and_without_what_is_beneath(asked, monkeypatch):

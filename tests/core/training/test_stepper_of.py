@@ -12,9 +12,12 @@ import torch
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import model_file
+from ssilk_core.network.feedback import feedback_size, feedback_vertices
 from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.parameters import on_moved_garment, parameter_shapes
+from ssilk_core.network.schemes import SCHEMES
 from ssilk_core.network.settings import ModelConfig
-from ssilk_core.scene.assets import TIGHT
+from ssilk_core.scene.assets import TIGHT, Scene
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.scene.mesh import topology
 from ssilk_core.training.job import TrainJob
@@ -78,6 +81,61 @@ def test_a_model_of_another_garment_is_refused(scene, toy_model, toy_scene, toy_
     base = model_file(toy_model(toy_scene(proxies=0)), FABRICS["silk"], {})
     with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
         job(scene, base, toy_motion(scene, 9))
+
+
+def shifted(scene: Scene, by: float, loosened: int = 0) -> Scene:
+    """The garment with every other vertex moved forwards [m], and so many pinned vertices made tight."""
+    mesh, classes = scene.garment.mesh, scene.classes.copy()
+    classes[:loosened] = TIGHT
+    points = mesh.points.copy()
+    points[::2, 2] += by
+    return replace(scene, garment=replace(scene.garment, mesh=replace(mesh, points=points), classes=classes))
+
+
+def test_a_whole_model_goes_on_where_its_garment_was_settled(scene, toy_model, toy_motion):
+    """Within 10 cm, and with fewer pinned vertices; never the other way round, and never its stepper alone."""
+    base = model_file(toy_model(scene), FABRICS["silk"], {})
+    assert job(shifted(scene, 0.04, 3), base, toy_motion(scene, 9), whole=True).scene.classes[2] == TIGHT
+    for other, whole in ((shifted(scene, 0.2), True), (shifted(scene, 0.04), False), (shifted(scene, 0, 3), False)):
+        with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
+            job(other, base, toy_motion(scene, 9), whole=whole)
+    base = model_file(toy_model(shifted(scene, 0, 3)), FABRICS["silk"], {})
+    with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
+        job(scene, base, toy_motion(scene, 9), whole=True)
+
+
+def test_loosened_vertices_stay_where_they_are_until_they_learn(scene, toy_model):
+    before = toy_model(scene, scale=0.05)
+    file = model_file(before, FABRICS["silk"], {})
+    loosened = shifted(scene, 0, 3)
+    known = on_moved_garment(file.parameters, scene, loosened, file.config)
+    assert {name: value.shape for name, value in known.items()} == parameter_shapes(
+        loosened, file.config, file.joints
+    )
+    after = GarmentModel(loosened, file.config, file.joints)
+    after.load_state_dict({name: torch.from_numpy(value) for name, value in known.items()})
+    z, character = torch.randn(4, file.config.latent), torch.eye(4)[:3].expand(3, 4, 3, 4).permute(0, 2, 3, 1)
+    torch.testing.assert_close(after.vertices(z, character), before.vertices(z, character))
+
+
+def test_a_settled_garment_is_seen_at_other_points_which_stand_in_for_those_before(scene, toy_model):
+    """What a network sees alike at all points counts as before, and so does all that is no point."""
+    trained = toy_model(scene, scheme="verlet", feedback_points=6, proximity_points=4, feedback_proxies=True)
+    file = model_file(trained, FABRICS["silk"], {})
+    other = shifted(scene, 0.08)
+    before, after = (feedback_vertices(each, file.config) for each in (scene, other))
+    assert not np.array_equal(before, after)
+    known = on_moved_garment(file.parameters, scene, other, file.config)
+    states, last = SCHEMES[file.config.scheme].states * file.config.latent, feedback_size(scene, file.config)
+    for name, start, count in (
+        ("initialiser.0.weight", 0, 4), (FIRST_WEIGHT, states, 4), (FIRST_WEIGHT, -last, 6),
+    ):  # fmt: skip
+        old, new = (part[name][:, start:][:, : 3 * count].reshape(-1, count, 3) for part in (file.parameters, known))
+        np.testing.assert_allclose(new.sum(axis=1), old.sum(axis=1), atol=1e-6)
+    proxies = last - 18
+    np.testing.assert_array_equal(known[FIRST_WEIGHT][:, -proxies:], file.parameters[FIRST_WEIGHT][:, -proxies:])
+    same = on_moved_garment(file.parameters, scene, scene, file.config)
+    assert all(np.array_equal(value, same[name]) for name, value in file.parameters.items())
 
 
 def test_a_whole_model_goes_on_as_it_is_and_all_of_it_learns(scene, toy_model, toy_motion):
