@@ -70,7 +70,7 @@ def find_cycle(motion: Motion, skeleton: Skeleton, size: float) -> Cycle:
     first, second, third, before, last = points.reshape(len(points), -1, 3)
     (angle, step), gap = _between(first, last)
     closed = Cycle(motion.frame_count - 1, True, angle, step, gap)
-    # Of frames a to e on a cubic the one between is c = (-a + 4 b + 4 d - e) / 6: both sides give (6 c - 4 d + e) / 3.
+    # On a cubic through frames a, b, c, d, e the one between is c = (-a + 4 b + 4 d - e) / 6, which gives each side.
     (angle, step), gap = _between((6 * first - 4 * second + third) / 3, (4 * last - before) / 3)
     opened = Cycle(motion.frame_count, False, angle, step, gap)
     return closed if closed.gap <= opened.gap else opened

@@ -27,7 +27,7 @@ MOST_ROUNDS = 16
 REPEATED = 5e-4  # [m] between the same vertex at the beginnings of two rounds, in two frames
 BLENDED = 0.5  # [s] before the end, at most half of a round
 LARGEST_GAP = 0.03  # of the garment's diagonal, by which a joint may miss where it began
-TOLD_GAP = 0.005  # [m] likewise, above which it is told, as it shows in the cloth
+LARGEST_SEAM = 5.0  # [mm] above which a bake warns
 LARGEST_TURN = np.radians(1)  # of a round whose world has a direction
 
 Decode = Callable[[GarmentPose], Floats]
@@ -147,14 +147,20 @@ class LoopedPoses:
         first: of the first round, which starts at rest, and of the first sample after it.
         begins: sample at which the round begins, of those that were rolled.
         rounds: that were played until then.
-        repeats: whether the next one begins with the same state.
+        apart: distance between the beginnings of this round and the next, of the vertex that is farthest off in two
+            frames [m].
     """
 
     pose: GarmentPose
     first: GarmentPose
     begins: int
     rounds: int
-    repeats: bool
+    apart: float
+
+    @property
+    def repeats(self) -> bool:
+        """Whether the next round begins with the same state."""
+        return self.apart <= REPEATED
 
 
 def looped(rolled: Iterable[GarmentPose], loop: Loop, count: int, fps: float, decode: Decode) -> LoopedPoses:
@@ -188,7 +194,7 @@ def looped(rolled: Iterable[GarmentPose], loop: Loop, count: int, fps: float, de
     share = ((np.arange(count) - (period - length)) / length).clip(0, 1)
     share *= share * (3 - 2 * share)
     closed = _mixed(own, whole.part(slice(begin - period, begin - period + count)), share)
-    return LoopedPoses(closed, whole.part(slice(0, period + 1)), begin, chosen + 1, apart[chosen] <= REPEATED)
+    return LoopedPoses(closed, whole.part(slice(0, period + 1)), begin, chosen + 1, apart[chosen])
 
 
 def _mixed(pose: GarmentPose, other: GarmentPose, share: Floats) -> GarmentPose:
@@ -202,7 +208,7 @@ def _mixed(pose: GarmentPose, other: GarmentPose, share: Floats) -> GarmentPose:
 
 
 @dataclass(frozen=True)
-class Seam:
+class LoopSeam:
     """How the end of a round meets its beginning.
 
     Attributes:
@@ -214,7 +220,7 @@ class Seam:
     jump: float
 
 
-def seam(cycle: Cycle, begin: Sequence[Floats], end: Sequence[Floats], fps: float) -> Seam:
+def seam(cycle: Cycle, begin: Sequence[Floats], end: Sequence[Floats], fps: float) -> LoopSeam:
     """Return how vertices meet at the seam, as the last frames lead to it.
 
     Args:
@@ -228,7 +234,7 @@ def seam(cycle: Cycle, begin: Sequence[Floats], end: Sequence[Floats], fps: floa
     else:
         apart = (6 * first - 4 * second + third - 4 * last + before) / 3  # as in `find_cycle`
         jump = second - 2 * first + last
-    return Seam(float(np.linalg.norm(apart, axis=-1).max()), fps * _rms(jump))
+    return LoopSeam(float(np.linalg.norm(apart, axis=-1).max()), fps * _rms(jump))
 
 
 def summary(
@@ -256,15 +262,25 @@ def summary(
         closed=loop.cycle.closed,
         rounds=found.rounds,
         repeats=found.repeats,
+        blended_mm=1000 * found.apart,
         seam_at_rest_mm=1000 * at_rest.apart,
         seam_mm=1000 * written.apart,
         body_mm=1000 * loop.cycle.gap,
         jump_at_rest=at_rest.jump,
         jump=written.jump,
         usual_jump=float(np.mean(jumps)),
+        largest_jump=max(jumps),
         travel_m=loop.cycle.travel(first[0].mean(axis=0)),
         turn_degrees=float(np.degrees(loop.cycle.angle)),
     )
+
+
+def seam_words(found: LoopSummary) -> str:
+    """Return the words for a seam that shows; empty where none does, or where no frame is shown twice."""
+    if not (found.closed and found.seam_mm > LARGEST_SEAM):
+        return ""
+    why = f"the end of the motion misses its beginning by up to {found.body_mm:.0f} mm at the joints"
+    return f"the last frame is up to {found.seam_mm:.0f} mm off the first; {why}: close the cycle, and bake it again"
 
 
 def _rms(vectors: Floats) -> float:

@@ -210,11 +210,13 @@ class LoopSummary:
         closed: whether the last frame shows the pose of the first, else the one before that.
         rounds: that were played until the written one ended.
         repeats: whether the garment's state had come to repeat by then.
+        blended_mm: distance between the beginnings of this round and the next, of the vertex that is farthest off in
+            two frames [mm]: what the last frames are blended over.
         seam_at_rest_mm, seam_mm: distance between the first frame and where the last ones lead, of the vertex that
             misses it most [mm]: of a round that starts at rest, and of the one that is written.
         body_mm: likewise, of the character's joints.
-        jump_at_rest, jump: RMS change of the velocity at the seam [m/s], likewise; usual_jump: from a sample to the
-            next within the round, in the mean.
+        jump_at_rest, jump: RMS change of the velocity at the seam [m/s], likewise.
+        usual_jump, largest_jump: the same from sample to sample within the round, in the mean and at most.
         travel_m: how far a round takes the garment [m].
         turn_degrees: by how much it turns it about the vertical.
     """
@@ -223,12 +225,14 @@ class LoopSummary:
     closed: bool
     rounds: int
     repeats: bool
+    blended_mm: float
     seam_at_rest_mm: float
     seam_mm: float
     body_mm: float
     jump_at_rest: float
     jump: float
     usual_jump: float
+    largest_jump: float
     travel_m: float
     turn_degrees: float
 
@@ -237,11 +241,13 @@ class LoopSummary:
         last = "shows the first one's pose" if self.closed else "is one before the first"
         figures = {
             "seam from rest, at most [mm]": self.seam_at_rest_mm,
+            "seam before blending, at most [mm]": self.blended_mm,
             "seam, at most [mm]": self.seam_mm,
             "joints miss, at most [mm]": self.body_mm,
             "velocity jumps from rest [m/s]": self.jump_at_rest,
             "velocity jumps [m/s]": self.jump,
-            "within the round [m/s]": self.usual_jump,
+            "within the round, mean [m/s]": self.usual_jump,
+            "within the round, at most [m/s]": self.largest_jump,
             "travels [m]": self.travel_m,
             "turns [degrees]": self.turn_degrees,
         }

@@ -28,7 +28,7 @@ from ...scene.riders import Rider, RiderJoints
 from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
-from .looped import Loop, LoopedPoses, looped, summary
+from .looped import Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
 from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
 from .world import ShotSurroundings, Sight
@@ -405,6 +405,8 @@ class BakeRollout:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
             report(Message(f"{self.request.motion}: {text} {off:.2g} mm (RMS) of linear blend skinning"))
+        if self.loop_summary and (words := seam_words(self.loop_summary)):
+            report(Message(f"{self.request.motion}: {words}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
 

@@ -53,7 +53,9 @@ def read_direction(source: str, stage: str, garment: str, motion: Motion) -> Sai
     Raises:
         SsilkError: a value is no number or out of range, or several prims of the shot may be the garment.
     """
-    prims = _prims(source, stage, garment, motion)
+    file, _ = split_location(source)
+    shot, home = open_stage(file), open_stage(stage)
+    prims = _prims(shot, home, source, garment, motion)
     free = next((prim for prim in prims if has_value(prim, FREE)), None)
     hold = next((prim for prim in prims if has_value(prim, HOLD)), None)
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
@@ -63,7 +65,9 @@ def read_direction(source: str, stage: str, garment: str, motion: Motion) -> Sai
 @explains_damage
 def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
     """Return whether a shot is said to be a cycle; arguments and errors as `read_direction`."""
-    prim = next((prim for prim in _prims(source, stage, garment, motion) if has_value(prim, LOOP)), None)
+    file, _ = split_location(source)
+    shot, home = open_stage(file), open_stage(stage)  # prims live as long as these
+    prim = next((prim for prim in _prims(shot, home, source, garment, motion) if has_value(prim, LOOP)), None)
     if prim is None:
         return False
     found = prim.GetAttribute(LOOP).Get()
@@ -72,11 +76,9 @@ def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
     return found
 
 
-def _prims(source: str, stage: str, garment: str, motion: Motion) -> list[Usd.Prim]:
+def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: str, motion: Motion) -> list[Usd.Prim]:
     """Return the garment's prims in the shot, then in the character's stage."""
-    file, prim = split_location(source)
-    shot, home = open_stage(file), open_stage(stage)
-    _, placed = find_animation(shot, prim or split_location(motion.path)[1], None)
+    _, placed = find_animation(shot, split_location(source)[1] or split_location(motion.path)[1], None)
     return [*_in_shot(shot, garment, placed), *filter(None, [home.GetPrimAtPath(garment)])]
 
 
