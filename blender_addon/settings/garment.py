@@ -123,6 +123,12 @@ class GarmentSettings(bpy.types.PropertyGroup):
         max=MAX_HOLD,
         override=SHOTS,
     )
+    loop: BoolProperty(
+        name="Loop",
+        description="The motion is a cycle: a bake plays it until the garment repeats, and its last frame flows into "
+        "its first",
+        override=SHOTS,
+    )
     certify: BoolProperty(
         name="Certify",
         description="Move baked frames as little as it takes until the garment does not pass through itself and no "

@@ -346,6 +346,11 @@ WORDS = {
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
     ),
+    "Loop": "Schleife",
+    "The motion is a cycle: a bake plays it until the garment repeats, and its last frame flows into its first": (
+        "Die Bewegung ist ein Zyklus: Gebacken wird, wenn sich das Kleidungsstück wiederholt, und das letzte Bild "
+        "geht in das erste über"
+    ),
     "Certify": "Zertifizieren",
     "Move baked frames as little as it takes until the garment does not pass through itself and no skin shows that "
     "it covers; a wrong frame takes seconds": (

@@ -195,6 +195,9 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
                       help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
                            "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip
+    verb.add_argument("--loop", action="store_true",
+                      help="the motion is a cycle: play it until the garment repeats, and write one round whose last "
+                           "frame flows into its first (default: ssilk:loop of the garment in the shot)")  # fmt: skip
     add_world(verb, "with --refine and --quality hero; the network alone feels wind and gravity, and sees colliders "
                     "where it was trained with some")  # fmt: skip
     _add_names(verb)
@@ -333,6 +336,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             certify=options.certify,
             hide_covered=options.hide_covered,
             hold=options.hold or 0,
+            loop=options.loop,
             colliders=tuple(options.collider),
             wind=options.wind,
             gusts=options.gusts,
