@@ -211,8 +211,6 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
-    if family and train.collider_fraction:
-        report(Message("a family of bodies is trained without colliders: its models see none", "warning"))
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
     files |= {*options.over, *options.family}

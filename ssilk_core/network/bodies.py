@@ -99,6 +99,12 @@ class SeenBodies:
         return replace(self, family=self.family.stored())
 
 
+def unseen(parameters: Mapping[str, Floats], size: int) -> dict[str, Floats]:
+    """Return weights of K coordinates that count nothing, for the networks of a model of one body, by name."""
+    biases = {name: parameters.get(f"{name}.0.bias") for name in SEEING}
+    return {name: np.zeros((len(bias), size), np.float32) for name, bias in biases.items() if bias is not None}
+
+
 COLUMNS = re.compile(r"(\w+)\.0\.parametrizations\.bias\.(original|0\.columns)")
 
 
@@ -115,3 +121,12 @@ def parted(values: Mapping[str, Floats]) -> tuple[dict[str, Floats], dict[str, F
         else:
             columns[found[1]] = value
     return parameters, columns
+
+
+def joined(parameters: Mapping[str, Floats], columns: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return what `parted` takes apart."""
+    found = dict(parameters)
+    for name, values in columns.items():
+        within = f"{name}.0.parametrizations.bias"
+        found[f"{within}.original"], found[f"{within}.0.columns"] = found.pop(f"{name}.0.bias"), values
+    return found

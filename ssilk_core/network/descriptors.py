@@ -125,22 +125,22 @@ def pose_features(
     turn = [
         six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
     ]
-    dynamic = np.concatenate([rate, change, *turn, accelerations(world, root, motion.fps)], axis=1)
+    dynamic = np.concatenate([rate, change, *turn, accelerations(world[..., :3, 3], root, motion.fps)], axis=1)
     return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity, near)
 
 
-def accelerations(world: Floats, root: Floats, fps: float) -> Floats:
+def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
     """Return accelerations of joints in the root's frame [g], the last of relative features before these saturate.
 
     Args:
-        world: joint-to-world transforms of the descriptor joints, shape (F, J', 4, 4).
+        places: of the descriptor joints in the world [m], shape (F, J', 3).
         root: rotations of the hub, shape (F, 3, 3).
 
     Returns:
         Shape (F, 3 J').
     """
-    acceleration = _differences(world[..., :3, 3], fps)[1] / (RATE_TIME**2 * GRAVITY)
-    return np.einsum("fba,fjb->fja", root, acceleration).reshape(len(world), -1)
+    acceleration = _differences(places, fps)[1] / (RATE_TIME**2 * GRAVITY)
+    return np.einsum("fba,fjb->fja", root, acceleration).reshape(len(places), -1)
 
 
 def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:

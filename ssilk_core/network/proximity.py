@@ -45,7 +45,7 @@ def sees_at(features: int) -> tuple[str, str]:
 
 def proximity_reach(scene: Scene) -> float:
     """Return the distance from which on colliders are not seen [m]."""
-    return scene.garment.mesh.diagonal
+    return scene.garment.sewn_mesh.diagonal  # one for all bodies of a family
 
 
 def proximity(points: Floats, distance: Floats, normal: Floats, origin: Floats, reach: float) -> Floats:

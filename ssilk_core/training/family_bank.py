@@ -17,8 +17,8 @@ from torch import Tensor
 from ..network.descriptors import SATURATION, accelerations, place_of_hub
 from ..scene.assets import Floats, Motion, Skeleton
 from ..scene.family import BodyFamily, motion_on
-from ..scene.kinematics import motion_transforms, resample
-from .motion_bank import MotionBank, arrays_of, bank_tensors, needed_spans, skinned
+from ..scene.kinematics import motion_transforms, resample, skinning_matrices
+from .motion_bank import MotionBank, arrays_of, bank_tensors, needed_spans
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +88,28 @@ def build_family_bank(
 
 
 def _family_arrays(clip: Motion, skeleton: Skeleton, joints: np.ndarray, family: BodyFamily) -> dict[str, np.ndarray]:
-    """Return what a `FamilyBank` has of the frames of one clip beside those of the base, by name, float32."""
-    hub = place_of_hub(skeleton, joints)
+    """Return what a `FamilyBank` has of the frames of one clip beside those of the base, by name, float32.
 
-    def parts(motion: Motion, own: Skeleton) -> tuple[Floats, Floats, Floats]:
-        matrices, root = skinned(motion, own)
-        world = motion_transforms(motion, own.parents)[:, joints]
-        raw = accelerations(world, world[:, hub, :3, :3], motion.fps)
-        return matrices[:, :, :3, 3].reshape(len(root), -1), root, raw
-
-    base, moves = parts(clip, skeleton), []
+    Rotations are the same on all bodies, so that only positions are summed anew along chains of joints.
+    """
+    world = motion_transforms(clip, skeleton.parents)
+    turned = skinning_matrices(world, skeleton.bind_transforms)[..., :3, :3]
+    hub, root = skeleton.hub, world[:, joints[place_of_hub(skeleton, joints)], :3, :3]
+    moves: list[tuple[Floats, Floats, Floats]] = []
     for unit, taller in zip(np.eye(family.size), family.taller):
         other = family.skeleton_at(skeleton, unit)
-        found = parts(motion_on(clip, skeleton, other, 1 + taller), other)
-        moves.append([there - here for there, here in zip(found, base)])
+        local = motion_on(clip, skeleton, other, 1 + taller).translations - clip.translations
+        moved = np.zeros_like(local)
+        for joint, parent in enumerate(skeleton.parents):
+            own = local[:, joint]
+            if parent >= 0:
+                own = moved[:, parent] + np.einsum("fab,fb->fa", world[:, parent, :3, :3], own)
+            moved[:, joint] = own
+        bound = other.bind_transforms[:, :3, 3] - skeleton.bind_transforms[:, :3, 3]
+        centred = moved - moved[:1, hub, None]
+        skins = centred - np.einsum("fjab,jb->fja", turned, bound)
+        raw = accelerations(moved[:, joints], root, clip.fps)
+        moves.append((skins.reshape(len(skins), -1), centred[:, hub], raw))
     stacked = [np.stack(each, axis=1).astype(np.float32) for each in zip(*moves)]
-    return {**dict(zip(("matrix_moves", "root_moves", "raw_moves"), stacked)), "raw": base[2].astype(np.float32)}
+    own = accelerations(world[:, joints][..., :3, 3], root, clip.fps).astype(np.float32)
+    return {**dict(zip(("matrix_moves", "root_moves", "raw_moves"), stacked)), "raw": own}

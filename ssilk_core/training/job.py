@@ -46,7 +46,8 @@ class TrainJob:
         output: the model file to write; the run's other files go to the same folder.
         inputs: hashes of the input files by name, for the provenance.
         minutes: wall time to fill instead of the schedule's iterations; None for these. A resumed run may have more.
-        base: a trained model of the same scene that training goes on from; None to train anew.
+        base: a trained model of the same scene that training goes on from; None to train anew. That of a family may
+            be of its first body alone, or of the same family.
         whole: whether all networks of `base` learn, with its settings, and its garment may have been moved.
             Otherwise its initialiser and decoder stay as they are while a new stepper learns.
         over: trained garments that are worn beneath this one, in some of the windows. What is pinned over cloth that
@@ -75,9 +76,11 @@ class TrainJob:
     def __post_init__(self) -> None:
         if self.family:
             self._need_family()
-        if self.base and self.base.bodies:
-            found = "training that goes on from a model of a family of bodies"
-            fail(self.scene.garment.mesh.path, found, "models of one body train on", "train for the family anew")
+        if self.base and self.base.bodies and not self.family:
+            found = "training that goes on from a model of a family of bodies, without the family"
+            fail(
+                self.scene.garment.mesh.path, found, "a model of one body trains on", "name its bodies with --family"
+            )
         need_wearable(self.over, self.scene, self.model.fps)
         if self.over:
             scene = loosened(self.scene, self.over)
@@ -85,6 +88,8 @@ class TrainJob:
             object.__setattr__(self, "scene", scene)
         if self.base:
             _need_same_scene(self.base, self.scene, moved=self.whole)
+        if self.base and self.base.bodies and self.family:
+            _need_same_family(self.base.bodies.family, self.family, self.scene.garment.mesh.path)
         if self.base and self.whole:
             object.__setattr__(self, "model", self.base.config)
             # P and D are trained.
@@ -126,16 +131,14 @@ class TrainJob:
             object.__setattr__(self, "train", least)
 
     def _need_family(self) -> None:
-        """Raise `SsilkError` where a family is asked for with what knows one body; it sees no colliders."""
+        """Raise `SsilkError` where a family is asked for with what knows one body."""
         for found, there in (
-            ("training that goes on from a model", self.base is not None),
+            ("a stepper alone that learns", self.stepper_alone),
             ("garments beneath", bool(self.over)),
             (f"descriptors '{self.model.descriptors}'", self.model.descriptors != "relative"),
         ):
             if there:
                 fail(self.scene.garment.mesh.path, f"{found} and a family of bodies", "one of both", "leave one out")
-        object.__setattr__(self, "train", replace(self.train, collider_fraction=0))
-        object.__setattr__(self, "model", replace(self.model, proximity_points=0))
 
     @property
     def stepper_alone(self) -> bool:
@@ -217,6 +220,24 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
             + (f", whose rest points may have moved by {1000 * FARTHEST_MOVED:g} mm" if moved else ""),
             "train anew",
         )
+
+
+def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> None:
+    """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them."""
+    mine, theirs = own.bodies, family.bodies
+    alike = mine.members.shape == theirs.members.shape and mine.joints.shape == theirs.joints.shape
+    alike = alike and all(
+        np.allclose(here, there, atol=SAME)
+        for here, there in (
+            (mine.members, theirs.members),
+            (mine.joint_moves, theirs.joint_moves),
+            (mine.point_moves, theirs.point_moves[:, mine.rows]),
+            (own.cloth_moves, family.cloth_moves),
+        )
+    )
+    if not alike:
+        found = "another family of bodies than the given model was trained for"
+        fail(where, found, "training goes on for the same one", "name the same stages in the same order")
 
 
 def _frames(motions: Sequence[Motion]) -> dict[str, list[tuple[float, int, float]]]:

@@ -10,6 +10,9 @@ Bodies do not pass through floors and chairs, so that an obstacle is where the b
 it is drawn for. Where it would, one beside the garment is moved away, and then r shrinks until it does not, below
 zero at need. The same is done in each window that continues another: an obstacle that stands in the way draws back.
 Some obstacles are kept off the garment, too, as it would rest: what is near is not always touched.
+
+A window of a family of bodies continues on another body than that before. Its floor is then as far from the new body
+as it was from the old one, as if that had been in the same frames; what stands in the new one's way draws back.
 """
 
 from __future__ import annotations
@@ -26,6 +29,8 @@ from ..network.model.network import GarmentModel
 from ..network.proximity import proximity_reach
 from ..physics.skinning import Skinning
 from ..scene.assets import SkinWeights
+from ..scene.family import BodyFamily
+from .family_bank import FamilyBank
 from .motion_bank import MotionBank
 
 BODY_POINTS = 256  # spread over the body, by which it is kept out of obstacles
@@ -146,10 +151,17 @@ class ObstacleDrawer:
         model: of the garment, as it is trained.
         hub: the place of the skeleton's hub among the joints of the descriptors.
         share: of windows and poses that have any.
+        family: bodies that steps are done on; the scene's alone by default.
     """
 
     def __init__(
-        self, model: GarmentModel, bank: MotionBank, hub: int, share: float, generator: torch.Generator
+        self,
+        model: GarmentModel,
+        bank: MotionBank,
+        hub: int,
+        share: float,
+        generator: torch.Generator,
+        family: BodyFamily | None = None,
     ) -> None:
         body = model.scene.character.merged_body()
         self.model, self.bank, self.hub, self.share, self.generator = model, bank, hub, share, generator
@@ -158,6 +170,20 @@ class ObstacleDrawer:
         skin = SkinWeights(body.skin.path, body.skin.indices[rows], body.skin.weights[rows])
         self._skin = Skinning(skin).to(bank.static.device)
         self._body = torch.tensor(body.mesh.points[rows], dtype=torch.float32, device=bank.static.device)
+        self._base, self._moves = self._body.clone(), None
+        if family:
+            assert isinstance(bank, FamilyBank)
+            self._moves = torch.tensor(family.point_moves[:, rows], dtype=torch.float32, device=self._body.device)
+
+    def wear(self, place: Tensor) -> None:
+        """Keep obstacles out of the body of a family at coordinates (K,), in place."""
+        if self._moves is not None:
+            self._body.copy_(self._base + torch.tensordot(place, self._moves, 1))
+
+    @property
+    def worn(self) -> Tensor | None:
+        """Coordinates (K,) of the body that steps are done on; None for one body alone."""
+        return self.bank.place if isinstance(self.bank, FamilyBank) else None
 
     def near(self, obstacles: Obstacles, frames: Tensor, gravity: Tensor) -> Near:
         """Return how near obstacles are in frames (N,) to the points that see them.
@@ -210,6 +236,25 @@ class ObstacleDrawer:
         inside = (-self._clearance(obstacles, frames)).clamp_min(0)
         drawn = Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius - inside)
         return drawn.without_empty()
+
+    def brought(self, obstacles: Obstacles, frames: Tensor, before: Tensor) -> Obstacles:
+        """Return obstacles around a body at coordinates `before` (K,) as they are around that which is worn now.
+
+        Floors and walls, which come first, stay as far from it in frames (T, N); it stays outside of all.
+        """
+        assert isinstance(self.bank, FamilyBank)
+        now, place = self._clearance(obstacles, frames), self.bank.place.clone()
+        self._put_on(before)
+        then = self._clearance(obstacles, frames)
+        self._put_on(place)
+        nearer = torch.cat([(now - then)[:1], torch.zeros_like(now[1:])])
+        brought = Obstacles(obstacles.turn, obstacles.centre, obstacles.half, obstacles.radius + nearer)
+        return self.drawn_back(brought, frames)
+
+    def _put_on(self, place: Tensor) -> None:
+        assert isinstance(self.bank, FamilyBank)
+        self.bank.wear(place)
+        self.wear(place)
 
     def _resting(self, frames: Tensor, gravity: Tensor) -> Tensor:
         """Return the points that see obstacles (M, 3, N), where they would rest without in frames (N,)."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..events import Message, Reporter, format_count, silent
+from ..network.bodies import joined, unseen
 from ..network.checkpoint import ModelFile
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
@@ -96,10 +97,11 @@ class TrainingParts:
         """Return a new stepper with its own seed; a group of processes shares the batch."""
         group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
-        drawer = None
+        drawer, family = None, self.model.family
         if self.model.proximity and own.collider_fraction:
             hub = place_of_hub(self.model.scene.character.skeleton, self.model.joints)
-            drawer = ObstacleDrawer(self.model, self.bank, hub, own.collider_fraction, generator)
+            known = family.bodies if family else None
+            drawer = ObstacleDrawer(self.model, self.bank, hub, own.collider_fraction, generator, known)
         sampler = WindowSampler(self.bank, own, self.model.config.latent, generator, drawer)
         surface = config.closest_point == "triangles"
         objective = Objective(
@@ -111,9 +113,10 @@ class TrainingParts:
             self.inner.attach(sampler)
         average = group.average if group.size > 1 else None
         bodies = None
-        if family := self.model.family:
+        if family:
             assert isinstance(self.bank, FamilyBank)
-            wearers: list[BodyWearer] = [self.model, self.bank, objective, *([self.shape] if self.shape else [])]
+            known_to = (self.model, self.bank, objective, self.shape, drawer)
+            wearers: list[BodyWearer] = [each for each in known_to if each]
             bodies = DrawnBodies(family.bodies, wearers, seed, self.device)
         return Stepper(self.model, objective, sampler, own, average, self.smoothing, bodies)
 
@@ -141,6 +144,10 @@ def build_parts(
     if job.base and job.whole:
         known = on_moved_garment(job.base.parameters, job.base.scene, scene, job.base.config)
         known = seeing_more(known, scene, job.base.config, job.model)
+        if job.family:
+            # To a model of one body coordinates count nothing yet.
+            own = job.base.bodies.columns if job.base.bodies else unseen(known, job.family.bodies.size)
+            known = joined(known, own)
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)

@@ -273,7 +273,7 @@ class TrainingRun:
             self.report(validation_message(state.iteration, score, self.lbs, dynamic))
             finite = {name: value for name, value in batch.items() if isfinite(value)}
             state.curve = append_point(state.curve, CurvePoint(state.iteration, state.seconds, finite, score))
-            better = state.best is None or score.total < state.best.score.total
+            better = state.best is None or score.judged < state.best.score.judged
             if better:
                 state.best = Best(state.iteration, score)
             self._write_state()

@@ -109,6 +109,7 @@ class Stepper:
 
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
+        self.sampler.change_body()
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
         if self.config.initial_loss:
             poses = self.sampler.with_initial(*poses)

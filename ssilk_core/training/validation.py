@@ -105,6 +105,11 @@ class Score:
         """Sum of all terms [J]."""
         return sum(self.terms.values())
 
+    @property
+    def judged(self) -> float:
+        """Mean of the totals on all bodies [J], by which the best model is chosen; the total for one body."""
+        return (self.total + sum(body.total for body in self.bodies)) / (1 + len(self.bodies))
+
 
 @dataclass(frozen=True, eq=False)
 class ValidatedBody:

@@ -96,8 +96,9 @@ def shortcomings(
 
 
 def non_finite_terms(score: Score) -> list[str]:
-    """Return the names of the terms that are not finite."""
-    return [name for name, value in score.terms.items() if not isfinite(value)]
+    """Return the names of the terms that are not finite, and of bodies whose total is not."""
+    found = {**score.terms, **{body.name: body.total for body in score.bodies}}
+    return [name for name, value in found.items() if not isfinite(value)]
 
 
 def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) -> Message:
@@ -111,6 +112,7 @@ def validation_message(iteration: int, score: Score, lbs: Score, moves: bool) ->
         + "".join(
             f", {part}" for part in (score.shown_skin, score.intersections, score.step_errors, *score.layers) if part
         )
+        + "".join(f", {body.total:.4g} of {body.lbs:.4g} J on {body.name}" for body in score.bodies)
     )
     if score.dynamics < NO_DYNAMICS and moves:
         return Message(f"{text}; {ADVICE}", "warning")

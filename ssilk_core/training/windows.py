@@ -56,6 +56,7 @@ class WindowSampler:
         latents: the two states from which a continued window starts, shape (2, batch, latent).
         carried: which slots continue, shape (batch,).
         obstacles: around each slot's character; None where none are drawn.
+        around: coordinates of the body of a family that they were drawn around, shape (K,); None for one body alone.
         inner: what inner garments keep from window to window, by name (`InnerGarments.attach`); nothing by default.
     """
 
@@ -88,6 +89,7 @@ class WindowSampler:
         self.latents = torch.zeros(2, config.batch, latent, device=device)
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
         self.obstacles = drawer.draw(self.frames(), self.direction) if drawer else None
+        self.around = None if drawer is None or drawer.worn is None else drawer.worn.clone()
         self.inner: dict[str, Tensor] = {}
 
     def _fresh(self) -> Tensor:
@@ -163,16 +165,31 @@ class WindowSampler:
         if self.heading is not None:
             self.heading.copy_(torch.where(go_on[:, None], self.heading, random_headings(fresh, self.generator)))
         if self.drawer and self.obstacles:
-            drawn = self.drawer.draw(self.frames(), self.direction)
             kept = self.drawer.drawn_back(self.obstacles, self.frames())
-            for own, old, new in zip(self.obstacles.parts, kept.parts, drawn.parts):
-                own.copy_(torch.where(go_on.reshape(1, -1, *[1] * (own.ndim - 2)), old, new))
+            # Those of a family's new windows are drawn around the body that the next step is done on.
+            drawn = self.drawer.draw(self.frames(), self.direction) if self.around is None else kept
+            self._choose(go_on, kept, drawn)
         self.latents.copy_(latents.detach())
         self.carried.copy_(go_on)
 
+    def change_body(self) -> None:
+        """Draw obstacles of new windows around the body of a family that is worn now, and bring those of others."""
+        if self.drawer is None or self.obstacles is None or self.around is None or self.drawer.worn is None:
+            return
+        drawn = self.drawer.draw(self.frames(), self.direction)
+        brought = self.drawer.brought(self.obstacles, self.frames(), self.around)
+        self._choose(self.carried, brought, drawn)
+        self.around.copy_(self.drawer.worn)
+
+    def _choose(self, chosen: Tensor, kept: Obstacles, drawn: Obstacles) -> None:
+        """Take obstacles that are kept in slots that are `chosen` (batch,), and others elsewhere, in place."""
+        assert self.obstacles is not None
+        for own, old, new in zip(self.obstacles.parts, kept.parts, drawn.parts):
+            own.copy_(torch.where(chosen.reshape(1, -1, *[1] * (own.ndim - 2)), old, new))
+
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
-        names = ("first", "direction", "latents", "carried", "heading", "pull")
+        names = ("first", "direction", "latents", "carried", "heading", "pull", "around")
         found = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.obstacles:
             found |= {f"obstacles.{name}": value for name, value in vars(self.obstacles).items()}

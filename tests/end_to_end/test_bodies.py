@@ -143,8 +143,19 @@ def test_a_family_needs_members(world, capsys, toy):
     stage.Save()
     assert run(f"{TRAIN} --family taller.usda -o new.safetensors", *toy.training) == 2
     assert "Hips/Spine/Skull" in capsys.readouterr().err and not Path("new.safetensors").exists()
-    assert run(f"{TRAIN} --family heavier.usda --start-from model.safetensors -o new.safetensors") == 2
+    assert run(f"{TRAIN} --family heavier.usda --stepper-of model.safetensors -o new.safetensors") == 2
     assert "a family of bodies" in capsys.readouterr().err
+
+
+def test_a_family_goes_on_from_a_model_of_its_first_body_or_of_itself(world, toy, capsys):
+    steps = [word.replace("static_fraction=0.5", "static_fraction=0") for word in toy.training]
+    assert run(f"{TRAIN} --family heavier.usda --start-from model.safetensors -o new.safetensors", *steps) == 0
+    own = load_model("new.safetensors")
+    assert own.bodies is not None and own.provenance["whole"]
+    assert run(f"{TRAIN} --family heavier.usda --start-from new.safetensors -o more.safetensors", *steps) == 0
+    capsys.readouterr()
+    assert run(f"{TRAIN} --family taller.usda --start-from new.safetensors -o odd.safetensors", *steps) == 2
+    assert "another family of bodies" in capsys.readouterr().err and not Path("odd.safetensors").exists()
 
 
 def test_a_training_of_a_family_goes_on_as_if_it_had_not_stopped(world, toy, monkeypatch):
@@ -314,7 +325,7 @@ def test_a_character_without_a_stage_is_no_body_to_export_for(world, capsys):
 
 def test_a_model_of_a_family_does_not_train_on_as_one_of_a_body(world, capsys):
     assert run(f"{TRAIN} --preset draft --start-from family.safetensors -o new.safetensors") == 2
-    assert "train for the family anew" in capsys.readouterr().err
+    assert "name its bodies with --family" in capsys.readouterr().err
 
 
 def with_hat(path: str) -> None:

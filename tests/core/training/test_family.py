@@ -274,3 +274,140 @@ def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(m
     drawn.draw(1)
     torch.testing.assert_close(stepper.ema_model.decoder.rest, rest)
     assert not torch.allclose(model.decoder.rest, rest)
+
+
+def family_job(scene, family, motion, output, **given):
+    config = given.pop("model", CONFIG)
+    train = given.pop("train", TrainConfig(batch=4, static_batch=2, static_fraction=0, collider_fraction=0.0))
+    return TrainJob(
+        scene=scene, motions=[motion], held_out=[motion], model=config, train=train, fabric=Fabric("toy"),
+        output=output, family=family, **given,
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def test_a_model_of_one_body_goes_on_for_a_family_as_it_was(scene, members, family, toy_motion, tmp_path):
+    motion = toy_motion(scene, 24)
+    alone = GarmentModel(scene, CONFIG, np.arange(3), 0)
+    generator = torch.Generator().manual_seed(1)
+    for value in alone.parameters():
+        value.add_(0.2 * torch.randn(value.shape, generator=generator))
+    base = model_file(alone, Fabric("toy"), {})
+    job = family_job(scene, family, motion, tmp_path / "m.safetensors", base=base, whole=True)
+    parts = build_parts(job, CPU)
+    file = model_file(parts.model, Fabric("toy"), {})
+    assert all(not values.any() for values in file.bodies.columns.values())
+    for coordinates in family.bodies.members:
+        found = file.on_body(coordinates)
+        assert found.parameters.keys() == base.parameters.keys()
+        for name, value in base.parameters.items():
+            np.testing.assert_array_equal(found.parameters[name], value)
+    assert torch.equal(
+        frames_of(parts.model, motion, members[0].skeleton), frames_of(alone, motion, members[0].skeleton)
+    )
+
+
+def test_a_step_from_a_model_of_one_body_teaches_it_bodies(scene, family, toy_motion, tmp_path):
+    motion = toy_motion(scene, 24)
+    base = model_file(GarmentModel(scene, CONFIG, np.arange(3), 0), Fabric("toy"), {})
+    job = family_job(scene, family, motion, tmp_path / "m.safetensors", base=base, whole=True)
+    parts = build_parts(job, CPU)
+    stepper = parts.stepper(job.train, 0)
+    for iteration in range(3):
+        stepper.run(iteration)
+    assert all(module.columns.any() for module in parts.model.modules() if isinstance(module, SeenBody))
+    onward = model_file(parts.model, Fabric("toy"), {})
+    again = build_parts(replace(job, base=onward), CPU).model
+    for name, value in parts.model.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name])
+
+
+def test_what_a_family_cannot_go_on_from_is_refused(scene, members, family, model, toy_motion, tmp_path):
+    motion, path = toy_motion(scene, 24), tmp_path / "m.safetensors"
+    file = model_file(model, Fabric("toy"), {})
+    with pytest.raises(SsilkError, match="without the family"):
+        family_job(scene, None, motion, path, base=file, whole=True)
+    with pytest.raises(SsilkError, match="a stepper alone"):
+        family_job(scene, family, motion, path, base=file)
+    other = dressed_family(scene, BodyFamily.of([members[0], members[2], members[1]]), [members[2], members[1]])[0]
+    with pytest.raises(SsilkError, match="another family"):
+        family_job(scene, other, motion, path, base=file, whole=True)
+
+
+SEEING_COLLIDERS = TrainConfig(batch=64, window=4, static_batch=2, static_fraction=0, collider_fraction=1.0)
+
+
+def colliding_parts(scene, family, motion, output):
+    job = family_job(scene, family, motion, output, train=SEEING_COLLIDERS, model=replace(CONFIG, proximity_points=5))
+    assert job.train.collider_fraction == 1 and job.model.proximity_points == 5
+    parts = build_parts(job, CPU)
+    stepper = parts.stepper(job.train, 0)
+    return parts, stepper, stepper.sampler.drawer
+
+
+def clearances(parts, drawer, obstacles, frames, member):
+    """Distances of a member's own points from obstacles in windows, least of each, from its own skinning."""
+    body = member.merged_body()
+    whole = CollisionBody(body, member.skeleton.joint_count, device=CPU)
+    found = []
+    for at in frames:
+        points = whole.pose(parts.bank.character(at)).points
+        found.append(torch.stack([obstacles.distance(points, box).amin(0) for box in range(2)]))
+    return torch.stack(found).amin(0)
+
+
+@torch.no_grad()
+def test_floors_lie_at_the_lowest_point_of_the_body_that_is_drawn(scene, members, family, toy_motion, tmp_path):
+    parts, stepper, drawer = colliding_parts(scene, family, toy_motion(scene, 40), tmp_path / "m.safetensors")
+    sampler, bodies = stepper.sampler, family.bodies
+    sampler.carried.fill_(False)
+    floor_gaps = []
+    for row in (1, 2, 0):
+        stepper.bodies.wear(bodies.members[row].copy())
+        sampler.change_body()
+        least = clearances(parts, drawer, sampler.obstacles, sampler.frames(), members[row])
+        there = sampler.obstacles.radius > -1
+        assert there.any() and (least[there] > -1e-3).all()  # the body is in none of them
+        floor_gaps.append(float(least[0][there[0]].median()))
+    assert max(floor_gaps) < 0.02  # most touch it: `SKIN` away, and a little where the lowest point is not sampled
+
+
+@torch.no_grad()
+def test_floors_go_along_with_bodies_of_windows_that_continue(scene, members, family, toy_motion, tmp_path):
+    parts, stepper, drawer = colliding_parts(scene, family, toy_motion(scene, 40), tmp_path / "m.safetensors")
+    sampler, bodies = stepper.sampler, family.bodies
+    stepper.bodies.wear(bodies.members[1].copy())
+    sampler.carried.fill_(False)
+    sampler.change_body()
+    sampler.carried.fill_(True)
+    there, frames = sampler.obstacles.radius[0] > -1, sampler.frames()
+    before = clearances(parts, drawer, sampler.obstacles, frames, members[1])[0][there]
+    for row in (2, 0, 1):
+        stepper.bodies.wear(bodies.members[row].copy())
+        sampler.change_body()
+        now = clearances(parts, drawer, sampler.obstacles, frames, members[row])
+        torch.testing.assert_close(now[0][there], before, atol=0.01, rtol=0)
+        standing = sampler.obstacles.radius > -1
+        assert (now[standing] > -1e-3).all()
+
+
+def test_training_for_a_family_that_sees_colliders_goes_on_again(scene, family, toy_motion, tmp_path):
+    """What obstacles were drawn around is part of the state."""
+    runs = []
+    for split in (False, True):
+        _, stepper, _ = colliding_parts(scene, family, toy_motion(scene, 40), tmp_path / "m.safetensors")
+        for iteration in range(3):
+            stepper.run(iteration)
+            if split and iteration == 1:
+                saved = {name: value.clone() for name, value in stepper.sampler.state().items()}
+                stepper.bodies.wear(family.bodies.members[1].copy())
+                stepper.sampler.restore(saved)
+        runs.append(stepper.sampler.obstacles)
+    assert all(torch.equal(one, other) for one, other in zip(runs[0].parts, runs[1].parts))
+
+
+def test_the_best_model_of_a_family_is_that_of_all_its_bodies():
+    first = Score({"stretch": 1.0}, 0.0, bodies=(BodyScore("/a", 5.0, 9.0, 0.0),))
+    then = Score({"stretch": 1.5}, 0.0, bodies=(BodyScore("/a", 2.0, 9.0, 0.0),))
+    assert then.judged < first.judged and then.total > first.total
+    assert Score({"stretch": 1.5}, 0.0).judged == 1.5
