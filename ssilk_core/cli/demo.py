@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.
 
-The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
+The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training,
+and so does --garment cape_over_dress, which films an outfit: a cape that was trained over the hooded dress, and the
+dress. The list outfit.toml, to inspect and train both anew, is written beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,8 +30,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="folder for everything that the demo writes (default demo_out)",
     )  # fmt: skip
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="garment (default cape)"
-    )
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress", "cape_over_dress"), default="cape",
+        help="garment, or an outfit of two (default cape)",
+    )  # fmt: skip
     verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
@@ -37,18 +41,22 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
+    from ..demo.garments import OVER
     from ..demo.shipped import open_shipped, origin
 
-    wardrobe = _make_inputs(options.output, report)
+    outfit = OVER.get(options.garment, ())
+    wardrobe = _make_inputs(options, report)
     shipped = open_shipped(options.garment, wardrobe[options.garment])
     report(Message(f"shipped {options.garment}: {origin(shipped)}"))
-    commands = _shipped(options) + ([] if options.pretrained else _trained(options))
+    commands = _outfit(options, outfit[1:]) if outfit else _shipped(options)
+    if not (outfit or options.pretrained):
+        commands += _trained(options)
     for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
         code = options.main([*command, "--json"] if options.json else command)
         if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
-    shown = ["shipped"] if options.pretrained else ["shipped", PRESET]
+    shown = ["shipped"] if options.pretrained or outfit else ["shipped", PRESET]
     report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
@@ -69,6 +77,22 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
             {name: shots[name] for name in ("linear blend skinning", "shipped")},
             fps=30 if options.pretrained else 15,
         ),
+    ]
+
+
+def _outfit(options: argparse.Namespace, inner: Sequence[str]) -> list[list[str]]:
+    """Return the commands that bake and film a shipped garment over those beneath it, inner ones first."""
+    from ..demo.shipped import shipped_path
+
+    out = options.output
+    models = [str(shipped_path(name)) for name in (*inner, options.garment)]
+    bake = ["bake", *models, "--stage", str(_body()), "--motion", str(out / "shot.usdc")]
+    folders = {"linear blend skinning": out / "outfit_lbs", "shipped": out / "outfit"}
+    shots = {name: str(folder / "shots" / "shot" / "shot.usda") for name, folder in folders.items()}
+    return [
+        [*bake, "-o", str(folders["linear blend skinning"]), "--lbs"],
+        [*bake, "-o", str(folders["shipped"])],
+        *_views(out / "shipped", shots, fps=30),
     ]
 
 
@@ -112,16 +136,22 @@ def _body() -> Path:
     return demo_body_path()
 
 
-def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
-    """Write the wardrobe, the motions to train on, and the shot to bake; return the wardrobe."""
+def _make_inputs(options: argparse.Namespace, report: Reporter) -> dict[str, Mesh]:
+    """Write the wardrobe, the motions to train on, and the shot to bake; return the wardrobe.
+
+    For an outfit, its list is written as well.
+    """
     from ssilk_usd.reading.character import read_character
     from ssilk_usd.writing.files import write_garment, write_motion
 
-    from ..demo.garments import GARMENTS, build_garment
+    from ..demo.garments import GARMENTS, OVER, build_garment
     from ..demo.motions import demo_shot, training_motions
+    from ..training.wardrobe.listing import write_list
 
-    character = read_character(_body())
-    wardrobe = {name: build_garment(name, character).mesh for name in GARMENTS}
+    out, character = options.output, read_character(_body())
+    over = OVER.get(options.garment, ())
+    named = [*GARMENTS, options.garment] if over else GARMENTS
+    wardrobe = {name: build_garment(name, character).mesh for name in named}
     for name, mesh in wardrobe.items():
         write_garment(out / "wardrobe" / f"{name}.usdc", mesh)
         report(Message(f"made {name}: {mesh.vertex_count} vertices"))
@@ -129,6 +159,11 @@ def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
     for number, motion in enumerate(motions):
         write_motion(out / "motions" / f"{number:02d}_{motion.path}.usdc", motion, character.skeleton)
     write_motion(out / "shot.usdc", demo_shot(character.skeleton), character.skeleton)
+    if over:
+        table = {"stage": str(_body()), "motions": str(out / "motions"), "material": {"tether": 5000}}
+        tables = {name: {**table, "garment": str(out / "wardrobe" / f"{name}.usdc")} for name in over[1:]}
+        own = {**table, "garment": str(out / "wardrobe" / f"{options.garment}.usdc"), "over": [*over[1:]]}
+        write_list(out / "outfit.toml", {**tables, options.garment: own})
     seconds = sum(motion.frame_count / motion.fps for motion in motions)
     report(Message(f"made {len(motions)} motions of {seconds:.0f} s to train on, and a shot to bake"))
     return wardrobe

@@ -16,15 +16,30 @@ CLEARANCE = 0.012  # [m]; more than the 6 mm that must remain, because triangles
 
 
 def build_garment(name: str, character: Character) -> Garment:
-    """Return one of `GARMENTS` fitted to an upright character in an A-pose, without weights or classes.
+    """Return one of `GARMENTS` or `OVER` fitted to an upright character in an A-pose, without weights or classes.
 
     Raises:
         SsilkError: there is no garment of that name.
     """
+    if name in OVER:
+        return settled(name, character)
     if name not in CUTS:
-        fail_unknown(f"garment '{name}'", "no such garment in the wardrobe", name, GARMENTS)
+        fail_unknown(f"garment '{name}'", "no such garment in the wardrobe", name, [*GARMENTS, *OVER])
     points, faces = CUTS[name](fit(character))
-    return Garment(Mesh(f"/{''.join(word.title() for word in name.split('_'))}", points, faces))
+    return Garment(Mesh(_path(name), points, faces))
+
+
+def settled(name: str, character: Character) -> Garment:
+    """Return a garment of `OVER` as 'ssilk inspect --over' settles it off the one beneath."""
+    from ..authoring.preflight.settle import settle
+
+    outer, inner = (build_garment(each, character).mesh for each in OVER[name])
+    offsets = settle(outer, character.merged_body().mesh, inner=[inner]).offsets
+    return Garment(Mesh(_path(name), outer.points + offsets, outer.faces))
+
+
+def _path(name: str) -> str:
+    return f"/{''.join(word.title() for word in name.split('_'))}"
 
 
 def cape(fit: BodyFit) -> tuple[Floats, Ints]:
@@ -114,3 +129,4 @@ def skirt_surface(fit: BodyFit, columns: int, band: int) -> Floats:
 
 CUTS = {"cape": cape, "fringe_skirt": fringe_skirt, "hooded_dress": hooded_dress}
 GARMENTS = tuple(CUTS)
+OVER = {"cape_over_dress": ("cape", "hooded_dress")}  # garments that are worn over another one

@@ -53,7 +53,7 @@ def there(folder, monkeypatch):
     return folder
 
 
-def skinned(path) -> tuple[np.ndarray, np.ndarray]:
+def skinned(path, frames: int = FRAMES) -> tuple[np.ndarray, np.ndarray]:
     """The garment's points (F, V, 3), float32, as UsdSkel alone has them, and its faces."""
     stage = Usd.Stage.Open(str(path))
     root = UsdSkel.Root(next(prim for prim in stage.Traverse() if prim.IsA(UsdSkel.Root)))
@@ -65,7 +65,7 @@ def skinned(path) -> tuple[np.ndarray, np.ndarray]:
     mesh, found = UsdSkel.BindingAPI(target.GetPrim()), []
     shapes = UsdSkel.BlendShapeQuery(mesh)
     rest = target.GetPrim().GetAttribute("points").Get()
-    for time in range(FRAMES):
+    for time in range(frames):
         points = Vt.Vec3fArray(rest)
         weights = query.GetAnimQuery().ComputeBlendShapeWeights(time)
         if weights and target.GetBlendShapeMapper():

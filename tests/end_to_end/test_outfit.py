@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom, Vt
+from ssilk_usd.reading.facts import read_provenance
 from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.shots.play import Shot
 
@@ -16,6 +17,7 @@ from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.physics.intersections.pairs import intersections_between
 
+from .test_certify import skinned
 from .test_glb import Reader
 
 
@@ -103,6 +105,19 @@ def write_outfit(toy) -> None:
     Path("outfit.toml").write_text(LIST.format(settings=", ".join(words)))
 
 
+def write_dented_coat() -> None:
+    """A coat around the toy's skirt with a dent, which comes through the skirt in the middle of its front."""
+    stage = Usd.Stage.Open("rigged.usda")
+    attribute = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt")).GetPointsAttr()
+    points = np.array(attribute.Get(), dtype=float)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    tip = points[np.argmin(np.abs(points - middle)[:, :2].sum(axis=1) - 0.01 * (points[:, 2] > middle[2]))]
+    near = np.exp(-((points - tip) ** 2).sum(axis=1) / (0.25 * np.ptp(points[:, 1])) ** 2)
+    points[:, [0, 2]] *= (1.04 - 0.07 * near)[:, None]
+    attribute.Set(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+    stage.Export("coat.usda")
+
+
 def crossing(outer: str, inner: str) -> int:
     """Triangles of a garment's file that intersect another one's, in the bind pose, by libigl on what USD reads."""
     first, second = (read_scene("rigged.usda", garment=each)[1].mesh for each in (outer, inner))
@@ -178,6 +193,56 @@ def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
         for frame, time in enumerate(shot.frame_times):
             away = np.abs(reader.skinned(meshes[name], frame) - shot.garment_points(time)).max()
             assert away < 1e-5, (name, frame)
+
+
+def crossing_frames(folder: str) -> list[int]:
+    """Frames in which a coat crosses the skirt of a folder, as UsdSkel alone has both."""
+    (coat, faces), (skirt, below) = (
+        skinned(f"{folder}/shots/walk/{name}/anim.usdc", 9) for name in ("coat", "skirt")
+    )
+    pairs = [intersections_between(np.float64(x), faces, np.float64(y), below) for x, y in zip(coat, skirt)]
+    return [frame for frame, each in enumerate(pairs) if len(each)]
+
+
+def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file(toy, copy, capsys):
+    """Whatever the order of the models; the file is proven against that of the inner garment, which must be there."""
+    write_dented_coat()
+    train = shlex.split("train coat.usda --motions clip.usda --over skirt.safetensors -o coat.safetensors")
+    assert main([*train, *toy.training]) in (0, 5)
+    both = "coat.safetensors skirt.safetensors"
+    baked(capsys, both, "plain")
+    assert crossing_frames("plain")
+    events = baked(capsys, f"{both} --certify", "certified")
+    assert crossing_frames("certified") == []
+    said = read_provenance("certified/shots/walk/coat/anim.usdc")["certificate"]
+    assert said["over"] == {"skirt": "../skirt/anim.usdc"} and not said.get("frames left")
+    free = "0 of 9 frames intersect themselves or skirt, 0 show covered skin"
+    assert said["found"] == free and said["frames wrong before"] > 0
+    assert "over" not in read_provenance("certified/shots/walk/skirt/anim.usdc")["certificate"]
+    figures = [event["detail"] for event in events if event["event"] == "result"]
+    assert [each["certificate"] for each in figures if "certificate" in each][1] == free  # the skirt came first
+    again = baked(capsys, f"{both} --certify", "certified")
+    assert all(
+        event["detail"]["current"] for event in again if event["event"] == "result" and "current" in str(event)
+    )
+    capsys.readouterr()
+    assert main(["verify", "certified/shots/walk/coat/anim.usdc"]) == 0
+    assert f"counted in it: {free}\n" in capsys.readouterr().err
+    inner = Path("certified/shots/walk/skirt/anim.usdc")
+    inner.rename("kept.usdc")
+    assert main(["verify", "certified/shots/walk/coat/anim.usdc"]) == 3
+    assert "it was certified over 'skirt', which is not at" in capsys.readouterr().err
+    Path("kept.usdc").rename(inner)
+    glb = shlex.split(f"bake {both} --stage rigged.usda --motion walk.usda --target glb --certify -o both.glb")
+    assert main(glb) == 0
+    assert f"certificate: {free}" in capsys.readouterr().err
+    assert main(["verify", "both.glb"]) == 0
+    reader, points = Reader("both.glb"), {}
+    for mesh in reader.json["meshes"]:
+        if name := mesh["extras"].get("garment"):
+            points[name] = [np.float64(reader.skinned(mesh["name"], frame)) for frame in range(9)]
+    faces = load_model("coat.safetensors").scene.garment.mesh.faces
+    assert not any(len(intersections_between(x, faces, y, faces)) for x, y in zip(points["coat"], points["skirt"]))
 
 
 def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):

@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...events import Message, Reporter, Result
+from ...files import sha256
+from ...network.checkpoint import load_model
 from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
 from ...scene.assets import Floats
 from .record import TaskRecord
 from .shots import finished
+from .task import BakeTask
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot
@@ -23,7 +26,7 @@ FRAMES_AT_ONCE = 32
 
 def tell_other_layers(folder: Path, shot: str, report: Reporter) -> None:
     """Warn of garments of a shot that were trained over others than lie beneath them there."""
-    found = _whole(finished(folder, shot))
+    found = whole(finished(folder, shot))
     for name, record in found.items():
         together = {name: record, **_beside(found, name)}
         models = {each: (own.inputs["model"].sha256, own.over) for each, own in together.items()}
@@ -66,7 +69,7 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
     Raises:
         SsilkError: a layer cannot be read.
     """
-    found = _whole(finished(folder, shot))
+    found = whole(finished(folder, shot))
     pairs = [pair for pair in combinations(found, 2) if found[pair[0]].wearer == found[pair[1]].wearer]
     if pairs and not can_find():
         report(Message(f"{folder / 'shots' / shot}: cloth through other garments is {NOT_COUNTED}", "warning"))
@@ -79,7 +82,37 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
     return touching
 
 
-def _whole(found: Mapping[str, TaskRecord | None]) -> dict[str, TaskRecord]:
+def inner_first(tasks: Sequence[BakeTask]) -> list[BakeTask]:
+    """Return tasks with those of garments first that others of them were trained over, else in their order.
+
+    Raises:
+        SsilkError: a model cannot be read.
+    """
+    over = trained_over({task.request.model for task in tasks})
+    return sorted(tasks, key=lambda task: depth(task.request.model, over))
+
+
+def trained_over(models: Iterable[str | Path]) -> dict[str, list[str]]:
+    """Return those of some models that each was trained over, by their paths.
+
+    Raises:
+        SsilkError: a model cannot be read.
+    """
+    known = {str(path): Path(path) for path in models}
+    digests = {name: sha256(path) for name, path in known.items() if path.is_file()}
+    found = {}
+    for name, path in known.items():
+        over = (load_model(path).provenance.get("over") or {}).values()
+        found[name] = [other for other, digest in digests.items() if other != name and digest in over]
+    return found
+
+
+def depth(model: str | Path, over: Mapping[str, Sequence[str]]) -> int:
+    """Return how many garments lie beneath one another below that of a model."""
+    return max((1 + depth(other, over) for other in over[str(model)]), default=0)
+
+
+def whole(found: Mapping[str, TaskRecord | None]) -> dict[str, TaskRecord]:
     """Return the records that can be read, without levels of quality of other garments."""
     return {name: record for name, record in found.items() if record and not record.level_of}
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,17 +21,26 @@ from .counted import state_rollout_counts
 from .hiding import hidden_polygons_of
 from .inputs import InputFiles, InputHashes, need_pinned
 from .latents import solved
-from .layered import tell_layers, tell_other_layers
+from .layered import inner_first, tell_layers, tell_other_layers, whole
 from .levels import need_levels
 from .load import LoadedGarment, load_garment
 from .names_used import GarmentUse, UsedNames, need_distinct_case, need_same_body, says, write_use
 from .origin import shot_metadata
-from .record import RECORD, TaskRecord, current_record, inputs_of, read_record, task_key, write_record
+from .record import (
+    RECORD,
+    TaskRecord,
+    current_record,
+    inputs_of,
+    portable,
+    read_record,
+    task_key,
+    write_record,
+)
 from .refinement import refined
 from .request import BakeRequest
 from .result import BakeResult
 from .rollout import BakeRollout
-from .shots import write_shot_stage
+from .shots import finished, write_shot_stage
 from .task import BakeTask, has_possible_names, need_possible_names, plan_layers
 from .verification import verify_file
 from .write import result_of
@@ -79,11 +88,12 @@ def bake_layers(
     layers, results = LayerFolder(folder), []
     if any(task.request.certify for task in tasks):
         need_certifier()
+        tasks = inner_first(tasks)
     layers.need_names(tasks)
     report(Started("bake", len(tasks), {"output": str(folder)}))
     try:
         for task in tasks:
-            results.append(layers.bake(task, again=again, report=report))
+            results.append(layers.bake(task, again=again, report=report, together=True))
             report(Result("bake", results[-1].figures("layer")))
     except BaseException:  # what is finished is in its shot, whatever stops the rest, which is what is told
         try:
@@ -167,11 +177,17 @@ class LayerFolder:
                 names.check(task)
                 self._checked.add(task)
 
-    def bake(self, task: BakeTask, *, again: bool = False, report: Reporter = silent) -> BakeResult:
+    def bake(
+        self, task: BakeTask, *, again: bool = False, report: Reporter = silent, together: bool = False
+    ) -> BakeResult:
         """Bake one garment in one shot, unless that is done already.
 
         Any number of processes may bake the same task at the same time: each writes the same files. The record's key
         is of what the inputs held while they were read.
+
+        Args:
+            together: certify it over what it was trained over and lies finished in the shot; otherwise by itself, so
+                that it does not depend on which tasks are done.
 
         Raises:
             SsilkError: an input is missing or bad, or not what the task's job was submitted with, or a file cannot be
@@ -181,7 +197,9 @@ class LayerFolder:
         need_possible_names(task)
         layout, home = self.layout(task), self._home(task)
         wanted = task.pinned or self.inputs.hashes(task.request)
-        if not again and (record := self._done(task, wanted)):
+        beneath = self._beneath(task) if together and task.request.certify else {}
+        met = {os.path.relpath(path, home): sha256(path) for path in beneath.values()}
+        if not again and (record := self._done(task, wanted)) and met.items() <= record.files.items():
             return replace(record.result, current=True)
         need_levels(self.path, [task], complete=False)
         self._need_inputs([task])
@@ -198,14 +216,26 @@ class LayerFolder:
         write_use(self.path, task.garment, use.untold(self.path, task.garment))  # no asset is without it
         asset = self._asset(task, garment, use, report)
         write_use(self.path, task.garment, use)  # the asset says so now
-        result, files = _write_layer(layout, asset.asset, rollout, task, report)
+        result, files = _write_layer(layout, asset.asset, rollout, task, report, beneath)
         written = {os.path.relpath(path, home): digest for path, digest in (files | dict(asset.digests)).items()}
+        written |= met
         record = TaskRecord(
             key=key, files=written, result=result, inputs=inputs, root=request.root, level_of=task.level_of,
             over=garment.over_models,
         )  # fmt: skip
         write_record(home, record)
         return result
+
+    def _beneath(self, task: BakeTask) -> dict[str, Path]:
+        """Return the layers of garments that a task's was trained over, finished on the same character, by name."""
+        over, request = self.garment(task).over_models.values(), task.request
+        wearer = portable(request.motion, self.path), request.root
+        found = whole(finished(self.path, task.shot)) if over else {}
+        return {
+            name: self.layout(replace(task, garment=name)).animation
+            for name, record in found.items()
+            if name != task.garment and record.wearer == wearer and record.inputs["model"].sha256 in over
+        }
 
     def _home(self, task: BakeTask) -> Path:
         """Return the folder of the files that a task alone writes."""
@@ -297,12 +327,16 @@ def _write_asset(
 
 
 def _write_layer(
-    layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter
+    layout: Layout, asset: Asset, rollout: BakeRollout, task: BakeTask, report: Reporter, beneath: Mapping[str, Path]
 ) -> tuple[BakeResult, dict[Path, str]]:
-    """Write and verify what moves; return the result, and SHA-256 of what was written, by its path."""
+    """Write and verify what moves; return the result, and SHA-256 of what was written, by its path.
+
+    Args:
+        beneath: layers of garments that it is certified over, by name.
+    """
     from ssilk_usd.shots import layers_animation
 
-    rollout = certified(refined(solved(rollout, report), report, add_shapes=True), report)
+    rollout = certified(refined(solved(rollout, report), report, add_shapes=True), report, beneath)
     hidden = hidden_polygons_of(rollout, report)
     riders = rollout.rider_joints()
     if riders and rollout.request.writes_points:

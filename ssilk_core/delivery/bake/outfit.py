@@ -23,7 +23,7 @@ from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
 from .bodies import WornModel, worn
-from .layered import over_others, tell_layers
+from .layered import depth, over_others, tell_layers, trained_over
 from .opened import add_provenance, provenance_of
 from .origin import read_origin
 from .request import BakeRequest
@@ -62,18 +62,20 @@ def bake_outfit(
     """
     names = [garment_name(request) for request in requests]
     _need_together(requests, names, output)
-    results = []
+    results = dict[str, BakeResult]()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         parts = {name: folder / f"{name}{GLB}" for name in names}
-        for number, (name, request) in enumerate(zip(names, requests)):
-            body = include_body and not number
+        asked = dict(zip(names, requests))
+        for name, beneath in _beneath(requests, names).items():
             result = bake(
-                request, parts[name], quality=quality, budget=budget, include_body=body, verify=verify,
+                asked[name], parts[name], quality=quality, budget=budget,
+                include_body=include_body and name == names[0], verify=verify,
                 report=_without_results(report), place=output,
+                beneath={inner: parts[inner] for inner in beneath},
             )  # fmt: skip
-            results.append(replace(result, path=output))
-            report(Result("bake", {"garment": name, **results[-1].figures()}))
+            results[name] = replace(result, path=output)
+            report(Result("bake", {"garment": name, **results[name].figures()}))
         with replacing(output) as unverified:
             join_glbs(parts, unverified)
             _need_unchanged(parts, unverified, folder, output)
@@ -84,7 +86,7 @@ def bake_outfit(
     for each in layers:
         report(Result("bake", {"garment": each.outer, "over": each.inner, **each.summary("time code")}))
     report(Result("bake", {"output": str(output), "garments": len(names), "bytes": output.stat().st_size}))
-    return results
+    return [results[name] for name in names]
 
 
 def verify_garments(
@@ -111,9 +113,10 @@ def verify_garments(
         return proven, tell_layers(folder, name, report, "verify")
     proven, said = {}, provenance_of(shot)[GARMENTS]
     with tempfile.TemporaryDirectory() as folder_name:
-        for name in said:
-            alone = Path(folder_name) / f"{name}{GLB}"
+        parts = {name: Path(folder_name) / f"{name}{GLB}" for name in said}
+        for name, alone in parts.items():
             write_alone(shot, name, alone)
+        for name, alone in parts.items():  # beside those that it is certified over
             origin = read_origin(shot, {}, provenance=said[name])
             proven[name] = verify(alone, device=device, report=_without_results(report), **origin.request.inputs)
             report(Result("verify", {"shot": str(shot), "garment": name, **proven[name].figures()}))
@@ -125,6 +128,16 @@ def holds_several(shot: Path) -> bool:
     if shot.suffix == GLB:
         return shot.is_file() and bool(garments_in(provenance_of(shot)))
     return is_stage(shot)
+
+
+def _beneath(requests: Sequence[BakeRequest], names: Sequence[str]) -> dict[str, list[str]]:
+    """Return the garments that each is certified over, by name, inner ones first; none where that is not asked."""
+    if not requests[0].certify:
+        return {name: [] for name in names}
+    called = {str(request.model): name for name, request in zip(names, requests)}
+    over = trained_over(called)
+    ordered = sorted(called, key=lambda model: depth(model, over))
+    return {called[model]: [called[each] for each in over[model]] for model in ordered}
 
 
 def _need_together(requests: Sequence[BakeRequest], names: Sequence[str], output: Path) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -256,9 +257,14 @@ class LoopSummary:
         return {"samples": self.samples, "last frame": last, "rounds": self.rounds, "state": state, **rounded}
 
 
-def certified_frames(frames: int, intersecting: int, showing: int) -> str:
-    """Return in words in how many frames triangles intersect others, and covered skin shows."""
-    return f"{intersecting:,} of {frames:,} frames intersect, {showing:,} show covered skin"
+def certified_frames(frames: int, intersecting: int, showing: int, over: Sequence[str] = ()) -> str:
+    """Return in words in how many frames triangles intersect others, and covered skin shows.
+
+    Args:
+        over: garments beneath, whose triangles count as well.
+    """
+    others = f" themselves or {', '.join(over)}" if over else ""
+    return f"{intersecting:,} of {frames:,} frames intersect{others}, {showing:,} show covered skin"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,6 +280,7 @@ class CertificateSummary:
         codes: first and last time code of each of these spans.
         reasons: what is wrong in each of them, and where.
         mean_mm, largest_mm: displacement of the vertices that were moved, in these frames [mm].
+        over: garments beneath, with which triangles must not intersect either.
     """
 
     frames: int
@@ -286,6 +293,7 @@ class CertificateSummary:
     reasons: tuple[str, ...]
     mean_mm: float
     largest_mm: float
+    over: tuple[str, ...] = ()
 
     @property
     def unfree(self) -> str:
@@ -297,7 +305,7 @@ class CertificateSummary:
         return f"{count} frames have no free position: {'; '.join(spans)}"
 
     def __str__(self) -> str:
-        said = certified_frames(self.frames, self.intersecting, self.showing)
+        said = certified_frames(self.frames, self.intersecting, self.showing, self.over)
         return f"{said}; {self.unfree}" if self.left else said
 
     def figures(self) -> dict[str, object]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,6 +45,7 @@ def bake(
     verify: bool = True,
     report: Reporter = silent,
     place: Path | None = None,
+    beneath: Mapping[str, Path] | None = None,
 ) -> BakeResult:
     """Bake one garment over one motion into one file, which appears once it is verified.
 
@@ -55,6 +57,7 @@ def bake(
         verify: re-skin the file by UsdSkel and compare it with the decoder's own vertices.
         report: takes events.
         place: the file that this one becomes a part of, from which inputs are named; `output` by default.
+        beneath: files of garments that it is certified over, by name, where the request asks for that.
 
     Raises:
         SsilkError: an input is missing or does not fit, or the file cannot be written.
@@ -72,7 +75,7 @@ def bake(
         need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
-    rollout = certified(refined(solved(rollout, report), report), report)
+    rollout = certified(refined(solved(rollout, report), report), report, beneath)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, Path(place or path), report)
     rollout, hidden, summary, counts, verification = _write_verified(

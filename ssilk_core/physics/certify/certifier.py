@@ -17,8 +17,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...scene.assets import Floats, Scene
-from .faults import FaultFinder, FrameFaults, PosedSkin
+from ...scene.assets import Floats, Ints, Scene
+from .faults import FaultFinder, FrameFaults, Surroundings
 from .metric import DisplacementMetric
 from .settle import THICKNESS, Settler
 from .untangle import Untangler
@@ -40,6 +40,7 @@ class Frames:
         body: vertices of the character's merged body there [m], shape (B, 3); None without one.
         turns: linear part of the blended skinning of each vertex, shape (V, 3, 3).
         cuts: frames that do not go on from the one before.
+        beneath: vertices of the garments beneath, in the world [m], shape (W, 3); None without any.
     """
 
     count: int
@@ -48,6 +49,7 @@ class Frames:
     body: Callable[[int], Floats | None]
     turns: Callable[[int], Floats]
     cuts: frozenset[int] = frozenset()
+    beneath: Callable[[int], Floats] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +82,15 @@ class Certifier:
 
     Args:
         scene: the garment on its character.
+        beneath: triangles (G, 3) of the garments beneath it, which stay where they are.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, beneath: Ints | None = None) -> None:
         import ipctk
 
         ipctk.set_num_threads(1)  # sums in another order have other last digits
         mesh = scene.garment.mesh
-        self.finder = FaultFinder(scene)
+        self.finder = FaultFinder(scene, beneath)
         self.untangler = Untangler(mesh, self.finder)
         self.settler = Settler(mesh, self.finder, DisplacementMetric(mesh, LENGTH))
 
@@ -158,8 +161,8 @@ class Certifier:
         found[faces[moves[faces].any(axis=1)].reshape(-1)] = True
         return found
 
-    def _skin(self, frames: Frames, frame: int) -> PosedSkin | None:
-        return self.finder.place(frames.body(frame))
+    def _skin(self, frames: Frames, frame: int) -> Surroundings | None:
+        return self.finder.place(frames.body(frame), frames.beneath(frame) if frames.beneath else None)
 
     def _freed(
         self, frames: Frames, frame: int, faults: FrameFaults, near: _Moved | None, thickness: float
@@ -228,7 +231,7 @@ class Certifier:
         return self._settled(start, target, moves, skin, thickness)
 
     def _settled(
-        self, start: Floats, target: Floats, moves: np.ndarray, skin: PosedSkin | None, thickness: float
+        self, start: Floats, target: Floats, moves: np.ndarray, skin: Surroundings | None, thickness: float
     ) -> _Moved | None:
         """Return a free frame near a target, lifted once more where that uncovered skin; None where it stays bare."""
         settled = self.settler.settle(start, target, moves, skin, thickness)

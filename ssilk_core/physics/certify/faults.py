@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is wrong in one frame of a garment: triangles that intersect others, and covered skin that shows.
 
+Others are its own, and those of garments beneath it, which stay where they are. Its own triangles have the first
+numbers, and its own vertices too.
+
 Skin is looked at where its share is measured (`skin.covered_skin`), and at four times as many points between, along
 smooth normals. Points inside another part of the body are not seen, whatever lies over them.
 """
@@ -16,6 +19,7 @@ from ...scene.assets import Floats, Ints, Scene
 from ...scene.mesh import topology
 from ..collision.winding_number import ENCLOSED, winding_number
 from ..intersections.cloth import ClothIntersections
+from ..intersections.pairs import intersections_between
 from ..skin.blocked_rays import NO_TRIANGLE, BlockedRays
 from ..skin.covered_points import CoveredPoints, LastingRays
 from ..skin.figures import COVER_REACH, SHOW_DEPTH
@@ -52,7 +56,10 @@ class SkinPoints:
 
 @dataclass(frozen=True, eq=False)
 class FrameFaults:
-    """What is wrong in a frame: pairs of triangles that intersect (P, 2), and skin that shows."""
+    """What is wrong in a frame: pairs of triangles that intersect (P, 2), and skin that shows.
+
+    The first triangle of a pair is the garment's.
+    """
 
     pairs: Ints
     skin: SkinPoints
@@ -68,14 +75,18 @@ class FaultFinder:
 
     Args:
         scene: with the character's body, if it has one.
+        beneath: triangles (G, 3) of the garments beneath it, which have W vertices together.
 
     Attributes:
         cloth: which triangles intersect.
+        faces: of the garment (F, 3); `every` has those beneath as well, whose vertices come after its own.
         joints: of each point of the skin that is looked at, the joint with the largest weight, shape (S,).
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, beneath: Ints | None = None) -> None:
         self.cloth, self.faces = ClothIntersections.of(scene), scene.garment.mesh.faces
+        self.beneath = np.zeros((0, 3), dtype=np.int64) if beneath is None else beneath
+        self.every = np.concatenate([self.faces, self.beneath + scene.garment.mesh.vertex_count])
         self._sets: list[tuple[CoveredPoints, bool]] = []
         self.joints = np.zeros(0, dtype=np.int64)
         if not scene.character.bodies:
@@ -95,10 +106,15 @@ class FaultFinder:
             self._search = BlockedRays(mesh.points, mesh.faces)
             self._last = np.full(len(self.joints), NO_TRIANGLE)
 
-    def place(self, body: Floats | None) -> PosedSkin | None:
-        """Return the points of the skin on a posed body (B, 3) [m]; None where none is covered."""
+    def place(self, body: Floats | None, beneath: Floats | None = None) -> Surroundings | None:
+        """Return the points of the skin on a posed body (B, 3) [m]; None where none is covered and nothing beneath.
+
+        Args:
+            beneath: positions of the garments beneath (W, 3) [m].
+        """
         if body is None or not self._sets:
-            return None
+            none = np.zeros((0, 3))
+            return None if beneath is None else Surroundings(none, none, none, np.zeros(0, dtype=np.int8), beneath)
         smooth_normals = topology.vertex_normals(body, self._body.faces)
         starts, normals = [], []
         for points, smooth in self._sets:
@@ -109,15 +125,19 @@ class FaultFinder:
             normal = (smooth_normals[corners] * share).sum(axis=1) if smooth else flat
             normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12))
         unknown = np.full(len(self.joints), -1, dtype=np.int8)
-        return PosedSkin(body, np.concatenate(starts), np.concatenate(normals), unknown)
+        return Surroundings(body, np.concatenate(starts), np.concatenate(normals), unknown, beneath)
 
-    def find(self, points: Floats, skin: PosedSkin | None) -> FrameFaults:
+    def find(self, points: Floats, skin: Surroundings | None) -> FrameFaults:
         """Return what is wrong with the cloth at these positions [m], shape (V, 3)."""
-        return FrameFaults(self.cloth.pairs(points), self.showing(points, skin))
+        pairs = self.cloth.pairs(points)
+        if skin is not None and skin.beneath is not None:
+            crossing = intersections_between(points, self.faces, skin.beneath, self.beneath)
+            pairs = np.concatenate([pairs, crossing + [0, len(self.faces)]])
+        return FrameFaults(pairs, self.showing(points, skin))
 
-    def showing(self, points: Floats, skin: PosedSkin | None) -> SkinPoints:
+    def showing(self, points: Floats, skin: Surroundings | None) -> SkinPoints:
         """Return the points of the skin that show, with the cloth beneath them."""
-        if skin is None:
+        if skin is None or not len(skin.starts):
             return _no_points()
         origin = skin.starts.mean(axis=0)
         x, starts = (np.ascontiguousarray(each, dtype=np.float32) for each in (points - origin, skin.starts - origin))
@@ -126,7 +146,7 @@ class FaultFinder:
         shows = shows[~self._enclosed(skin, shows)]
         return self._beside(points, skin, shows, -SHOW_DEPTH, 0.0)
 
-    def resting(self, points: Floats, skin: PosedSkin, chosen: Ints, above: float) -> SkinPoints:
+    def resting(self, points: Floats, skin: Surroundings, chosen: Ints, above: float) -> SkinPoints:
         """Return the points, of those with indices (M,), whose outermost cloth lies less than `above` them [m].
 
         Beneath the skin it is looked for as deep as it is seen.
@@ -138,7 +158,7 @@ class FaultFinder:
         over, _ = self._search.find(x, starts, directions, low, high, unknown)
         return found.chosen(over == NO_TRIANGLE)
 
-    def _beside(self, points: Floats, skin: PosedSkin, chosen: Ints, low: float, high: float) -> SkinPoints:
+    def _beside(self, points: Floats, skin: Surroundings, chosen: Ints, low: float, high: float) -> SkinPoints:
         """Return the points, of those with indices (M,), with any cloth between two heights over them [m]."""
         least, most = (np.full(len(chosen), reach, np.float32) for reach in (low, high))
         x, starts, directions = self._asked(points, skin, chosen)
@@ -151,13 +171,13 @@ class FaultFinder:
         return SkinPoints(index, face, weights, normal, height)
 
     @staticmethod
-    def _asked(points: Floats, skin: PosedSkin, chosen: Ints) -> tuple[Floats, Floats, Floats]:
+    def _asked(points: Floats, skin: Surroundings, chosen: Ints) -> tuple[Floats, Floats, Floats]:
         """Return vertices, and starts and directions of rays, around an origin that float32 is exact near."""
         origin = skin.starts.mean(axis=0)
         x, starts = ((each - origin).astype(np.float32) for each in (points, skin.starts[chosen]))
         return np.ascontiguousarray(x), starts, skin.normals[chosen].astype(np.float32)
 
-    def _enclosed(self, skin: PosedSkin, chosen: Ints) -> np.ndarray:
+    def _enclosed(self, skin: Surroundings, chosen: Ints) -> np.ndarray:
         """Tell which points lie inside a part of the body, bool (M,); it is looked for once in each pose."""
         asked = chosen[skin.enclosed[chosen] < 0]
         starts = skin.starts[asked] + LIFTED * skin.normals[asked]
@@ -169,16 +189,24 @@ class FaultFinder:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedSkin:
-    """Points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body (B, 3) [m].
+class Surroundings:
+    """What is around a garment in a frame: points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body
+    (B, 3) [m], and the garments beneath.
 
-    `enclosed` (S,) tells which lie inside another part of it, 1 or 0, and -1 where nobody has asked yet.
+    Attributes:
+        enclosed: which points lie inside another part of the body, 1 or 0, and -1 where nobody has asked yet, (S,).
+        beneath: positions of the garments beneath (W, 3) [m]; None without any.
     """
 
     body: Floats
     starts: Floats
     normals: Floats
     enclosed: Ints
+    beneath: Floats | None = None
+
+    def joined(self, points: Floats) -> Floats:
+        """Return positions of the garment (V, 3) and of those beneath, (V + W, 3) [m]."""
+        return points if self.beneath is None else np.concatenate([points, self.beneath])
 
 
 def _no_points() -> SkinPoints:

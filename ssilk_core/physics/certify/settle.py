@@ -15,7 +15,7 @@ import numpy as np
 
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import topology
-from .faults import FaultFinder, PosedSkin, SkinPoints
+from .faults import FaultFinder, SkinPoints, Surroundings
 from .metric import DisplacementMetric
 
 if TYPE_CHECKING:
@@ -50,7 +50,12 @@ class Settler:
         self._apart |= {(other, one): False for one, other in self._apart}
 
     def settle(
-        self, start: Floats, target: Floats, moves: np.ndarray, skin: PosedSkin | None, thickness: float = THICKNESS
+        self,
+        start: Floats,
+        target: Floats,
+        moves: np.ndarray,
+        skin: Surroundings | None,
+        thickness: float = THICKNESS,
     ) -> Floats:
         """Return free positions (V, 3) [m] near a target.
 
@@ -62,7 +67,7 @@ class Settler:
         rows = np.flatnonzero(moves)
         if not len(rows):
             return start
-        potential = _Potential(self, start, target, rows, thickness)
+        potential = _Potential(self, start, target, rows, thickness, skin)
         x, whole = start[rows], np.array(start)
         for stiffness in BARRIERS:
             potential.stiffen(stiffness)
@@ -88,9 +93,9 @@ class Settler:
             share /= 2
         return share * step if share > SHORTEST else None
 
-    def _held(self, points: Floats, moves: np.ndarray, skin: PosedSkin | None) -> SkinPoints | None:
+    def _held(self, points: Floats, moves: np.ndarray, skin: Surroundings | None) -> SkinPoints | None:
         """Return the points of the skin that moving cloth lies on."""
-        if skin is None:
+        if skin is None or not len(skin.starts):
             return None
         lows, highs = points[moves].min(axis=0) - RESTING, points[moves].max(axis=0) + RESTING
         near = np.flatnonzero(((skin.starts >= lows) & (skin.starts <= highs)).all(axis=1))
@@ -135,23 +140,35 @@ class _Supports:
 class _Potential:
     """What a settled frame minimises over some of its vertices (R, 3)."""
 
-    def __init__(self, owner: Settler, start: Floats, target: Floats, rows: Ints, thickness: float) -> None:
+    def __init__(
+        self,
+        owner: Settler,
+        start: Floats,
+        target: Floats,
+        rows: Ints,
+        thickness: float,
+        skin: Surroundings | None,
+    ) -> None:
         import ipctk
         import scipy.sparse as sparse
 
-        mesh = owner.mesh
+        own, every = len(start), owner.finder.every
         self.thickness, self.target, self.origin = thickness, target[rows], start[rows]
         self.cost = sparse.kron(owner.metric.matrix[rows][:, rows], sparse.identity(3)).tocsc()
         moving = np.stack([start[rows], target[rows]])
         low, high = moving.min(axis=(0, 1)) - MARGIN, moving.max(axis=(0, 1)) + MARGIN
-        corners = start[mesh.faces]
+        whole = start if skin is None else skin.joined(start)
+        if len(whole) == own:
+            every = owner.mesh.faces
+        corners = whole[every]
         kept = ((corners.max(axis=1) >= low) & (corners.min(axis=1) <= high)).all(axis=1)
-        vertices = np.unique(mesh.faces[kept])
-        place = np.full(len(start), -1)
+        vertices = np.unique(every[kept])
+        place = np.full(len(whole), -1)
         place[vertices] = np.arange(len(vertices))
-        faces = place[mesh.faces[kept]]
+        faces = place[every[kept]]
+        rest = np.concatenate([owner.mesh.points, whole[own:]])  # what does not move rests where it is
         self.mesh = ipctk.CollisionMesh(
-            np.asfortranarray(mesh.points[vertices]),
+            np.asfortranarray(rest[vertices]),
             np.asfortranarray(topology.edges(faces).astype(np.int32)),
             np.asfortranarray(faces.astype(np.int32)),
         )
@@ -160,10 +177,13 @@ class _Potential:
             for one, other in owner._apart
             if place[one] >= 0 and place[other] >= 0
         }
-        if apart:
-            self.mesh.can_collide = ipctk.make_sparse_filter(apart, True)
+        filters = [ipctk.make_sparse_filter(apart, True)] if apart else []
+        if (moving_ones := int((vertices < own).sum())) < len(vertices):
+            filters.append(ipctk.make_static_obstacle_filter(moving_ones))
+        if filters:
+            self.mesh.can_collide = filters[0] if len(filters) == 1 else filters[0] & filters[1]
         self.places = place[rows]
-        self.whole = np.asfortranarray(start[vertices])
+        self.whole = np.asfortranarray(whole[vertices])
         self.stiffen(BARRIERS[0])
         degrees = np.arange(3 * len(vertices)).reshape(-1, 3)[self.places].reshape(-1)
         self.degrees = degrees

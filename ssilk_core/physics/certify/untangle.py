@@ -17,7 +17,7 @@ import numpy as np
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import geodesic
 from .crossings import contour_forces
-from .faults import FaultFinder, FrameFaults, PosedSkin, SkinPoints
+from .faults import FaultFinder, FrameFaults, SkinPoints, Surroundings
 from .metric import DisplacementMetric, DisplacementSolver
 
 LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a frame gets little better
@@ -58,7 +58,7 @@ class Untangler:
         self.metrics = [DisplacementMetric(mesh, length) for length in LENGTHS]
 
     def free(
-        self, start: Floats, skin: PosedSkin | None, faults: FrameFaults | None = None, *, lifts: bool = False
+        self, start: Floats, skin: Surroundings | None, faults: FrameFaults | None = None, *, lifts: bool = False
     ) -> Untangled:
         """Return positions from a start (V, 3) [m] at which less is wrong, and nothing where that was found.
 
@@ -74,7 +74,7 @@ class Untangler:
             wanted = region | self._around(faults, LENGTHS[level] * REACH)
             if solver is None or (wanted & ~region).any():
                 region, solver = wanted, self.metrics[level].within(np.flatnonzero(wanted))
-            points = points + self._step(points, faults, region, solver)
+            points = points + self._step(points, faults, region, solver, skin)
             if np.linalg.norm(points - start, axis=1).max() > FARTHEST:
                 break
             faults = self.finder.find(points, skin)
@@ -92,16 +92,25 @@ class Untangler:
 
     def _around(self, faults: FrameFaults, reach: float) -> np.ndarray:
         """Return the vertices within reach of what is wrong, bool (V,)."""
-        faces = np.concatenate([faults.pairs.reshape(-1), faults.skin.face]).astype(np.int64)
+        own = faults.pairs[faults.pairs < len(self.mesh.faces)]
+        faces = np.concatenate([own, faults.skin.face]).astype(np.int64)
         vertices = np.unique(self.mesh.faces[faces])
         found = geodesic.within(self.mesh.points, self.mesh.faces, vertices, reach)
         return np.asarray(found)
 
-    def _step(self, points: Floats, faults: FrameFaults, region: np.ndarray, solver: DisplacementSolver) -> Floats:
-        """Return a displacement (V, 3) [m]."""
+    def _step(
+        self,
+        points: Floats,
+        faults: FrameFaults,
+        region: np.ndarray,
+        solver: DisplacementSolver,
+        skin: Surroundings | None,
+    ) -> Floats:
+        """Return a displacement (V, 3) [m]; what lies beneath stays."""
         rows = np.flatnonzero(region)
         moved = np.zeros_like(points)
-        forces = contour_forces(points, self.mesh.faces, faults.pairs)[rows]
+        whole = points if skin is None else skin.joined(points)
+        forces = contour_forces(whole, self.finder.every, faults.pairs)[rows]
         if forces.any():
             found = solver.response(forces)
             largest = np.linalg.norm(found, axis=1).max()

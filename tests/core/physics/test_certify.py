@@ -17,7 +17,7 @@ from ssilk_core.physics.certify.faults import FaultFinder
 from ssilk_core.physics.certify.metric import DisplacementMetric
 from ssilk_core.physics.certify.settle import THICKNESS, Settler
 from ssilk_core.physics.certify.untangle import HEIGHT, Untangler
-from ssilk_core.physics.intersections.pairs import self_intersections
+from ssilk_core.physics.intersections.pairs import intersections_between, self_intersections
 from ssilk_core.scene.assets import LOOSE, Body, Garment, Mesh, ProxyRig, Scene, SkinWeights
 
 N, SIDE = 16, 0.16  # cells along a sheet, and its length [m]
@@ -107,6 +107,28 @@ def test_sheets_pushed_through_each_other_come_apart(layers, depth):
     tip = np.linalg.norm(start[: len(start) // 2, :2], axis=1).argmin()
     above = np.linalg.norm(start[len(start) // 2 :, :2] - start[tip, :2], axis=1).argmin() + len(start) // 2
     assert settled[tip, 2] < settled[above, 2]
+
+
+def test_a_sheet_comes_out_of_the_one_beneath_which_stays(scene, layers):
+    """The upper of two sheets is the garment, the lower one lies beneath it and comes through."""
+    half = layers.garment.mesh.vertex_count // 2
+    points, faces = layers.garment.mesh.points[half:], sheet()[1]
+    below = pushed(layers, 0.006)[:half]
+    worn = wearing(scene, points, faces)
+    frames = replace(still(worn, [points, points]), beneath=lambda frame: below - [0, 0, 0.02 * frame])
+    assert not Certifier(worn).faults(frames)  # alone nothing is wrong
+    certifier = Certifier(worn, faces)
+    faults = certifier.faults(frames)
+    assert list(faults) == [0] and (faults[0].pairs[:, 0] < len(faces)).all()
+    assert (faults[0].pairs[:, 1] >= len(faces)).all()
+    found = certifier.certify(frames, faults)
+    assert not found.left and found.points[0].shape == points.shape
+    assert not len(intersections_between(found.points[0], faces, below, faces))
+    assert not len(self_intersections(found.points[0], faces))
+    away = found.points[0] - points
+    assert 0.003 < away[:, 2].max() < 0.012 and np.linalg.norm(away, axis=1).min() < 1e-3  # over the bump alone
+    tip = np.linalg.norm(points[:, :2], axis=1).argmin()
+    assert found.points[0][tip, 2] > below[:, 2].max() - 1e-3  # on the side that it was on
 
 
 def test_what_is_wanted_beyond_contact_ends_at_the_barrier(layers):

@@ -11,12 +11,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ....errors import fail
 from ....events import Countdown, Message, Reporter, silent
 from ..opened import add_provenance, open_shot
 from ..rollout import BakeRollout
+from .beneath import GarmentsBeneath
 from .blendshapes import with_shapes
 from .requirements import need_certifier
-from .summary import CERTIFICATE, summary_of
+from .summary import CERTIFICATE, OVER, summary_of
 from .work import CertificateWork, frames_of
 from .written import faults_in
 
@@ -27,11 +29,16 @@ ATTEMPTS = 4  # at moving what is wrong in the file
 THICKER = 1.6  # in each after the second: room between cloth and cloth
 
 
-def certified(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
+def certified(
+    rollout: BakeRollout, report: Reporter = silent, beneath: Mapping[str, Path] | None = None
+) -> BakeRollout:
     """Return a rollout whose wrong frames are moved, or the rollout itself where its request does not ask for it.
 
+    Args:
+        beneath: files of garments that it is worn over in this shot, by their names. They stay as they are.
+
     Raises:
-        SsilkError: a library is missing.
+        SsilkError: a library is missing, or a garment beneath has other frames.
     """
     if not rollout.request.certify or rollout.certificate is not None:
         return rollout
@@ -40,18 +47,24 @@ def certified(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     need_certifier()
     poses = tuple(rollout.poses())
     points = [vertices for pose in poses for vertices in rollout.decode(pose)]
-    work = CertificateWork(rollout, Certifier(rollout.deformer.scene), frames_of(rollout, poses, points))
+    below = GarmentsBeneath(beneath, rollout.request.samples_per_frame) if beneath else None
+    if below and len(below.times) != rollout.motion.frame_count:
+        found, here = f"{len(below.times)} frames", f"the garment over it has {rollout.motion.frame_count}"
+        fail(str(next(iter(below.files.values()))), found, here, "bake both over one range")
+    certifier = Certifier(rollout.deformer.scene, below.faces if below else None)
+    work = CertificateWork(rollout, certifier, frames_of(rollout, poses, points, below), below)
     if excused := len(work.certifier.finder.cloth.allowed):
         text = f"{excused} pairs of triangles that intersect in the bind pose, or that stitches join, do not count"
         report(Message(f"{rollout.deformer.scene.garment.mesh.path}: {text}", "warning"))
-    report(Message("looking for cloth that passes through cloth, and for covered skin that shows"))
+    over = f", of {', '.join(below.files)} beneath it too" if below else ""
+    report(Message(f"looking for cloth that passes through cloth{over}, and for covered skin that shows"))
     faults = work.certifier.faults(work.frames, Countdown(work.frames.count, report))
     work.faulty = tuple(faults)
     if faults:
         report(Message(f"{len(faults)} of {work.frames.count} frames are moved"))
-        found = work.certifier.certify(work.frames, faults, Countdown(2 * len(faults), report))
-        work.points.update(found.points)
-        work.caught.update(found.left)
+        moved = work.certifier.certify(work.frames, faults, Countdown(2 * len(faults), report))
+        work.points.update(moved.points)
+        work.caught.update(moved.left)
     return with_shapes(work, poses)
 
 
@@ -67,7 +80,7 @@ def proven(rollout: BakeRollout, path: Path, report: Reporter = silent) -> BakeR
     work: CertificateWork = certificate.work
     work.attempts += 1
     shot, samples = open_shot(path), rollout.request.samples_per_frame
-    found = dict(faults_in(shot, work.certifier, rollout, samples, report))
+    found = dict(faults_in(shot, work.certifier, rollout, work.beneath, report))
     freed = {frame: faults for frame, faults in found.items() if frame not in work.caught}
     if freed and work.attempts < ATTEMPTS:
         if work.attempts > 1 or not work.exact.isdisjoint(freed) or not set(freed) <= set(work.points):
@@ -76,7 +89,8 @@ def proven(rollout: BakeRollout, path: Path, report: Reporter = silent) -> BakeR
         return with_shapes(work, certificate.poses_before)
     summary = summary_of(work, found, shot.sample_times(samples))
     certificate.summary = summary
-    add_provenance(path, {CERTIFICATE: summary.to_metadata()})
+    over = {OVER: work.beneath.named(path.parent)} if work.beneath else {}
+    add_provenance(path, {CERTIFICATE: {**summary.to_metadata(), **over}})
     if summary.left:
         report(Message(f"{rollout.request.motion}: {summary.unfree}", "warning"))
     return None

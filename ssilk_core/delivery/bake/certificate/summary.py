@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ....physics.certify.faults import FrameFaults
 
 CERTIFICATE = "certificate"  # what a shot says of it, under this name
+OVER = "over"  # and in it the files of garments beneath
 
 
 def summary_of(work: CertificateWork, found: Mapping[int, FrameFaults], times: Sequence[float]) -> CertificateSummary:
@@ -39,6 +40,7 @@ def summary_of(work: CertificateWork, found: Mapping[int, FrameFaults], times: S
         reasons=reasons,
         mean_mm=1000 * float(moved.mean()) if len(moved) else 0.0,
         largest_mm=1000 * float(moved.max()) if len(moved) else 0.0,
+        over=tuple(work.beneath.files) if work.beneath else (),
     )
 
 
@@ -50,7 +52,8 @@ def _reason(work: CertificateWork, faults: Sequence[FrameFaults]) -> str:
     pairs, points = max(len(each.pairs) for each in faults), max(len(each.skin) for each in faults)
     for each in faults:
         if cloth.regions is not None:
-            regions.update(cloth.regions[each.pairs.reshape(-1)].tolist())
+            own = each.pairs[each.pairs < len(cloth.mesh.faces)]
+            regions.update(cloth.regions[own].tolist())
         regions.update(work.certifier.finder.joints[each.skin.index].tolist())
     where = names[regions.most_common(1)[0][0]].rpartition("/")[2]
     first = next((int(each.pairs[0, 0]) for each in faults if len(each.pairs)), None)

@@ -12,8 +12,9 @@ from ....events import Reporter, silent
 from ..opened import open_shot, provenance_of
 from ..result import certified_frames
 from ..rollout import BakeRollout
+from .beneath import GarmentsBeneath
 from .requirements import need_certifier
-from .summary import CERTIFICATE
+from .summary import CERTIFICATE, OVER
 from .written import faults_in
 
 
@@ -45,16 +46,35 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
         raise VerificationError(f"{path}: it was baked with --certify, but has no certificate; bake it again.")
     moved, left = (frames_said(said.get(name, ())) for name in ("moved frames", "frames left"))
     shot, samples = open_shot(path), rollout.request.samples_per_frame
+    beneath = _beneath(said.get(OVER), path, samples)
+    certifier = Certifier(rollout.deformer.scene, beneath.faces if beneath else None)
     times, intersecting, showing = shot.sample_times(samples), 0, 0
-    for frame, faults in faults_in(shot, Certifier(rollout.deformer.scene), rollout, samples, report):
+    for frame, faults in faults_in(shot, certifier, rollout, beneath, report):
         intersecting, showing = intersecting + (len(faults.pairs) > 0), showing + (len(faults.skin) > 0)
         if frame not in left:
             raise VerificationError(
                 f"{path}: {len(faults.pairs)} pairs of triangles intersect and {len(faults.skin)} points of covered "
                 f"skin show at time code {times[frame]:g}, where its certificate says that none does."
             )
-    counted = certified_frames(len(times), intersecting, showing)
+    counted = certified_frames(len(times), intersecting, showing, tuple(beneath.files) if beneath else ())
     return CheckedCertificate(frozenset(moved), str(said.get("found", "nothing")), counted)
+
+
+def _beneath(said: object, path: Path, samples: int) -> GarmentsBeneath | None:
+    """Return the garments that a file says it was certified over, in their own files; None where it names none.
+
+    Raises:
+        VerificationError: one is not there.
+    """
+    if not (isinstance(said, Mapping) and said):
+        return None
+    files = {str(name): path.parent / str(place) for name, place in said.items()}
+    for name, file in files.items():
+        if not file.is_file():
+            raise VerificationError(
+                f"{path}: it was certified over '{name}', which is not at {file}; bake both again."
+            )
+    return GarmentsBeneath(files, samples)
 
 
 def frames_said(said: object) -> set[int]:

@@ -12,6 +12,7 @@ import numpy as np
 from ....scene.assets import Floats, GarmentPose
 from ....scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices, split_at_cuts
 from ..rollout import BakeRollout
+from .beneath import GarmentsBeneath
 
 if TYPE_CHECKING:
     from ....physics.certify.certifier import Certifier, Frames
@@ -24,6 +25,7 @@ class CertificateWork:
     base: BakeRollout
     certifier: Certifier
     frames: Frames
+    beneath: GarmentsBeneath | None = None
     attempts: int = 0  # how often the file has been looked at
     exact: set[int] = field(default_factory=set)  # frames with a shape each
     caught: set[int] = field(default_factory=set)  # frames in which nothing free was found
@@ -31,7 +33,12 @@ class CertificateWork:
     faulty: tuple[int, ...] = ()
 
 
-def frames_of(rollout: BakeRollout, poses: Sequence[GarmentPose], points: Sequence[Floats]) -> Frames:
+def frames_of(
+    rollout: BakeRollout,
+    poses: Sequence[GarmentPose],
+    points: Sequence[Floats],
+    beneath: GarmentsBeneath | None = None,
+) -> Frames:
     """Return the frames of a rollout, of which its bodies and turns are computed when they are asked for."""
     from ....physics.certify.certifier import Frames
     from ....scene.decomposition.rest import turns
@@ -54,4 +61,5 @@ def frames_of(rollout: BakeRollout, poses: Sequence[GarmentPose], points: Sequen
 
     spans = split_at_cuts(motion, skeleton)
     cuts = np.cumsum([span.frame_count for span in spans])[:-1]
-    return Frames(motion.frame_count, motion.fps, points.__getitem__, body_at, turns_at, frozenset(cuts.tolist()))
+    apart, below = frozenset(cuts.tolist()), beneath.points if beneath else None
+    return Frames(motion.frame_count, motion.fps, points.__getitem__, body_at, turns_at, apart, below)

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ....errors import fail
 from ....events import Countdown, Reporter
 from ....scene.assets import Floats
 from ....scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices
 from ..posed import body_in
 from ..rollout import BakeRollout
+from .beneath import GarmentsBeneath
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot
@@ -24,9 +26,17 @@ if TYPE_CHECKING:
 
 
 def faults_in(
-    shot: Shot | GlbShot, certifier: Certifier, rollout: BakeRollout, samples: int, report: Reporter
+    shot: Shot | GlbShot,
+    certifier: Certifier,
+    rollout: BakeRollout,
+    beneath: GarmentsBeneath | None,
+    report: Reporter,
 ) -> Iterator[tuple[int, FrameFaults]]:
-    """Yield the frames of a file in which something is wrong, as its own joints and blendshapes pose it."""
+    """Yield the frames of a file in which something is wrong, as its own joints and blendshapes pose it.
+
+    Raises:
+        SsilkError: garments beneath have other frames.
+    """
     scene, motion = rollout.deformer.scene, rollout.motion
     skeleton = scene.character.skeleton
     player: ShotPlayer = shot
@@ -34,7 +44,14 @@ def faults_in(
     bodies = body_in(shot, scene) if scene.character.bodies else None
     merged = scene.character.merged_body() if scene.character.bodies else None
     joints = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-    times = shot.sample_times(samples)
+    times = shot.sample_times(rollout.request.samples_per_frame)
+    if beneath and beneath.times != times:
+        fail(
+            str(next(iter(beneath.files.values()))),
+            f"{len(beneath.times)} frames from {beneath.times[0]:g}",
+            f"the garment over it has {len(times)} from {times[0]:g}, and is certified over the same ones",
+            "bake both over one range",
+        )
     told = Countdown(len(times), report)
     for frame, time in enumerate(times):
         posed = shot.points(time)
@@ -44,7 +61,8 @@ def faults_in(
         elif merged is not None:
             rest = body_at_rest(scene.character, motion, slice(frame, frame + 1))
             body = skin_points(rest, merged.skin, joints[frame : frame + 1])[0]
-        faults = certifier.finder.find(posed[garment], certifier.finder.place(body))
+        below = beneath.points(frame) if beneath else None
+        faults = certifier.finder.find(posed[garment], certifier.finder.place(body, below))
         if faults.count:
             yield frame, faults
         told()
