@@ -2,6 +2,7 @@
 """Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.
 
 The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
+--family films one model of the cape on three bodies side by side, and trains nothing.
 """
 
 from __future__ import annotations
@@ -11,12 +12,14 @@ import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import EXIT_OK, EXIT_WORSE
+from ..errors import EXIT_OK, EXIT_WORSE, fail
 from ..events import Message, Reporter, Result
 
 if TYPE_CHECKING:
     from ..scene.assets import Mesh
 
+FAMILY = "cape"  # the garment of which a model for a family of bodies ships
+FILMED_BODIES = {"neutral": "", "tall": "tall", "heavy": "heavy"}  # by their captions
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
 
 
@@ -29,7 +32,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--garment", choices=("cape", "fringe_skirt", "hooded_dress"), default="cape", help="garment (default cape)"
     )
-    verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
+    shown = verb.add_mutually_exclusive_group()
+    shown.add_argument("--pretrained", action="store_true", help="show the shipped model only")
+    shown.add_argument("--family", action="store_true",
+                       help=f"show the model of the {FAMILY} for a family of bodies, on three of them")  # fmt: skip
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
     )
@@ -37,18 +43,26 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
-    from ..demo.shipped import open_shipped, origin
+    from ..demo.shipped import FAMILY_SUFFIX, open_shipped, origin
 
+    if options.family and options.garment != FAMILY:
+        found = f"--family with --garment {options.garment}"
+        fail("demo", found, f"a model for a family of bodies ships of the {FAMILY}", "leave one of both out")
     wardrobe = _make_inputs(options.output, report)
-    shipped = open_shipped(options.garment, wardrobe[options.garment])
-    report(Message(f"shipped {options.garment}: {origin(shipped)}"))
-    commands = _shipped(options) + ([] if options.pretrained else _trained(options))
+    model = options.garment + (FAMILY_SUFFIX if options.family else "")
+    shipped = open_shipped(model, wardrobe[options.garment])
+    report(Message(f"shipped {model}: {origin(shipped)}"))
+    if options.family:
+        _make_shots(options.output, report)
+        commands = _on_bodies(options)
+    else:
+        commands = _shipped(options) + ([] if options.pretrained else _trained(options))
     for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
         code = options.main([*command, "--json"] if options.json else command)
         if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
-    shown = ["shipped"] if options.pretrained else ["shipped", PRESET]
+    shown = ["family"] if options.family else ["shipped"] if options.pretrained else ["shipped", PRESET]
     report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
@@ -70,6 +84,24 @@ def _shipped(options: argparse.Namespace) -> list[list[str]]:
             fps=30 if options.pretrained else 15,
         ),
     ]
+
+
+def _on_bodies(options: argparse.Namespace) -> list[list[str]]:
+    """Return the commands that bake one model on three bodies, each from its own stage, and film them."""
+    from ssilk_usd.stages import demo_body_path
+
+    from ..demo.shipped import FAMILY_SUFFIX, shipped_path
+
+    out, model = options.output, str(shipped_path(FAMILY + FAMILY_SUFFIX))
+    shots = {caption: str(out / f"{FAMILY}_{caption}.usdc") for caption in FILMED_BODIES}
+    return [
+        *(
+            ["bake", model, "--stage", str(demo_body_path(name)), "--motion", str(out / f"shot_{caption}.usdc"),
+             "-o", shots[caption]]
+            for caption, name in FILMED_BODIES.items()
+        ),
+        *_views(out / "family", shots, fps=30),
+    ]  # fmt: skip
 
 
 def _trained(options: argparse.Namespace) -> list[list[str]]:
@@ -132,3 +164,21 @@ def _make_inputs(out: Path, report: Reporter) -> dict[str, Mesh]:
     seconds = sum(motion.frame_count / motion.fps for motion in motions)
     report(Message(f"made {len(motions)} motions of {seconds:.0f} s to train on, and a shot to bake"))
     return wardrobe
+
+
+def _make_shots(out: Path, report: Reporter) -> None:
+    """Write the shot to bake for each body: joints turn alike, between the bones of that body."""
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.stages import demo_body_path
+    from ssilk_usd.writing.files import write_motion
+
+    from ..demo.motions import demo_shot
+    from ..scene.family import BodyFamily, motion_on
+
+    characters = [read_character(demo_body_path(name)) for name in FILMED_BODIES.values()]
+    family, base = BodyFamily.of(characters), characters[0].skeleton
+    shot = demo_shot(base)
+    for caption, character, coordinates in zip(FILMED_BODIES, characters, family.members):
+        moved = motion_on(shot, base, character.skeleton, 1 + float(family.taller @ coordinates))
+        write_motion(out / f"shot_{caption}.usdc", moved, character.skeleton)
+    report(Message(f"made a shot for each of {len(characters)} bodies"))
