@@ -17,6 +17,7 @@ from ssilk_usd.reading.motion import read_motion
 from torch import Tensor
 
 from helpers.reports import table, write_results
+from ssilk_core.delivery.bake import worn
 from ssilk_core.devices import select_device
 from ssilk_core.errors import fail
 from ssilk_core.network.checkpoint import ModelFile, load_model, network
@@ -68,8 +69,12 @@ class Subject:
 
 
 def open_subject(path: Path, stage: Path, device: str) -> Subject:
-    """Load a model and put it on the character of a stage."""
+    """Load a model and put it on the character of a stage; one for a family of bodies is on that body then."""
     file = load_model(path)
+    if file.bodies:
+        on = worn(file, open_stage(stage), None)
+        dressed = EvaluationScene(on.scene, file.fabric, file.config.fps, select_device(device))
+        return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed)
     dressed = dressed_in(file, stage, device)
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
 
