@@ -50,7 +50,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     outfit = OVER.get(options.garment, ())
     wardrobe = _make_inputs(options, report)
-    shipped = open_shipped(options.garment, wardrobe[FAMILY_GARMENT if options.garment == FAMILY else options.garment])
+    garment = FAMILY_GARMENT if options.garment == FAMILY else options.garment
+    shipped = open_shipped(options.garment, wardrobe[garment])
     report(Message(f"shipped {options.garment}: {origin(shipped)}"))
     if options.garment == FAMILY:
         _make_shots(options.output, report)
