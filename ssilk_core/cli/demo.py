@@ -34,7 +34,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )
     shown = verb.add_mutually_exclusive_group()
     shown.add_argument("--pretrained", action="store_true", help="show the shipped model only")
-    shown.add_argument("--family", action="store_true",
+    shown.add_argument("--family", action="store_true", dest="on_bodies",
                        help=f"show the model of the {FAMILY} for a family of bodies, on three of them")  # fmt: skip
     verb.add_argument(
         "--set", action="append", default=[], metavar="NAME=VALUE", dest="settings", help="as in 'ssilk train'"
@@ -45,14 +45,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Make the inputs, then run the commands; the first that fails ends the demo with its exit code."""
     from ..demo.shipped import FAMILY_SUFFIX, open_shipped, origin
 
-    if options.family and options.garment != FAMILY:
+    if options.on_bodies and options.garment != FAMILY:
         found = f"--family with --garment {options.garment}"
         fail("demo", found, f"a model for a family of bodies ships of the {FAMILY}", "leave one of both out")
     wardrobe = _make_inputs(options.output, report)
-    model = options.garment + (FAMILY_SUFFIX if options.family else "")
+    model = options.garment + (FAMILY_SUFFIX if options.on_bodies else "")
     shipped = open_shipped(model, wardrobe[options.garment])
     report(Message(f"shipped {model}: {origin(shipped)}"))
-    if options.family:
+    if options.on_bodies:
         _make_shots(options.output, report)
         commands = _on_bodies(options)
     else:
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         code = options.main([*command, "--json"] if options.json else command)
         if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
-    shown = ["family"] if options.family else ["shipped"] if options.pretrained else ["shipped", PRESET]
+    shown = ["family"] if options.on_bodies else ["shipped"] if options.pretrained else ["shipped", PRESET]
     report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
