@@ -42,7 +42,7 @@ from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import ModelFile, load_model, save_model
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.scene.assets import Motion, Scene
-from ssilk_core.scene.family import BodyFamily, motion_on
+from ssilk_core.scene.family import BodyFamily
 
 SAME_BODY = 1e-4  # between coordinates
 
@@ -62,7 +62,7 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
     found = bearable(path, subject, options, motions)
     target, told = shipped_path(subject.name), record(subject, found, motions)
     if options.family:
-        told["bodies"] = {stage.stem: on_body(path, stage, subject, options, motions) for stage in options.family}
+        told["bodies"] = {stage.stem: on_body(path, stage, options, motions) for stage in options.family}
     save_model(target, published(whole, told), pack=True)
     size = target.stat().st_size
     return [*loss_row(subject.name, found), f"{size:,}"], {**asdict(found), "bytes": size}
@@ -83,15 +83,10 @@ def bearable(path: Path, subject: Subject, options: Namespace, motions: list[Mot
     return found
 
 
-def on_body(
-    path: Path, stage: Path, base: Subject, options: Namespace, motions: list[Motion]
-) -> dict[str, float | bool]:
+def on_body(path: Path, stage: Path, options: Namespace, motions: list[Motion]) -> dict[str, float | bool]:
     """Return the score of a model for a family on the held-out clips on one more body, seen in training or not."""
     subject, bodies = open_subject(path, stage, options.device), need_bodies(load_model(path), path)
-    before, after = base.scene.character.skeleton, subject.scene.character.skeleton
-    place = bodies.place_of(subject.scene.character)
-    taller = 1 + float(bodies.taller @ place.coordinates)
-    clips = [motion_on(motion, before, after, taller) for motion in motions]
+    place, clips = bodies.place_of(subject.scene.character), [subject.on_body(motion) for motion in motions]
     found = bearable(path, subject, Namespace(**{**vars(options), "stage": stage}), clips)
     lbs = means(subject, clips, lbs=True)
     return {

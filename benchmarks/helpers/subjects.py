@@ -24,20 +24,25 @@ from ssilk_core.network.checkpoint import ModelFile, load_model, network
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.quality.evaluation.bodies import has_bones, on_body
 from ssilk_core.quality.evaluation.methods import EvaluationScene
-from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.scene.assets import Motion, Scene, Skeleton
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not."""
+    """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not.
+
+    `base` is the skeleton of the first body of a family, and by how much this one is taller; None for that body.
+    """
 
     name: str
     file: ModelFile
     model: GarmentModel
     dressed: EvaluationScene
+    base: tuple[Skeleton, float] | None = None
 
     @property
     def scene(self) -> Scene:
@@ -54,6 +59,12 @@ class Subject:
     @property
     def device(self) -> torch.device:
         return self.dressed.device
+
+    def on_body(self, motion: Motion) -> Motion:
+        """Return a motion on this body, where it has the bones of the first body of its family."""
+        if self.base is None or not has_bones(motion, self.base[0]):
+            return motion
+        return on_body(motion, *self.base, self.scene.character.skeleton)
 
     def validator(self, *motions: Motion) -> Validator:
         """Return a validator of this garment that holds whole motions at the model's rate."""
@@ -74,7 +85,10 @@ def open_subject(path: Path, stage: Path, device: str) -> Subject:
     if file.bodies:
         on = worn(file, open_stage(stage), None)
         dressed = EvaluationScene(on.scene, file.fabric, file.config.fps, select_device(device))
-        return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed)
+        base, bodies = None, file.bodies.family.bodies
+        if on.body:
+            base = file.scene.character.skeleton, float(bodies.taller @ on.body[: bodies.size])
+        return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed, base)
     dressed = dressed_in(file, stage, device)
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
 
@@ -152,5 +166,5 @@ def measure_each(
 
 
 def clip_of(options: argparse.Namespace, name: str, subject: Subject) -> Motion:
-    """Read one clip of the motions' folder."""
-    return read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
+    """Read one clip of the motions' folder, on the subject's body."""
+    return subject.on_body(read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton))
