@@ -27,10 +27,14 @@ from ssilk_core.delivery.bake import BakeRequest, load_rollout
 from ssilk_core.delivery.view.shots import Look
 from ssilk_core.demo import garments, motions, shipped
 from ssilk_core.events import silent
+from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import ModelFile, load_model, save_model
 from ssilk_core.physics.energy import GarmentEnergy
-from ssilk_core.scene.assets import Garment, Motion, Scene, Skeleton
+from ssilk_core.physics.intersections.pairs import intersections_between
+from ssilk_core.scene.assets import PINNED, Garment, Motion, Scene, Skeleton
+from ssilk_core.training.wardrobe.listing import read_list
 
+SHIPPED = (*garments.GARMENTS, *garments.OVER)
 SHORT = shlex.split(
     "--set iterations=2 --set static_fraction=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set "
     "pretraining_batch=4 "
@@ -41,7 +45,7 @@ SHORT = shlex.split(
 @cache
 def wardrobe() -> dict[str, Garment]:
     character = read_character(demo_body_path())
-    return {name: garments.build_garment(name, character) for name in garments.GARMENTS}
+    return {name: garments.build_garment(name, character) for name in SHIPPED}
 
 
 @contextmanager
@@ -192,6 +196,34 @@ def test_the_draft_is_trained_and_filmed_beside_what_ships(drafted):
     assert commands[-1][1:4] == [str(folder / name) for name in names]
     for name in ("cape_draft.safetensors", "shipped.mp4", "draft.mp4", "draft.png"):
         assert (folder / name).stat().st_size > 1000
+
+
+@pytest.mark.parametrize("garment", garments.OVER)
+def test_a_garment_that_ships_over_another_fits_it(garment):
+    """It starts clear of the one that ships, over which it was trained; what lay over that is no longer pinned."""
+    inner = shipped.shipped_path(garments.OVER[garment][1])
+    model, below = load_model(shipped.shipped_path(garment)), load_model(inner).scene.garment.mesh
+    assert model.provenance["over"] == {inner.stem: sha256(inner)}
+    mesh, built = model.scene.garment.mesh, wardrobe()[garment].mesh
+    np.testing.assert_allclose(mesh.points, built.points, atol=shipped.TOLERANCE)
+    assert not len(intersections_between(mesh.points, mesh.faces, below.points, below.faces))
+    assert not (model.scene.classes == PINNED).any()
+
+
+@pytest.mark.usefixtures("brief")
+def test_an_outfit_is_baked_and_filmed_and_its_list_written(tmp_path, capsys):
+    assert main(["demo", "--garment", "cape_over_dress", "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    assert [command[0] for command in typed(said)] == ["bake", "bake", "view", "view"]
+    assert "triangles that intersect hooded_dress: 0.0" in said.rpartition("$ ssilk bake")[2]
+    for folder in ("outfit", "outfit_lbs"):
+        shots = tmp_path / folder / "shots" / "shot"
+        assert {each.parent.name for each in shots.glob("*/anim.usdc")} == {"cape_over_dress", "hooded_dress"}
+    assert (tmp_path / "shipped.mp4").stat().st_size > 1000
+    inner, outer = read_list(tmp_path / "outfit.toml")
+    assert (inner.name, outer.name, outer.over) == ("hooded_dress", "cape_over_dress", ("hooded_dress",))
+    assert main(["inspect", str(tmp_path / "outfit.toml")]) in (0, 5)
+    assert "garments-cross" not in capsys.readouterr().out
 
 
 def thinner(model: ModelFile) -> ModelFile:
