@@ -363,6 +363,14 @@ WORDS = {
         "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist, "
         "sobald Klassen automatisch gefunden wurden"
     ),
+    "Stiffer": "Steifer",
+    "By": "Um",
+    "Vertex group in which the cloth is stiffer, such as a collar, or softer; weights lie between": (
+        "Vertexgruppe, in der der Stoff steifer ist, etwa ein Kragen, oder weicher; Gewichte liegen dazwischen"
+    ),
+    "What stretching and bending are multiplied by where the weight is one; below one it is softer": (
+        "Womit Dehnung und Biegung malgenommen werden, wo das Gewicht eins ist; unter eins ist er weicher"
+    ),
     "Pins": "Festes",
     "Vertex group of what is pinned when classes are found; the band it hangs from when empty": (
         "Vertexgruppe dessen, was fest ist, wenn Klassen gesucht werden; wenn leer, der Rand, an dem es hängt"

@@ -30,7 +30,7 @@ from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
-from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
+from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 
 if TYPE_CHECKING:
@@ -118,6 +118,8 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
         found = apply_overrides(stated_fabric(garment.surface, report), options.material)
     if garment.classes is not None:
         need_stitch(garment.mesh, garment.classes, found)
+    if garment.mesh.stiffness is not None:
+        report(Message(f"{garment.mesh.path}: {stiffness_words(garment.mesh)}"))
     return found
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 CLASS = "primvars:ssilk:class"
 PIN = "primvars:ssilk:pin"  # 1 where a vertex is to be pinned when classes are found
 LEVEL = "primvars:ssilk:tightness"  # the least tightness at which a vertex is tight, 0 where it is pinned
+STIFFNESS = "primvars:ssilk:stiffness"  # by which the fabric's own is multiplied, 1 where there is none
 GARMENT = "ssilk:garment"
 PROXIES = "ssilk:proxyJoints"
 JOINTS = "skel:joints"
