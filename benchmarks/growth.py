@@ -67,7 +67,8 @@ def by_vertices() -> dict[str, dict[str, list[float]]]:
 def by_counts() -> dict[str, dict[str, list[float]]]:
     """Return microseconds of a garment's frame where many are played, by way and threads, for each count."""
     found: dict[str, dict[str, list[float]]] = {}
-    players, motion = [], player_of(USUAL)[1]
+    players: list[Player] = []
+    motion = player_of(USUAL)[1]
     for counted, counts in COUNTS.items():
         rows = found.setdefault(counted, {})
         for way in WAYS:
