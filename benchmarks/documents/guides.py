@@ -35,6 +35,15 @@ def targets() -> str:
     return table(header, rows, 4)
 
 
+def growth() -> str:
+    """What a frame takes of garments of more and more vertices, and how fast that grows."""
+    found, rows = result("growth"), []
+    sizes = found["sizes"]["vertices"]
+    for way, taken in found["microseconds"]["vertices"].items():
+        rows.append([f"{way} [µs]", *(f"{time:,.0f}" for time in taken)])
+    return table(("vertices", *(f"{size:,}" for size in sizes)), rows)
+
+
 def presets() -> str:
     """Sizes and schedules of the presets."""
     rows = []
