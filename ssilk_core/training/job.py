@@ -202,6 +202,7 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
         np.array_equal(mine, theirs)
         for mine, theirs in ((own.garment.mesh.faces, mesh.faces), (own.parents, scene.parents))
     )
+    alike = alike and own.garment.mesh.points.shape == mesh.points.shape
     alike = alike and np.allclose(own.bind_transforms, scene.bind_transforms, atol=SAME)
     if alike:
         away = np.linalg.norm(own.garment.mesh.points - mesh.points, axis=1).max(initial=0)
