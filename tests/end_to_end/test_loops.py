@@ -144,6 +144,11 @@ def test_the_garment_may_say_it_and_layers_keep_it(stage):
     record = json.loads(Path("layers/shots/cycle/lively/bake.json").read_text())
     assert record["detail"]["loop"]["closed"] and record["detail"]["loop"]["seam_mm"] < 0.01
     assert main([*BAKE, "cycle.usda", "-o", "layers", "--loop"]) == 0  # another request: it is baked again
+    asked_so = Path("layers/shots/cycle/lively/bake.json").read_text()
+    assert json.loads(asked_so)["key"] != record["key"]
+    written = Path(layer).stat().st_mtime_ns
+    assert main([*BAKE, "cycle.usda", "-o", "layers", "--loop"]) == 0  # the same: it is done
+    assert Path(layer).stat().st_mtime_ns == written
     assert main(["farm", "lively.safetensors", "--stage", "rigged.usda", "--motion", "cycle.usda", "--loop",
                  "--bundle", "job"]) == 0  # fmt: skip
     (task,) = json.loads(Path("job/job.json").read_text())["tasks"]
