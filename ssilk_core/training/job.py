@@ -232,6 +232,7 @@ def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> 
     """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them."""
     mine, theirs = own.bodies, family.bodies
     alike = mine.members.shape == theirs.members.shape and mine.joints.shape == theirs.joints.shape
+    alike = alike and mine.counts == theirs.counts  # else it may lack points that the model knows
     alike = alike and all(
         np.allclose(here, there, atol=SAME)
         for here, there in (
