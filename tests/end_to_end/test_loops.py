@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -123,11 +124,14 @@ def test_a_loop_goes_with_other_wishes(stage, more):
     assert said("loop.usdc")["seam from rest, at most [mm]"] > 100 * said("loop.usdc")["seam, at most [mm]"]
 
 
-def test_a_held_span_within_the_round_stays_held(stage):
+def test_a_held_span_within_the_round_stays_held(stage, capsys):
     direct("cycle.usda", free={0: 1.0, 4: 1.0, 8: 0.0, 12: 0.0, 18: 1.0})
     found, skinned = baked("loop.usdc", "cycle.usda", "--loop"), baked("lbs.usdc", "cycle.usda", "--lbs", "--loop")
     assert seam_of(found) < 1e-5
     off = np.sqrt(((found - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    baked("plain.usdc")
+    told = [int(number) for number in re.findall(r"(\d+) poses are held or let go", capsys.readouterr().err)]
+    assert told == [13, 13]  # frames 5 to 17, of one round
     assert off[8:13].max() < 8e-3 < off[0]
 
 
