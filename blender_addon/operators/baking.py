@@ -18,7 +18,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
-from ssilk_core.scene.assets import Collider
+from ssilk_core.scene.assets import PINNED, TIGHT, Collider
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, known_as
@@ -398,16 +398,23 @@ def seam(figures: Mapping[str, Any]) -> str:
     if "loop: seam, at most [mm]" not in figures:
         return ""
     left, before = figures["loop: seam, at most [mm]"], figures["loop: seam from rest, at most [mm]"]
-    return f"; the loop's last frame is within {left:.2g} mm of its first, {before:.3g} mm where it starts at rest"
+    end = "last frame" if figures["loop: last frame"].startswith("shows") else "frame after the last"
+    return f"; the loop's {end} is within {left:.2g} mm of its first, {before:.3g} mm where it starts at rest"
 
 
 def reclassed(garment: bpy.types.Object, model: Path) -> str:
     """Return a note if a garment's classes differ from its model's; empty if not, or if either cannot be read."""
     try:
-        trained, classes = load_model(model).scene.classes, current_classes(garment.data)
+        file, classes = load_model(model), current_classes(garment.data)
     except SsilkError:
         return ""
-    if classes is None or np.array_equal(trained, classes):
+    if classes is None:
+        return ""
+    trained = file.scene.classes
+    loosened = (
+        (trained == TIGHT) & (classes == PINNED) if file.provenance.get("over") else False
+    )  # by training itself
+    if np.array_equal(trained, np.where(loosened, TIGHT, classes)):
         return ""
     return " (as it was trained: classes were changed since, which take a new rig and a new training)"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -123,11 +124,14 @@ def test_a_loop_goes_with_other_wishes(stage, more):
     assert said("loop.usdc")["seam from rest, at most [mm]"] > 100 * said("loop.usdc")["seam, at most [mm]"]
 
 
-def test_a_held_span_within_the_round_stays_held(stage):
+def test_a_held_span_within_the_round_stays_held(stage, capsys):
     direct("cycle.usda", free={0: 1.0, 4: 1.0, 8: 0.0, 12: 0.0, 18: 1.0})
     found, skinned = baked("loop.usdc", "cycle.usda", "--loop"), baked("lbs.usdc", "cycle.usda", "--lbs", "--loop")
     assert seam_of(found) < 1e-5
     off = np.sqrt(((found - skinned) ** 2).sum(axis=-1).mean(axis=-1))
+    baked("plain.usdc")
+    told = [int(number) for number in re.findall(r"(\d+) poses are held or let go", capsys.readouterr().err)]
+    assert told == [13, 13]  # frames 5 to 17, of one round
     assert off[8:13].max() < 8e-3 < off[0]
 
 
@@ -144,6 +148,11 @@ def test_the_garment_may_say_it_and_layers_keep_it(stage):
     record = json.loads(Path("layers/shots/cycle/lively/bake.json").read_text())
     assert record["detail"]["loop"]["closed"] and record["detail"]["loop"]["seam_mm"] < 0.01
     assert main([*BAKE, "cycle.usda", "-o", "layers", "--loop"]) == 0  # another request: it is baked again
+    asked_so = Path("layers/shots/cycle/lively/bake.json").read_text()
+    assert json.loads(asked_so)["key"] != record["key"]
+    written = Path(layer).stat().st_mtime_ns
+    assert main([*BAKE, "cycle.usda", "-o", "layers", "--loop"]) == 0  # the same: it is done
+    assert Path(layer).stat().st_mtime_ns == written
     assert main(["farm", "lively.safetensors", "--stage", "rigged.usda", "--motion", "cycle.usda", "--loop",
                  "--bundle", "job"]) == 0  # fmt: skip
     (task,) = json.loads(Path("job/job.json").read_text())["tasks"]

@@ -190,7 +190,7 @@ def looped(rolled: Iterable[GarmentPose], loop: Loop, count: int, fps: float, de
     chosen = 1 + int(np.argmin(apart[1:]))
     whole, begin = parts[0], chosen * period
     own = whole.part(slice(begin, begin + count))
-    length = min(round(BLENDED * fps), period // 2)
+    length = min(max(round(BLENDED * fps), 1), period // 2)
     share = ((np.arange(count) - (period - length)) / length).clip(0, 1)
     share *= share * (3 - 2 * share)
     closed = _mixed(own, whole.part(slice(begin - period, begin - period + count)), share)

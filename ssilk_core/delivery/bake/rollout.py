@@ -28,7 +28,7 @@ from ...scene.riders import Rider, RiderJoints
 from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
-from .looped import Loop, LoopedPoses, looped, seam_words, summary
+from .looped import MOST_ROUNDS, Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
 from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
 from .world import ShotSurroundings, Sight
@@ -203,8 +203,9 @@ class BakeRollout:
         rolled = partial(self._rolled, roller=roller, lost=lost, start=start)
         if self.direction is not None:
             directed = DirectedPoses(self.direction, self.deformer, rolled)
-            yield from directed.poses(start, stop)
-            self.held_off[:] = directed.off
+            for pose in directed.poses(start, stop):
+                self.held_off[:] = directed.off  # now: a loop may ask for no more
+                yield pose
             return
         for pose in rolled(0, stop, 1):
             part = pose.part(slice(max(start - pose.start, 0), None))
@@ -223,6 +224,7 @@ class BakeRollout:
         lost, count = list[FrameSpan](), self.motion.frame_count
         course = self._course(0, loop.samples, roller, lost)
         found = looped(course, loop, count, self.motion.fps, partial(deform, self.deformer, self.motion))
+        del self.held_off[len(self.held_off) // MOST_ROUNDS :]  # those of one round
         within = [(span.first - found.begins, span.last - found.begins) for span in lost]
         spans = [(max(first, 0), min(last, count - 1)) for first, last in within]
         self.recovered[:] = [FrameSpan(first, last) for first, last in spans if first <= last]

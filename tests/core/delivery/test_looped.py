@@ -30,9 +30,9 @@ def decode(pose: GarmentPose) -> np.ndarray:
     return np.repeat(pose.weights[:, None].astype(float), 3, axis=2)
 
 
-def play(values: np.ndarray):
+def play(values: np.ndarray, fps: float = FPS):
     asked: list[int] = []
-    return looped(rolled(values, asked), loop(), PERIOD + 1, FPS, decode), sum(asked)
+    return looped(rolled(values, asked), loop(), PERIOD + 1, fps, decode), sum(asked)
 
 
 def wave(count: int) -> np.ndarray:
@@ -60,6 +60,13 @@ def test_where_none_repeats_the_nearest_is_taken_and_its_end_led_into_its_beginn
     lead = (wave(count) + drift)[found.begins - 2 : found.begins + 1]
     assert course[-2] - course[-1] == pytest.approx(lead[1] - lead[2], abs=1e-3)  # with its velocity
     np.testing.assert_allclose(course[: PERIOD // 2], (wave(count) + drift)[found.begins :][: PERIOD // 2], atol=1e-6)
+
+
+def test_the_last_frame_alone_is_led_into_the_first_where_half_a_second_has_no_other():
+    count = loop().samples
+    found, _ = play(wave(count) + 0.2 * np.sin(np.arange(count) / 37.0), fps=1.0)
+    course = found.pose.weights[:, 0]
+    assert np.isfinite(course).all() and course[0] == pytest.approx(course[-1], abs=1e-7)
 
 
 @pytest.mark.parametrize("closed", [True, False])

@@ -337,6 +337,13 @@ def test_what_a_family_cannot_go_on_from_is_refused(scene, members, family, mode
     other = dressed_family(scene, BodyFamily.of([members[0], members[2], members[1]]), [members[2], members[1]])[0]
     with pytest.raises(SsilkError, match="another family"):
         family_job(scene, other, motion, path, base=file, whole=True)
+    bodies, last = family.bodies, len(family.bodies.points) - 1
+    fewer = replace(
+        bodies, points=bodies.points[:last], point_moves=bodies.point_moves[:, :last], rows=bodies.rows[:last],
+        counts=(last,),
+    )  # fmt: skip
+    with pytest.raises(SsilkError, match="another family"):
+        family_job(scene, replace(family, bodies=fewer), motion, path, base=file, whole=True)
 
 
 SEEING_COLLIDERS = TrainConfig(batch=64, window=4, static_batch=2, static_fraction=0, collider_fraction=1.0)
