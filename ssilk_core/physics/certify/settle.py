@@ -15,7 +15,7 @@ import numpy as np
 
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import topology
-from .faults import FaultFinder, SkinPoints, FrameSurroundings
+from .faults import FaultFinder, FrameSurroundings, SkinPoints
 from .metric import DisplacementMetric
 
 if TYPE_CHECKING:

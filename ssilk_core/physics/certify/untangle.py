@@ -17,7 +17,7 @@ import numpy as np
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import geodesic
 from .crossings import contour_forces
-from .faults import FaultFinder, FrameFaults, SkinPoints, FrameSurroundings
+from .faults import FaultFinder, FrameFaults, FrameSurroundings, SkinPoints
 from .metric import DisplacementMetric, DisplacementSolver
 
 LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a frame gets little better
