@@ -23,7 +23,8 @@ time-sampled points instead, bound to no skeleton; in a folder of layers, they a
 
 --certify moves the frames in which triangles of the garment intersect, or covered skin shows, as little as it takes
 until none does in the written file, and says which frames have no free position. It adds blendshapes for these frames
-alone; all others stay as they are.
+alone; all others stay as they are. In a folder of layers or a glb, garments that were trained over others of the shot
+are certified over these.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...scene.assets import Floats, Ints, Scene
-from .faults import FaultFinder, FrameFaults, PosedWearer
+from .faults import FaultFinder, FrameFaults, FrameSurroundings
 from .metric import DisplacementMetric
 from .settle import THICKNESS, Settler
 from .untangle import Untangler
@@ -161,7 +161,7 @@ class Certifier:
         found[faces[moves[faces].any(axis=1)].reshape(-1)] = True
         return found
 
-    def _skin(self, frames: Frames, frame: int) -> PosedWearer | None:
+    def _skin(self, frames: Frames, frame: int) -> FrameSurroundings | None:
         return self.finder.place(frames.body(frame), frames.beneath(frame) if frames.beneath else None)
 
     def _freed(
@@ -231,7 +231,7 @@ class Certifier:
         return self._settled(start, target, moves, skin, thickness)
 
     def _settled(
-        self, start: Floats, target: Floats, moves: np.ndarray, skin: PosedWearer | None, thickness: float
+        self, start: Floats, target: Floats, moves: np.ndarray, skin: FrameSurroundings | None, thickness: float
     ) -> _Moved | None:
         """Return a free frame near a target, lifted once more where that uncovered skin; None where it stays bare."""
         settled = self.settler.settle(start, target, moves, skin, thickness)

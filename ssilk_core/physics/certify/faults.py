@@ -106,7 +106,7 @@ class FaultFinder:
             self._search = BlockedRays(mesh.points, mesh.faces)
             self._last = np.full(len(self.joints), NO_TRIANGLE)
 
-    def place(self, body: Floats | None, beneath: Floats | None = None) -> PosedWearer | None:
+    def place(self, body: Floats | None, beneath: Floats | None = None) -> FrameSurroundings | None:
         """Return the points of the skin on a posed body (B, 3) [m]; None where none is covered and nothing beneath.
 
         Args:
@@ -114,7 +114,9 @@ class FaultFinder:
         """
         if body is None or not self._sets:
             none = np.zeros((0, 3))
-            return None if beneath is None else PosedWearer(none, none, none, np.zeros(0, dtype=np.int8), beneath)
+            return (
+                None if beneath is None else FrameSurroundings(none, none, none, np.zeros(0, dtype=np.int8), beneath)
+            )
         smooth_normals = topology.vertex_normals(body, self._body.faces)
         starts, normals = [], []
         for points, smooth in self._sets:
@@ -125,9 +127,9 @@ class FaultFinder:
             normal = (smooth_normals[corners] * share).sum(axis=1) if smooth else flat
             normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-12))
         unknown = np.full(len(self.joints), -1, dtype=np.int8)
-        return PosedWearer(body, np.concatenate(starts), np.concatenate(normals), unknown, beneath)
+        return FrameSurroundings(body, np.concatenate(starts), np.concatenate(normals), unknown, beneath)
 
-    def find(self, points: Floats, skin: PosedWearer | None) -> FrameFaults:
+    def find(self, points: Floats, skin: FrameSurroundings | None) -> FrameFaults:
         """Return what is wrong with the cloth at these positions [m], shape (V, 3)."""
         pairs = self.cloth.pairs(points)
         if skin is not None and skin.beneath is not None:
@@ -135,7 +137,7 @@ class FaultFinder:
             pairs = np.concatenate([pairs, crossing + [0, len(self.faces)]])
         return FrameFaults(pairs, self.showing(points, skin))
 
-    def showing(self, points: Floats, skin: PosedWearer | None) -> SkinPoints:
+    def showing(self, points: Floats, skin: FrameSurroundings | None) -> SkinPoints:
         """Return the points of the skin that show, with the cloth beneath them."""
         if skin is None or not len(skin.starts):
             return _no_points()
@@ -146,7 +148,7 @@ class FaultFinder:
         shows = shows[~self._enclosed(skin, shows)]
         return self._beside(points, skin, shows, -SHOW_DEPTH, 0.0)
 
-    def resting(self, points: Floats, skin: PosedWearer, chosen: Ints, above: float) -> SkinPoints:
+    def resting(self, points: Floats, skin: FrameSurroundings, chosen: Ints, above: float) -> SkinPoints:
         """Return the points, of those with indices (M,), whose outermost cloth lies less than `above` them [m].
 
         Beneath the skin it is looked for as deep as it is seen.
@@ -158,7 +160,7 @@ class FaultFinder:
         over, _ = self._search.find(x, starts, directions, low, high, unknown)
         return found.chosen(over == NO_TRIANGLE)
 
-    def _beside(self, points: Floats, skin: PosedWearer, chosen: Ints, low: float, high: float) -> SkinPoints:
+    def _beside(self, points: Floats, skin: FrameSurroundings, chosen: Ints, low: float, high: float) -> SkinPoints:
         """Return the points, of those with indices (M,), with any cloth between two heights over them [m]."""
         least, most = (np.full(len(chosen), reach, np.float32) for reach in (low, high))
         x, starts, directions = self._asked(points, skin, chosen)
@@ -171,13 +173,13 @@ class FaultFinder:
         return SkinPoints(index, face, weights, normal, height)
 
     @staticmethod
-    def _asked(points: Floats, skin: PosedWearer, chosen: Ints) -> tuple[Floats, Floats, Floats]:
+    def _asked(points: Floats, skin: FrameSurroundings, chosen: Ints) -> tuple[Floats, Floats, Floats]:
         """Return vertices, and starts and directions of rays, around an origin that float32 is exact near."""
         origin = skin.starts.mean(axis=0)
         x, starts = ((each - origin).astype(np.float32) for each in (points, skin.starts[chosen]))
         return np.ascontiguousarray(x), starts, skin.normals[chosen].astype(np.float32)
 
-    def _enclosed(self, skin: PosedWearer, chosen: Ints) -> np.ndarray:
+    def _enclosed(self, skin: FrameSurroundings, chosen: Ints) -> np.ndarray:
         """Tell which points lie inside a part of the body, bool (M,); it is looked for once in each pose."""
         asked = chosen[skin.enclosed[chosen] < 0]
         starts = skin.starts[asked] + LIFTED * skin.normals[asked]
@@ -189,8 +191,8 @@ class FaultFinder:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedWearer:
-    """What a garment is worn on in a frame: points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body
+class FrameSurroundings:
+    """What is around a garment in a frame: points of the skin (S, 3) [m] with unit normals (S, 3), on a posed body
     (B, 3) [m], and the garments beneath.
 
     Attributes:

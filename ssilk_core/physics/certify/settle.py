@@ -15,7 +15,7 @@ import numpy as np
 
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import topology
-from .faults import FaultFinder, PosedWearer, SkinPoints
+from .faults import FaultFinder, FrameSurroundings, SkinPoints
 from .metric import DisplacementMetric
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Settler:
         start: Floats,
         target: Floats,
         moves: np.ndarray,
-        skin: PosedWearer | None,
+        skin: FrameSurroundings | None,
         thickness: float = THICKNESS,
     ) -> Floats:
         """Return free positions (V, 3) [m] near a target.
@@ -93,7 +93,7 @@ class Settler:
             share /= 2
         return share * step if share > SHORTEST else None
 
-    def _held(self, points: Floats, moves: np.ndarray, skin: PosedWearer | None) -> SkinPoints | None:
+    def _held(self, points: Floats, moves: np.ndarray, skin: FrameSurroundings | None) -> SkinPoints | None:
         """Return the points of the skin that moving cloth lies on."""
         if skin is None or not len(skin.starts):
             return None
@@ -147,7 +147,7 @@ class _Potential:
         target: Floats,
         rows: Ints,
         thickness: float,
-        skin: PosedWearer | None,
+        skin: FrameSurroundings | None,
     ) -> None:
         import ipctk
         import scipy.sparse as sparse

@@ -17,7 +17,7 @@ import numpy as np
 from ...scene.assets import Floats, Ints, Mesh
 from ...scene.mesh import geodesic
 from .crossings import contour_forces
-from .faults import FaultFinder, FrameFaults, PosedWearer, SkinPoints
+from .faults import FaultFinder, FrameFaults, FrameSurroundings, SkinPoints
 from .metric import DisplacementMetric, DisplacementSolver
 
 LENGTHS = (0.03, 0.012, 0.004)  # [m] over which pushes spread; the next where a frame gets little better
@@ -58,7 +58,7 @@ class Untangler:
         self.metrics = [DisplacementMetric(mesh, length) for length in LENGTHS]
 
     def free(
-        self, start: Floats, skin: PosedWearer | None, faults: FrameFaults | None = None, *, lifts: bool = False
+        self, start: Floats, skin: FrameSurroundings | None, faults: FrameFaults | None = None, *, lifts: bool = False
     ) -> Untangled:
         """Return positions from a start (V, 3) [m] at which less is wrong, and nothing where that was found.
 
@@ -104,7 +104,7 @@ class Untangler:
         faults: FrameFaults,
         region: np.ndarray,
         solver: DisplacementSolver,
-        skin: PosedWearer | None,
+        skin: FrameSurroundings | None,
     ) -> Floats:
         """Return a displacement (V, 3) [m]; what lies beneath stays."""
         rows = np.flatnonzero(region)
