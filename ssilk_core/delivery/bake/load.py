@@ -16,11 +16,11 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion
+from ...scene.assets import Deformer, Floats, Motion, Skeleton
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
-from .bodies import WornModel, worn
+from .bodies import WornModel, other_bones, worn
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .request import ALLOWED_FPS, BakeRequest
@@ -70,6 +70,7 @@ class LoadedGarment:
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
         body: which of the model's family it lies on (`bodies.WornModel.body`).
+        first: the skeleton of the first body of that family; None where it lies on that one.
     """
 
     request: BakeRequest
@@ -86,6 +87,7 @@ class LoadedGarment:
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
+    first: Skeleton | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -132,7 +134,7 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=self.told,
+            told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
             direction=None if request.lbs else self._directed(request, read),
         )
 
@@ -227,7 +229,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
-    file, scene = on.file, on.scene
+    first, file, scene = file, on.file, on.scene
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -249,6 +251,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=told,
         body=on.body,
+        first=first.scene.character.skeleton if on.body else None,
     )
 
 
