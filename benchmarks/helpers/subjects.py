@@ -24,9 +24,10 @@ from ssilk_core.network.checkpoint import ModelFile, load_model, network
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.energy import GarmentEnergy
-from ssilk_core.quality.evaluation.bodies import has_bones, on_body
+from ssilk_core.quality.evaluation.bodies import on_body
 from ssilk_core.quality.evaluation.methods import EvaluationScene
 from ssilk_core.scene.assets import Motion, Scene, Skeleton
+from ssilk_core.scene.family import has_bones
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 

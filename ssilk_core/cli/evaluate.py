@@ -253,7 +253,8 @@ def _playlist(
     from ssilk_usd.reading.motion import read_motion, read_motions
 
     from ..quality.evaluation.asked import EvaluationClips
-    from ..quality.evaluation.bodies import has_bones, on_body
+    from ..quality.evaluation.bodies import on_body
+    from ..scene.family import has_bones
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton

@@ -536,3 +536,7 @@ def test_clips_that_were_made_for_a_body_are_played_as_they_are(world, toy, caps
     clip.Save()
     assert run("evaluate family.safetensors --stage taller.usda --motions clips --no-probes") == EXIT_OK
     assert "played on its own" not in capsys.readouterr().err
+    cases = (("clips/own.usda", "taller", 0), ("clip.usda", "taller", 1), ("clip.usda", "hero", 0))
+    for motion, stage, warned in cases:
+        assert run(f"bake family.safetensors --stage {stage}.usda --motion {motion} -o {stage}_shot.usda") == EXIT_OK
+        assert capsys.readouterr().err.count("retarget it to the bones of this body") == warned

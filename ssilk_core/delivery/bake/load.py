@@ -16,12 +16,12 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion
+from ...scene.assets import Deformer, Floats, Motion, Skeleton
 from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
-from .bodies import WornModel, worn
+from .bodies import WornModel, other_bones, worn
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -76,6 +76,7 @@ class LoadedGarment:
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
         body: which of the model's family it lies on (`bodies.WornModel.body`).
+        first: the skeleton of the first body of that family; None where it lies on that one.
     """
 
     request: BakeRequest
@@ -92,6 +93,7 @@ class LoadedGarment:
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
+    first: Skeleton | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -139,7 +141,7 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=self.told,
+            told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
             direction=None if request.lbs else self._directed(request, read),
             loop=loop,
         )
@@ -295,7 +297,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
-    file, scene = on.file, on.scene
+    first, file, scene = file, on.file, on.scene
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -317,6 +319,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=told,
         body=on.body,
+        first=first.scene.character.skeleton if on.body else None,
     )
 
 

@@ -6,23 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from ...scene.assets import Motion, Skeleton
 from ...scene.family import motion_on
-from ...scene.kinematics import bind_pose
 from ...training.verdict import percent, share_below
 from .figures import ResultRow
 
 LBS, SIMULATOR = "LBS", "simulator"
-SAME_BONES = 1e-3  # [m]
-
-
-def has_bones(motion: Motion, skeleton: Skeleton) -> bool:
-    """Return whether the joints of a motion are between the bones of a skeleton, but for what moves it as a whole."""
-    others = np.setdiff1d(np.arange(skeleton.joint_count), skeleton.hub_path)
-    apart = np.abs(motion.translations - bind_pose(skeleton)[1])[:, others]
-    return bool(apart.max(initial=0.0) < SAME_BONES)
 
 
 def on_body(motion: Motion, base: Skeleton, taller: float, other: Skeleton) -> Motion:
