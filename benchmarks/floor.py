@@ -113,7 +113,7 @@ def look(options: argparse.Namespace, subject: Subject) -> None:
 def clip_of(options: argparse.Namespace, subject: Subject, name: str) -> Motion:
     """Return the first frames of a clip at the model's rate."""
     motion = read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
-    return resample(motion, subject.file.config.fps).clip(0, options.frames)
+    return resample(subject.on_body(motion), subject.file.config.fps).clip(0, options.frames)
 
 
 def main() -> None:

@@ -5,7 +5,8 @@
 
 A model is called as its garment is, and trained on what 'ssilk demo' writes into its folder `wardrobe`. It is refused
 when it was trained on another mesh, or when packing moves a vertex or changes an energy by more than `precision.py`
-allows on the held-out clips.
+allows on the held-out clips. One for a family of bodies, such as cape_family.safetensors, is measured on its first
+body, and on those of --family, on which clips are played as in training.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from helpers.reports import table, write_results
 from helpers.subjects import Subject, arguments, open_subject, parsed
 from precision import (
@@ -34,12 +36,15 @@ from precision import (
 
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import demo_shot
-from ssilk_core.demo.shipped import need_trained_on, shipped_path
+from ssilk_core.demo.shipped import FAMILY_SUFFIX, need_trained_on, shipped_path
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import split_location
-from ssilk_core.network.checkpoint import ModelFile, save_model
+from ssilk_core.network.checkpoint import ModelFile, load_model, save_model
 from ssilk_core.physics.energy import TERMS
 from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.scene.family import BodyFamily
+
+SAME_BODY = 1e-4  # between coordinates
 
 
 def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
@@ -48,11 +53,23 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
     Raises:
         SsilkError: it is of another garment, or packing it loses something.
     """
-    subject = open_subject(path, options.stage, options.device)
+    subject, whole = open_subject(path, options.stage, options.device), load_model(path)
     if "shipped" in subject.file.provenance:
         fail(str(path), "packed already", "'ssilk train' writes what is needed")
-    need_trained_on(build_garment(subject.name, subject.scene.character).mesh, subject.file, path)
+    garment = subject.name.removesuffix(FAMILY_SUFFIX)
+    need_trained_on(build_garment(garment, subject.scene.character).mesh, subject.file, path)
     motions = held_out(options, subject, HELD_OUT)
+    found = bearable(path, subject, options, motions)
+    target, told = shipped_path(subject.name), record(subject, found, motions)
+    if options.family:
+        told["bodies"] = {stage.stem: on_body(path, stage, options, motions) for stage in options.family}
+    save_model(target, published(whole, told), pack=True)
+    size = target.stat().st_size
+    return [*loss_row(subject.name, found), f"{size:,}"], {**asdict(found), "bytes": size}
+
+
+def bearable(path: Path, subject: Subject, options: Namespace, motions: list[Motion]) -> Loss:
+    """Return what packing costs; raise `SsilkError` where it is too much."""
     found = loss(subject, packed_subject(subject, options), motions)
     most = max(map(abs, found.changes.values()))
     if not found.bearable:
@@ -63,10 +80,28 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
             f"at most {1e3 * MOST_MOVED:g} mm, {1e3 * MOST_RMS:g} mm and {MOST_CHANGED:.1%} are allowed",
             "train it again",
         )
-    target = shipped_path(subject.name)
-    save_model(target, published(subject.file, record(subject, found, motions)), pack=True)
-    size = target.stat().st_size
-    return [*loss_row(subject.name, found), f"{size:,}"], {**asdict(found), "bytes": size}
+    return found
+
+
+def on_body(path: Path, stage: Path, options: Namespace, motions: list[Motion]) -> dict[str, float | bool]:
+    """Return the score of a model for a family on the held-out clips on one more body, seen in training or not."""
+    subject, bodies = open_subject(path, stage, options.device), need_bodies(load_model(path), path)
+    place, clips = bodies.place_of(subject.scene.character), [subject.on_body(motion) for motion in motions]
+    found = bearable(path, subject, Namespace(**{**vars(options), "stage": stage}), clips)
+    lbs = means(subject, clips, lbs=True)
+    return {
+        "energy [J]": sum(found.energies.values()),
+        "linear blend skinning [J]": sum(lbs[name] for name in TERMS),
+        "inside the body": found.inside,
+        "trained for": bool((np.abs(bodies.members - place.coordinates).max(axis=1) < SAME_BODY).any()),
+    }
+
+
+def need_bodies(file: ModelFile, path: Path) -> BodyFamily:
+    """Return the bodies of a model's family; raise `SsilkError` where it is of one body."""
+    if file.bodies is None:
+        fail(str(path), "a model of one body", "--family measures one of a family", "leave --family out")
+    return file.bodies.family.bodies
 
 
 def record(subject: Subject, found: Loss, motions: list[Motion]) -> dict[str, Any]:
@@ -95,7 +130,13 @@ def published(file: ModelFile, shipped: dict[str, Any]) -> ModelFile:
         replace(scene.garment, mesh=replace(mesh, path=without_folder(mesh.path))),
         replace(scene.rig, path=without_folder(scene.rig.path)),
     )
-    return replace(file, scene=public, provenance={**without_folders(file.provenance), "shipped": shipped})
+    bodies = file.bodies
+    if bodies:
+        known = bodies.family.bodies
+        known = replace(known, names=tuple(map(without_folder, known.names)))
+        bodies = replace(bodies, family=replace(bodies.family, bodies=known))
+    told = {**without_folders(file.provenance), "shipped": shipped}
+    return replace(file, scene=public, provenance=told, bodies=bodies)
 
 
 def without_folder(location: str) -> str:
@@ -116,6 +157,7 @@ def without_folders(value: Any) -> Any:
 def main() -> None:
     parser = arguments(__doc__ or "")
     parser.add_argument("--index", type=Path, required=True, help="JSON list of clips with their splits and tags")
+    parser.add_argument("--family", type=Path, nargs="+", default=[], help="stages of other bodies to measure on")
     options = parsed(parser)
     rows, measured = [], {}
     for path in options.models:

@@ -28,8 +28,8 @@ def method_over(model: Baseline | GarmentModel, takes: TakeSet) -> Network:
     return Network(model, takes)
 
 
-def open_network(path: Path, device: torch.device) -> OpenedModel:
-    """Open a baseline or a model of 'ssilk train', whichever the file holds.
+def open_network(path: Path, _: Path, device: torch.device) -> OpenedModel:
+    """Open a baseline or a model of 'ssilk train', whichever the file holds; both are for one body.
 
     The name is "ssilk", "snug", "ncs", or "ncs*" for an NCS that was trained with rotations.
     """

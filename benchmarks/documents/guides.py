@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from ssilk_core.training.settings import PRESETS
 
-from .forms import digits, result, table
+from .forms import digits, fixed, result, table
 
 TARGETS = {
     "usd": ("all", "the stage's", "layers or a file"),
@@ -35,6 +35,15 @@ def targets() -> str:
     return table(header, rows, 4)
 
 
+def growth() -> str:
+    """What a frame takes of garments of more and more vertices, and how fast that grows."""
+    found, rows = result("growth"), []
+    sizes = found["sizes"]["vertices"]
+    for way, taken in found["microseconds"]["vertices"].items():
+        rows.append([f"{way} [µs]", *(f"{time:,.0f}" for time in taken)])
+    return table(("vertices", *(f"{size:,}" for size in sizes)), rows)
+
+
 def presets() -> str:
     """Sizes and schedules of the presets."""
     rows = []
@@ -45,3 +54,17 @@ def presets() -> str:
                      f"{train.batch} of {train.window}", purpose])  # fmt: skip
     header = ("preset", "latent", "blendshapes", "hidden layers", "iterations", "windows of poses", "for")
     return table(header, rows, 7)
+
+
+STATED_DRAPE = {"silk": 35, "cotton": 70, "denim": 85}  # [%] by the add-on of another simulator
+
+
+def drape() -> str:
+    """How the presets of fabrics hang."""
+    rows = []
+    for name, found in result("drape").items():
+        length, share = found["bending length [mm]"], found["drape coefficient [%]"]
+        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), fixed(length, 1), fixed(share),
+                     STATED_DRAPE.get(name, "")])  # fmt: skip
+    header = ("preset", "weight [g/m²]", "bending length [mm]", "drape coefficient [%]", "stated elsewhere [%]")
+    return table(header, rows)

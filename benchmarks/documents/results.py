@@ -17,14 +17,31 @@ LBS, REFINED = "linear blend skinning", "refine 4"
 FULL = "full, poses included"
 
 
-def cells(name: str) -> dict[tuple[str, str, str], dict[str, Any]]:
-    """Return the figures of `tables.py`, by garment, method and split."""
-    return {(row["garment"], row["method"], row["split"]): row for row in result(name)["figures"]}
+def cells() -> dict[tuple[str, str, str], dict[str, Any]]:
+    """Return totals [J] and intersections by garment, method and split.
+
+    Those of other methods are from `tables.py`, those of garments that ship from `ssilk evaluate`.
+    """
+    found = {(row["garment"], row["method"], row["split"]): row for row in result("table1")["figures"]}
+    for name in GARMENTS:
+        for row in measured(name):
+            figures = row["figures"]
+            found[IN_RESULTS[name], "ssilk", row["split"]] = {
+                "total": [figures["total"]],
+                **{f"intersections_{at}": [figures["intersections"][at]] for at in ("mean", "worst")},
+            }
+    return found
+
+
+def measured(name: str) -> list[dict[str, Any]]:
+    """Return what `ssilk evaluate` found of a garment that ships, a row for each split."""
+    rows: list[dict[str, Any]] = document(f"evaluate_{name}")["figures"]
+    return [row for row in rows if row["method"] == "ssilk" and row["split"] in SPLITS]
 
 
 def overview() -> str:
     """Energy, skin that shows, limbs through cloth, bare skin, cloth through cloth: trained, refined, and skinned."""
-    energies, rows, names = cells("table1"), [], ("network", REFINED, LBS)
+    energies, rows, names = cells(), [], ("network", REFINED, LBS)
     crossed = any("intersections" in at for own in result("shown_skin").values() for split in SPLITS
                   for at in own[split].values())  # fmt: skip
     for name, words in GARMENTS.items():
@@ -48,7 +65,7 @@ def intersecting(figures: dict[str, Any] | None) -> str:
 
 def other_methods() -> str:
     """Energies of all methods, and cloth through cloth."""
-    energies, rows = cells("table1"), []
+    energies, rows = cells(), []
     crossed = any("intersections_mean" in row for row in energies.values())
     iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
     for name, words in GARMENTS.items():
@@ -97,8 +114,8 @@ def trainings() -> str:
 def beside_solver() -> Iterator[tuple[str, str, dict[str, Any]]]:
     """Yield garment, split and figures of networks that the simulator went on from."""
     for name in GARMENTS:
-        for row in document(f"evaluate_{name}")["figures"]:
-            if row["method"] == "ssilk" and row["split"] in SPLITS:
+        for row in measured(name):
+            if row["figures"]["solver"]:
                 yield name, row["split"], row["figures"]["solver"]
 
 
@@ -123,15 +140,14 @@ def rest() -> str:
     rows: list[list[object]] = []
     named: set[str] = set()
     for name in GARMENTS:
-        for row in document(f"evaluate_{name}")["figures"]:
-            if row["method"] == "ssilk" and row["split"] in SPLITS:
-                stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
-                time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
-                away = (fixed(stops[figure], 0, 1e-3) for figure in ("static_distance", "max_static_distance"))
-                words = "" if name in named else GARMENTS[name]
-                named.add(name)
-                rows.append([words, row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
-                             *away, fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
+        for row in measured(name):
+            stops, loop = row["figures"]["settling"], row["figures"]["loop_drift"]
+            time = "" if stops["settling_time"] is None else fixed(stops["settling_time"], 1)
+            away = (fixed(stops[figure], 0, 1e-3) for figure in ("static_distance", "max_static_distance"))
+            words = "" if name in named else GARMENTS[name]
+            named.add(name)
+            rows.append([words, row["split"], stops["stops"], percent(stops["settled_share"], 0), time,
+                         *away, fixed(loop["loop_distance"], 3, 1e-3)])  # fmt: skip
     header = ("garment", "clips", "stops", "settled [%]", "median time [s]", "distance to P [mm]", "largest",
               "between loops [mm]")  # fmt: skip
     return table(header, rows, 2)

@@ -38,10 +38,14 @@ def build(path: Path) -> bpy.types.Object:
     mesh.from_pydata(points.tolist(), [], scene.garment.mesh.faces.tolist())
     garment = bpy.data.objects.new("Garment", mesh)
     armature = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
-    for thing in (armature, garment):
+    body = bpy.data.objects.new("Body", bpy.data.meshes.new("Body"))  # a model has none, and playing needs one
+    body.data.from_pydata([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0)], [], [(0, 1, 2)])
+    for thing in (armature, garment, body):
         bpy.context.collection.objects.link(thing)
-    garment.modifiers.new("Armature", "ARMATURE").object = armature
+    for thing in (garment, body):
+        thing.modifiers.new("Armature", "ARMATURE").object = armature
     add_bones(armature, garment, scene)
+    body.vertex_groups.new(name=armature.data.bones[0].name).add([0, 1, 2], 1.0, "REPLACE")
     bpy.context.view_layer.objects.active = garment
     return garment
 

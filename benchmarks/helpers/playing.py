@@ -20,8 +20,8 @@ from ssilk_core.network.model.feedback import BodyFrames
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.character import character_frames
-from ssilk_core.network.runtime.playback import BLOCK, VERTEX_BLOCK
-from ssilk_core.network.runtime.skinning import skin_garment
+from ssilk_core.network.runtime.playback import BLOCK
+from ssilk_core.network.runtime.skinning import skin_garment, vertex_block
 from ssilk_core.physics.skinning import Skinning, blend_matrices, transform_points
 from ssilk_core.scene.assets import Motion
 from ssilk_core.training.motion_bank import build_bank
@@ -58,8 +58,12 @@ def spans(count: int, size: int) -> Iterator[slice]:
     return (slice(start, min(start + size, count)) for start in range(0, count, size))
 
 
-def with_numpy(player: Player, motion: Motion) -> Laps:
-    """Play a motion at the model's rate as `runtime.Playback` does; return the time of each part [s]."""
+def with_numpy(player: Player, motion: Motion, compiled: bool = False) -> Laps:
+    """Play a motion at the model's rate as `runtime.Playback` does; return the time of each part [s].
+
+    Args:
+        compiled: whether in compiled loops, as a longer motion.
+    """
     monitor, before = Stopwatch(), None
     assert player.stepper is not None
     for frames in spans(motion.frame_count, BLOCK):
@@ -75,7 +79,7 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
         monitor.lap(DESCRIPTORS)
         course = player.stepper.prepare(player.quasi_static(given.static), given, before)
         monitor.lap(REST)
-        states = player.stepper.roll(course)
+        states = player.stepper.roll(course, compiled)
         before = states[-2:]
         monitor.lap(LATENTS)
         if course.outputs is None:
@@ -85,8 +89,9 @@ def with_numpy(player: Player, motion: Motion) -> Laps:
         monitor.lap(DECODER)
         matrices = player.kinematics.matrices(transforms, given.matrices)
         monitor.lap(KINEMATICS)
-        for part in spans(len(states), VERTEX_BLOCK):
-            skin_garment(player.tiles, activations[:, part], matrices[..., part], given.origins[part])
+        for part in spans(len(states), vertex_block(player.file.scene.garment.mesh.vertex_count)):
+            posed = activations[:, part], matrices[..., part], given.origins[part]
+            player.sparse_skin.skin(*posed) if compiled else skin_garment(player.tiles, *posed)
         monitor.lap(SKINNING)
     return monitor.laps
 
@@ -131,7 +136,7 @@ def with_torch(model: GarmentModel, skinner: Skinner, motion: Motion, chunk: int
         character = given.character[frames, ..., 0].permute(1, 2, 3, 0)
         matrices = model.decoder.proxy_matrices(transforms, character)
         monitor.lap(KINEMATICS)
-        for part in spans(len(rest), VERTEX_BLOCK):
+        for part in spans(len(rest), vertex_block(len(skinner.rest))):
             skinner(activations[:, part], matrices[..., part])
         monitor.lap(SKINNING)
     return monitor.laps
@@ -172,6 +177,7 @@ def ways(file: ModelFile, chunks: dict[str, int]) -> dict[str, Way]:
         own = Skinner(decoder.rest, decoder.shapes, decoder.free, decoder.skin, decoder.skin_weights())
         theirs = Skinner(ncs.rest, ncs.shapes, ncs.free, ncs.skin, ncs.skin.dense(ncs.skin.weights))
     found: dict[str, Way] = {"numpy": lambda motion: with_numpy(player, motion)}
+    found["compiled loops"] = lambda motion: with_numpy(player, motion, compiled=True)
     for name, chunk in chunks.items():
         found[f"PyTorch, {name}"] = lambda motion, chunk=chunk: with_torch(model, own, motion, chunk)  # type: ignore[misc]
         found[f"NCS, {name}"] = lambda motion, chunk=chunk: with_baseline(ncs, theirs, motion, chunk)  # type: ignore[misc]

@@ -17,26 +17,33 @@ from ssilk_usd.reading.motion import read_motion
 from torch import Tensor
 
 from helpers.reports import table, write_results
+from ssilk_core.delivery.bake import worn
 from ssilk_core.devices import select_device
 from ssilk_core.errors import fail
 from ssilk_core.network.checkpoint import ModelFile, load_model, network
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.quality.evaluation.bodies import on_body
 from ssilk_core.quality.evaluation.methods import EvaluationScene
-from ssilk_core.scene.assets import Motion, Scene
+from ssilk_core.scene.assets import Motion, Scene, Skeleton
+from ssilk_core.scene.family import has_bones
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not."""
+    """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not.
+
+    `base` is the skeleton of the first body of a family, and by how much this one is taller; None for that body.
+    """
 
     name: str
     file: ModelFile
     model: GarmentModel
     dressed: EvaluationScene
+    base: tuple[Skeleton, float] | None = None
 
     @property
     def scene(self) -> Scene:
@@ -54,6 +61,12 @@ class Subject:
     def device(self) -> torch.device:
         return self.dressed.device
 
+    def on_body(self, motion: Motion) -> Motion:
+        """Return a motion on this body, where it has the bones of the first body of its family."""
+        if self.base is None or not has_bones(motion, self.base[0]):
+            return motion
+        return on_body(motion, *self.base, self.scene.character.skeleton)
+
     def validator(self, *motions: Motion) -> Validator:
         """Return a validator of this garment that holds whole motions at the model's rate."""
         skeleton, fps = self.scene.character.skeleton, self.file.config.fps
@@ -68,8 +81,15 @@ class Subject:
 
 
 def open_subject(path: Path, stage: Path, device: str) -> Subject:
-    """Load a model and put it on the character of a stage."""
+    """Load a model and put it on the character of a stage; one for a family of bodies is on that body then."""
     file = load_model(path)
+    if file.bodies:
+        on = worn(file, open_stage(stage), None)
+        dressed = EvaluationScene(on.scene, file.fabric, file.config.fps, select_device(device))
+        base, bodies = None, file.bodies.family.bodies
+        if on.body:
+            base = file.scene.character.skeleton, float(bodies.taller @ on.body[: bodies.size])
+        return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed, base)
     dressed = dressed_in(file, stage, device)
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)
 
@@ -147,5 +167,5 @@ def measure_each(
 
 
 def clip_of(options: argparse.Namespace, name: str, subject: Subject) -> Motion:
-    """Read one clip of the motions' folder."""
-    return read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton)
+    """Read one clip of the motions' folder, on the subject's body."""
+    return subject.on_body(read_motion(options.motions / f"{name}.usdc", subject.scene.character.skeleton))

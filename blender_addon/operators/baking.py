@@ -18,7 +18,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.quality.levels import QUALITIES
-from ssilk_core.scene.assets import Collider
+from ssilk_core.scene.assets import PINNED, TIGHT, Collider
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, known_as
@@ -188,6 +188,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         solves = self.quality != WHOLE and QUALITIES[self.quality].refine
         if solves and garment.ssilk.hold > 1:
             raise SetupError("A solver moves each frame: set Hold Frames to 1, or choose another quality.")
+        if solves and garment.ssilk.loop:
+            raise SetupError("A solver does not come back to its start: switch Loop off, or choose another quality.")
         joints = self.known_joints(garment, armature)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
@@ -328,12 +330,13 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         collider = ["--collider", COLLIDERS] if self.meets else []
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
         certify = ["--certify"] if garment.ssilk.certify else []
+        loop = ["--loop"] if garment.ssilk.loop else ["--pre-roll", f"{self.pre_roll:g}"]  # rounds are its run-up
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
-                "--motion", str(inputs / MOTION), "-o", str(self.shot), "--pre-roll", f"{self.pre_roll:g}",
-                *level, *rate, *collider, *certify, "--json",
+                "--motion", str(inputs / MOTION), "-o", str(self.shot),
+                *loop, *level, *rate, *collider, *certify, "--json",
             ]
         ]  # fmt: skip
 
@@ -346,7 +349,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         where = [self.put_on_timeline() + self.reclassed] if self.to_timeline else []
         where += [str(self.shot)] if self.to_usd else []
-        said = f"{lost(work.result)}{certificate(work.result)}{self.reshaped}{self.left_out}"
+        said = f"{lost(work.result)}{certificate(work.result)}{seam(work.result)}{self.reshaped}{self.left_out}"
         return f"'{self.pair.name}' is baked: {' and '.join(where)}{said}."
 
 
@@ -390,13 +393,28 @@ def certificate(figures: Mapping[str, Any]) -> str:
     return f"; {figures['certificate']}" if "certificate" in figures else ""
 
 
+def seam(figures: Mapping[str, Any]) -> str:
+    """Return in words how the end of a loop meets its beginning; empty where it is none."""
+    if "loop: seam, at most [mm]" not in figures:
+        return ""
+    left, before = figures["loop: seam, at most [mm]"], figures["loop: seam from rest, at most [mm]"]
+    end = "last frame" if figures["loop: last frame"].startswith("shows") else "frame after the last"
+    return f"; the loop's {end} is within {left:.2g} mm of its first, {before:.3g} mm where it starts at rest"
+
+
 def reclassed(garment: bpy.types.Object, model: Path) -> str:
     """Return a note if a garment's classes differ from its model's; empty if not, or if either cannot be read."""
     try:
-        trained, classes = load_model(model).scene.classes, current_classes(garment.data)
+        file, classes = load_model(model), current_classes(garment.data)
     except SsilkError:
         return ""
-    if classes is None or np.array_equal(trained, classes):
+    if classes is None:
+        return ""
+    trained = file.scene.classes
+    loosened = (
+        (trained == TIGHT) & (classes == PINNED) if file.provenance.get("over") else False
+    )  # by training itself
+    if np.array_equal(trained, np.where(loosened, TIGHT, classes)):
         return ""
     return " (as it was trained: classes were changed since, which take a new rig and a new training)"
 

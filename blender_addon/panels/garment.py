@@ -117,6 +117,10 @@ class FabricPanel(UsableGarmentPanel, bpy.types.Panel):
         layout.use_property_split, layout.use_property_decorate = True, False  # a fabric is not animated
         for name in ("preset", "density", "stretch_model", *MEMBRANE[fabric.stretch_model]):
             layout.prop(fabric, name)
+        own = context.object
+        layout.prop_search(own.ssilk, "stiff", own, "vertex_groups")
+        if own.ssilk.stiff:
+            layout.prop(own.ssilk, "stiffness")
         contact = CONTACT[fabric.contact_model]
         for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether", "stitch"):
             layout.prop(fabric, name)

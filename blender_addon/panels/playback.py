@@ -128,6 +128,7 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         draw_text(layout, model_line(context.object))
         layout.prop(context.object.ssilk, "free")
         layout.prop(context.object.ssilk, "hold")
+        layout.prop(context.object.ssilk, "loop")
         layout.prop(context.object.ssilk, "colliders")
         for line in filter(None, (unseen_line(context.object), *unmet(context.object))):
             draw_text(layout, line, icon="INFO")

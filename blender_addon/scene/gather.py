@@ -114,6 +114,7 @@ def _gathered(
     paths = [f"{ROOT}/{name}" for name in identifiers((thing.name for thing in things), taken=(SKELETON,))]
     lbs = own_weights(armature, garment, joints)
     mesh = read_mesh(garment, garment.data, paths[0], worn_points(garment))
+    mesh = replace(mesh, stiffness=_stiffness(garment))
     rig = _proxy_rig(armature, garment, joints, paths[0]) if proxies and joints.proxy_count else None
     bodies = [read_body(thing, armature, joints.character, path) for thing, path in zip(things[1:], paths[1:])]
     return GatheredScene(
@@ -162,6 +163,19 @@ def _pins(garment: bpy.types.Object) -> np.ndarray | None:
     if name not in garment.vertex_groups:
         raise SetupError(f"'{garment.name}' has no vertex group '{name}' for its pins; choose another, or none.")
     return (read_groups(garment, garment.data, [name])[:, 0] >= HALF).astype(np.int8)
+
+
+def _stiffness(garment: bpy.types.Object) -> np.ndarray | None:
+    """Return how stiff the cloth is at each vertex beside its fabric, shape (V,); None where it is its own.
+
+    Halfway between weights of zero and one it is halfway on a logarithmic scale.
+    """
+    name = garment.ssilk.stiff
+    if not name:
+        return None
+    if name not in garment.vertex_groups:
+        raise SetupError(f"'{garment.name}' has no vertex group '{name}' to be stiffer in; choose another, or none.")
+    return garment.ssilk.stiffness ** read_groups(garment, garment.data, [name])[:, 0].astype(np.float64)
 
 
 def _proxy_rig(armature: bpy.types.Object, garment: bpy.types.Object, joints: Joints, path: str) -> ProxyRig:

@@ -14,6 +14,7 @@ from bpy.props import (
     StringProperty,
 )
 
+from ssilk_core.scene.assets import SOFTEST, STIFFEST
 from ssilk_core.scene.kinematics import MAX_HOLD
 
 from ..scene.classes import tighten
@@ -105,6 +106,17 @@ class GarmentSettings(bpy.types.PropertyGroup):
         description="Trained model of the garment; that of its own training when empty",
         override=SHOTS,
     )
+    stiff: StringProperty(
+        name="Stiffer",
+        description="Vertex group in which the cloth is stiffer, such as a collar, or softer; weights lie between",
+    )
+    stiffness: FloatProperty(
+        name="By",
+        description="What stretching and bending are multiplied by where the weight is one; below one it is softer",
+        default=10.0,
+        min=SOFTEST,
+        max=STIFFEST,
+    )
     free: FloatProperty(
         name="Free",
         description="How much the network moves the garment: at 0 its bones carry it. Keyed, it holds the garment "
@@ -121,6 +133,12 @@ class GarmentSettings(bpy.types.PropertyGroup):
         default=1,
         min=1,
         max=MAX_HOLD,
+        override=SHOTS,
+    )
+    loop: BoolProperty(
+        name="Loop",
+        description="The motion is a cycle: a bake plays it until the garment repeats, and its last frame flows into "
+        "its first",
         override=SHOTS,
     )
     certify: BoolProperty(

@@ -346,6 +346,11 @@ WORDS = {
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
     ),
+    "Loop": "Schleife",
+    "The motion is a cycle: a bake plays it until the garment repeats, and its last frame flows into its first": (
+        "Die Bewegung ist ein Zyklus: Gebacken wird, wenn sich das Kleidungsstück wiederholt, und das letzte Bild "
+        "geht in das erste über"
+    ),
     "Certify": "Zertifizieren",
     "Move baked frames as little as it takes until the garment does not pass through itself and no skin shows that "
     "it covers; a wrong frame takes seconds": (
@@ -357,6 +362,14 @@ WORDS = {
     "were found automatically": (
         "Wie viel des Kleidungsstücks anliegt: nichts, was nicht fest ist, oder alles; ersetzt, was gemalt ist, "
         "sobald Klassen automatisch gefunden wurden"
+    ),
+    "Stiffer": "Steifer",
+    "By": "Um",
+    "Vertex group in which the cloth is stiffer, such as a collar, or softer; weights lie between": (
+        "Vertexgruppe, in der der Stoff steifer ist, etwa ein Kragen, oder weicher; Gewichte liegen dazwischen"
+    ),
+    "What stretching and bending are multiplied by where the weight is one; below one it is softer": (
+        "Womit Dehnung und Biegung malgenommen werden, wo das Gewicht eins ist; unter eins ist er weicher"
     ),
     "Pins": "Festes",
     "Vertex group of what is pinned when classes are found; the band it hangs from when empty": (

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.
 
-The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training,
-and so does --garment cape_over_dress, which films an outfit: a cape that was trained over the hooded dress, and the
-dress. The list outfit.toml, to inspect and train both anew, is written beside it.
+The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
+Two choices train nothing: --garment cape_over_dress films an outfit, a cape that was trained over the hooded dress,
+and the dress; --garment cape_family films one model of the cape on three bodies side by side. The list outfit.toml,
+to inspect and train the outfit anew, is written beside it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from ..events import Message, Reporter, Result
 if TYPE_CHECKING:
     from ..scene.assets import Mesh
 
+FAMILY_GARMENT = "cape"  # of which a model for a family of bodies ships
+FAMILY = "cape_family"  # that model
+FILMED_BODIES = {"neutral": "", "tall": "tall", "heavy": "heavy"}  # by their captions
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
 
 
@@ -30,8 +34,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="folder for everything that the demo writes (default demo_out)",
     )  # fmt: skip
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress", "cape_over_dress"), default="cape",
-        help="garment, or an outfit of two (default cape)",
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress", "cape_over_dress", FAMILY), default="cape",
+        help="garment, an outfit of two, or one on a family of bodies (default cape)",
     )  # fmt: skip
     verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
     verb.add_argument(
@@ -46,17 +50,23 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     outfit = OVER.get(options.garment, ())
     wardrobe = _make_inputs(options, report)
-    shipped = open_shipped(options.garment, wardrobe[options.garment])
+    garment = FAMILY_GARMENT if options.garment == FAMILY else options.garment
+    shipped = open_shipped(options.garment, wardrobe[garment])
     report(Message(f"shipped {options.garment}: {origin(shipped)}"))
-    commands = _outfit(options, outfit[1:]) if outfit else _shipped(options)
-    if not (outfit or options.pretrained):
+    if options.garment == FAMILY:
+        _make_shots(options.output, report)
+        commands = _on_bodies(options)
+    else:
+        commands = _outfit(options, outfit[1:]) if outfit else _shipped(options)
+    trains = not (outfit or options.pretrained or options.garment == FAMILY)
+    if trains:
         commands += _trained(options)
     for command in commands:
         report(Message("\n$ ssilk " + shlex.join(command)))
         code = options.main([*command, "--json"] if options.json else command)
         if code not in (EXIT_OK, EXIT_WORSE):  # a draft that is worse than none is filmed, too
             return code
-    shown = ["shipped"] if options.pretrained or outfit else ["shipped", PRESET]
+    shown = ["shipped", PRESET] if trains else ["shipped"]
     report(Result("demo", {f"{name} film": str(options.output / f"{name}.mp4") for name in shown}))
     return EXIT_OK
 
@@ -94,6 +104,24 @@ def _outfit(options: argparse.Namespace, inner: Sequence[str]) -> list[list[str]
         [*bake, "-o", str(folders["shipped"])],
         *_views(out / "shipped", shots, fps=30),
     ]
+
+
+def _on_bodies(options: argparse.Namespace) -> list[list[str]]:
+    """Return the commands that bake one model on three bodies, each from its own stage, and film them."""
+    from ssilk_usd.stages import demo_body_path
+
+    from ..demo.shipped import shipped_path
+
+    out, model = options.output, str(shipped_path(FAMILY))
+    shots = {caption: str(out / f"{FAMILY_GARMENT}_{caption}.usdc") for caption in FILMED_BODIES}
+    return [
+        *(
+            ["bake", model, "--stage", str(demo_body_path(name)), "--motion", str(out / f"shot_{caption}.usdc"),
+             "-o", shots[caption]]
+            for caption, name in FILMED_BODIES.items()
+        ),
+        *_views(out / "shipped", shots, fps=30),
+    ]  # fmt: skip
 
 
 def _trained(options: argparse.Namespace) -> list[list[str]]:
@@ -167,3 +195,21 @@ def _make_inputs(options: argparse.Namespace, report: Reporter) -> dict[str, Mes
     seconds = sum(motion.frame_count / motion.fps for motion in motions)
     report(Message(f"made {len(motions)} motions of {seconds:.0f} s to train on, and a shot to bake"))
     return wardrobe
+
+
+def _make_shots(out: Path, report: Reporter) -> None:
+    """Write the shot to bake for each body: joints turn alike, between the bones of that body."""
+    from ssilk_usd.reading.character import read_character
+    from ssilk_usd.stages import demo_body_path
+    from ssilk_usd.writing.files import write_motion
+
+    from ..demo.motions import demo_shot
+    from ..scene.family import BodyFamily, motion_on
+
+    characters = [read_character(demo_body_path(name)) for name in FILMED_BODIES.values()]
+    family, base = BodyFamily.of(characters), characters[0].skeleton
+    shot = demo_shot(base)
+    for caption, character, coordinates in zip(FILMED_BODIES, characters, family.members):
+        moved = motion_on(shot, base, character.skeleton, 1 + float(family.taller @ coordinates))
+        write_motion(out / f"shot_{caption}.usdc", moved, character.skeleton)
+    report(Message(f"made a shot for each of {len(characters)} bodies"))

@@ -2,12 +2,16 @@
 """Measure trained garments on whole clips: energies, against the simulator, and what energies hide.
 
 Models of one garment share their tables with linear blend skinning, on the character that they were trained with.
+--stage given several times measures each body of a family: garments then have the name of the body's stage in front,
+and the body on which least is won over linear blend skinning is told. Clips with the bones of the model's first body
+are played between the bones of the others.
 Gravity is relative to linear blend skinning. --reference compares with the reference simulator. It names a folder of
 shots of the same clips, written by 'ssilk simulate --points' and named after the clips, or one with such a folder
-for each garment, under its name. Three probes follow. Poses are held after stops: a garment should come to rest at
-its own static state. The first seconds of clips are looped: a garment should repeat itself. Steps are linearised
-about states of rollouts: a disturbance of the two states before a step should not grow, so the spectral radius of the
-map from these to the next two should stay under one. --no-probes leaves them out.
+for each garment, under its name. Of several bodies each has its own folder there, under its stage's name. Three
+probes follow. Poses are held after stops: a garment should come to rest at its own static state. The first seconds
+of clips are looped: a garment should repeat itself. Steps are linearised about states of rollouts: a disturbance of
+the two states before a step should not grow, so the spectral radius of the map from these to the next two should stay
+under one. --no-probes leaves them out.
 --solver continues the first two states of each clip, and of its most violent second, with the reference simulator. It
 tells how far the garment is from that after 5, 10, 30 and 60 frames, and what single steps from its own past miss.
 --output writes each row when it is measured, and says that it is unfinished until the last. What is measured of the
@@ -26,7 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result, Started
+from ..events import Message, Reporter, Result, Started
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -36,12 +40,14 @@ if TYPE_CHECKING:
     from ..quality.evaluation.asked import EvaluationClips, EvaluationOptions
     from ..quality.evaluation.methods import EvaluatedMethod, EvaluationScene, Method, TakeSet
     from ..quality.evaluation.results import EvaluationResults
+    from ..scene.assets import Skeleton
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    verb.add_argument("--stage", type=Path, action="append", required=True,
+                      help="USD file with the character (repeatable: one for each body of a family)")  # fmt: skip
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     verb.add_argument("--index", type=Path, metavar="JSON",
@@ -60,29 +66,42 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Evaluate; return 0."""
     from ..quality.evaluation.asked import EvaluationOptions
+    from ..quality.evaluation.bodies import worst_bodies
     from ..quality.evaluation.tables import tables
 
     if options.output:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
-        shared.check_output(options.output, *options.models, options.index)
+        shared.check_output(options.output, *options.models, *options.stage, options.index)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
     results = evaluated(options, asked, partial(open_model, options, report), report)
+    rows = [row for _, row in results.rows]
+    worst = worst_bodies(rows)
     if not options.json:
-        print(tables([row for _, row in results.rows]))
-    report(Result("evaluate", {"figures": results.figures} if options.json else {}))
+        print(tables(rows))
+    told: dict[str, object] = {f"worst body, {one.place}": one.words for one in worst}
+    if options.json:
+        told = {"figures": results.figures, **({"worst bodies": [asdict(one) for one in worst]} if worst else {})}
+    report(Result("evaluate", told))
     return EXIT_OK
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedModel:
-    """A model to evaluate: its file, the name of its method, and what returns that method over takes."""
+    """A model to evaluate, on one body.
+
+    Attributes:
+        file: as a model for that body.
+        name: of its method; `on` returns that over takes.
+        base: the skeleton of the first body of its family, and by how much this one is taller; None for one body.
+    """
 
     path: Path
     file: ModelFile
     name: str
     on: Callable[[TakeSet], Method]
+    base: tuple[Skeleton, float] | None = None
 
     @property
     def garment(self) -> tuple[object, ...]:
@@ -95,12 +114,14 @@ class OpenedModel:
         return self.file.scene.garment.mesh.path.rpartition("/")[2]
 
 
-Opener = Callable[[Path, "torch.device"], OpenedModel]
-"""Opens a file on a device."""
+Opener = Callable[[Path, Path, "torch.device"], OpenedModel]
+"""Opens a file for the body of a stage, on a device."""
 
 
-def open_model(options: argparse.Namespace, report: Reporter, path: Path, device: torch.device) -> OpenedModel:
-    """Open a model of 'ssilk train' for the body of the stage.
+def open_model(
+    options: argparse.Namespace, report: Reporter, path: Path, stage: Path, device: torch.device
+) -> OpenedModel:
+    """Open a model of 'ssilk train' for the body of a stage.
 
     Raises:
         SsilkError: the model cannot be read, or does not dress the character.
@@ -111,11 +132,15 @@ def open_model(options: argparse.Namespace, report: Reporter, path: Path, device
     from ..network.checkpoint import load_model, network
     from ..quality.evaluation.methods import Network
 
-    on = worn(load_model(path), open_stage(options.stage), options.root)
+    whole = load_model(path)
+    on = worn(whole, open_stage(stage), options.root)
     for event in on.told:
         report(event)
-    file = on.file
-    return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)))
+    file, base = on.file, None
+    if whole.bodies and on.body:
+        bodies = whole.bodies.family.bodies
+        base = whole.scene.character.skeleton, float(bodies.taller @ on.body[: bodies.size])
+    return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)), base)
 
 
 def evaluated(
@@ -132,12 +157,14 @@ def evaluated(
 
     need_predicates()
     device = select_device(options.device)
-    opened, listed = [opener(path, device) for path in options.models], _listed(options)
-    results = _results(options, asked, opened, listed)
+    bodies, listed = _bodies(options.stage), _listed(options)
+    opened = {body: [opener(path, stage, device) for path in options.models] for body, stage in bodies.items()}
+    results = _results(options, asked, [one for each in opened.values() for one in each], listed)
     known = results.known(report)
-    for number, models in enumerate(_by_garment(opened)):
-        dressed, methods = _dressed(models[0].file, options, device, exact), _methods(models)
-        playlist = _playlist(options, dressed, listed)
+    groups = [(body, models) for body, each in opened.items() for models in _by_garment(each)]
+    for number, (body, models) in enumerate(groups):
+        dressed, methods = _dressed(models[0].file, bodies[body], body, options, device, exact), _methods(models)
+        playlist = _playlist(options, dressed, listed, models[0].base, report)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
         try:
@@ -149,6 +176,22 @@ def evaluated(
             raise
     results.finish()
     return results
+
+
+def _bodies(stages: Sequence[Path]) -> dict[str, Path]:
+    """Return the stages of bodies by their names, that of one alone by none.
+
+    Raises:
+        SsilkError: two have one name.
+    """
+    if len(stages) == 1:
+        return {"": stages[0]}
+    found: dict[str, Path] = {}
+    for stage in stages:
+        if stage.stem in found:
+            fail(str(stage), f"a second body '{stage.stem}'", "names of stages tell bodies apart", "rename one")
+        found[stage.stem] = stage
+    return found
 
 
 def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
@@ -173,15 +216,17 @@ def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
     ]
 
 
-def _dressed(file: ModelFile, options: argparse.Namespace, device: torch.device, exact: bool) -> EvaluationScene:
-    """Put the garment of a model on the character of the stage."""
+def _dressed(
+    file: ModelFile, stage: Path, body: str, options: argparse.Namespace, device: torch.device, exact: bool
+) -> EvaluationScene:
+    """Put the garment of a model on the character of a stage."""
     from ssilk_usd.opening.stage import open_stage
 
     from ..delivery.bake import worn
     from ..quality.evaluation.methods import EvaluationScene
 
-    scene = worn(file, open_stage(options.stage), options.root).scene
-    return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact)
+    scene = worn(file, open_stage(stage), options.root).scene
+    return EvaluationScene(scene, file.fabric, file.config.fps, device, exact=exact, character=body)
 
 
 @dataclass(frozen=True)
@@ -193,20 +238,39 @@ class ListedClips:
     seen: list[Path]
 
 
-def _playlist(options: argparse.Namespace, dressed: EvaluationScene, listed: ListedClips) -> EvaluationClips:
-    """Read the clips that options name, and find the simulator's shots of them."""
+def _playlist(
+    options: argparse.Namespace,
+    dressed: EvaluationScene,
+    listed: ListedClips,
+    base: tuple[Skeleton, float] | None,
+    report: Reporter,
+) -> EvaluationClips:
+    """Read the clips that options name, and find the simulator's shots of them.
+
+    Args:
+        base: as `OpenedModel` has it.
+    """
     from ssilk_usd.reading.motion import read_motion, read_motions
 
     from ..quality.evaluation.asked import EvaluationClips
+    from ..quality.evaluation.bodies import on_body
+    from ..scene.family import has_bones
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
     reference = None
     if options.reference:
-        vertices = dressed.scene.garment.mesh.vertex_count
-        reference = References(options.reference, dressed.name, vertices, dressed.fps)
+        vertices, folder = dressed.scene.garment.mesh.vertex_count, options.reference / dressed.character
+        reference = References(folder, dressed.prim, vertices, dressed.fps)
+    clips = {name: read_motion(path, skeleton) for name, path in listed.files.items()}
+    if base and (moved := [name for name, motion in clips.items() if has_bones(motion, base[0])]):
+        clips |= {name: on_body(clips[name], *base, skeleton) for name in moved}
+        text = (
+            f"{len(moved)} of {len(clips)} clips have the bones of the model's first body, and are played on its own"
+        )
+        report(Message(f"{dressed.scene.character.path}: {text}"))
     return EvaluationClips(
-        clips={name: read_motion(path, skeleton) for name, path in listed.files.items()},
+        clips=clips,
         splits=listed.splits,
         simulated=reference.clips & listed.files.keys() if reference else frozenset(),
         read=reference.read if reference else None,
@@ -253,20 +317,27 @@ def _results(
         return EvaluationResults(None, {}, {})
     inputs = measured_inputs(
         models=options.models,
-        stage=options.stage,
+        stage=options.stage[0],
         clips=listed.files,
         device=options.device,
-        others={"motions of the training": listed.seen},
+        others={
+            "motions of the training": listed.seen,
+            **({"further bodies": options.stage[1:]} if options.stage[1:] else {}),
+        },
     )
     garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
-    simulated = {name: shots(options.reference, name) for name in garments}
+    simulated = {
+        f"{body}/{name}" if body else name: shots(options.reference / body, name)
+        for body in _bodies(options.stage)
+        for name in garments
+    }
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}
     return EvaluationResults(
         options.output,
         {
             "units": "SI",
             "models": {str(path): digest for path, (_, digest) in zip(options.models, inputs["models"])},
-            "stage": {str(options.stage): sha256(options.stage)},
+            "stage": {str(stage): sha256(stage) for stage in options.stage},
             "reference": options.reference and str(options.reference),
             "options": settings,
             "hardware": inputs["hardware"],

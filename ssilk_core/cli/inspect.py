@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,15 +83,26 @@ def _inspect(options: argparse.Namespace, report: Reporter) -> Inspected:
     """Inspect a garment, or the repaired copy of it that is written first where one is asked for."""
     from ..authoring.preflight.inspection import inspect
 
-    inputs, repaired = _read_inputs(options, report), None
+    inputs, repaired = _read(options, report), None
     if options.fix:
         repaired = _fix(options, inputs)
-        inputs = _read_inputs(_moved(options, options.fix), silent)
+        inputs = _read(_moved(options, options.fix), silent)
     return Inspected([*inspect(inputs), *_on_family(options, inputs, report)], repaired)
 
 
-def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
+def _read(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected."""
+    from ssilk_usd.opening.trial import tried
+
+    plain = argparse.Namespace(**{name: value for name, value in vars(options).items() if name != "parser"})
+    with tried(_read_inputs, plain, silent) as ending:  # one process for all files, which most are whole
+        inputs = None if ending else _read_inputs(options, report)
+    inputs = inputs or _read_inputs(options, report)  # else one for each, to name the one that is not
+    return replace(inputs, preset=preset_named(options.preset or _default_preset()))
+
+
+def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
+    """Read everything that is inspected, with the preset "draft" where none is asked for."""
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
@@ -102,7 +114,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
-        preset=preset_named(options.preset or _default_preset()), unread=unread,
+        preset=preset_named(options.preset or "draft"), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
         inner=_inner(options, character),
     )  # fmt: skip
@@ -210,7 +222,7 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
     with replacing(options.fix) as half_done:
         # Units first: everything else is measured in them.
         write_with_units(file, half_done, units)
-        inputs = _read_inputs(_moved(options, half_done), silent)
+        inputs = _read(_moved(options, half_done), silent)
         repair = plan_repair(
             inputs.character,
             inputs.garment,

@@ -30,7 +30,7 @@ from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
-from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, surface_message
+from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 
 if TYPE_CHECKING:
@@ -118,6 +118,8 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
         found = apply_overrides(stated_fabric(garment.surface, report), options.material)
     if garment.classes is not None:
         need_stitch(garment.mesh, garment.classes, found)
+    if garment.mesh.stiffness is not None:
+        report(Message(f"{garment.mesh.path}: {stiffness_words(garment.mesh)}"))
     return found
 
 
@@ -195,6 +197,9 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
                       help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
                            "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip
+    verb.add_argument("--loop", action="store_true",
+                      help="the motion is a cycle: play it until the garment repeats, and write one round whose last "
+                           "frame flows into its first (default: ssilk:loop of the garment in the shot)")  # fmt: skip
     add_world(verb, "with --refine and --quality hero; the network alone feels wind and gravity, and sees colliders "
                     "where it was trained with some")  # fmt: skip
     _add_names(verb)
@@ -333,6 +338,7 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             certify=options.certify,
             hide_covered=options.hide_covered,
             hold=options.hold or 0,
+            loop=options.loop,
             colliders=tuple(options.collider),
             wind=options.wind,
             gusts=options.gusts,

@@ -12,6 +12,7 @@ from ..network.checkpoint import ModelFile, load_model
 from ..scene.assets import Mesh
 
 FOLDER = Path(__file__).with_name("models")
+FAMILY_SUFFIX = "_family"  # of a garment's name, for its model for a family of bodies
 TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here
 
 

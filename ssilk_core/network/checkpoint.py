@@ -139,6 +139,7 @@ def _tensors(model: ModelFile) -> dict[str, Any]:
         "scene.rig.weights": rig.skin.weights,
         "joints": model.joints,
         **({} if mesh.uvs is None else {"scene.mesh.uvs": mesh.uvs}),
+        **({} if mesh.stiffness is None else {"scene.mesh.stiffness": mesh.stiffness}),
         **({} if (sewn := scene.garment.sewn) is None else {"scene.mesh.sewn": sewn}),
         **{f"model.{name}": value for name, value in model.parameters.items()},
         **({} if model.bodies is None else model.bodies.stored().tensors()),
@@ -315,6 +316,7 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.mesh.polygon_counts"],
         tensors["scene.mesh.polygon_indices"],
         tensors.get("scene.mesh.uvs"),
+        tensors.get("scene.mesh.stiffness"),
     )
     rig = ProxyRig(
         paths["rig"],

@@ -25,8 +25,8 @@ import numpy as np
 
 from ..network.checkpoint import ModelFile, save_model
 from ..network.runtime import Playback, Player
-from ..network.runtime.playback import BLOCK, VERTEX_BLOCK
-from ..network.runtime.skinning import Tile
+from ..network.runtime.playback import BLOCK
+from ..network.runtime.skinning import Tile, vertex_block
 from ..network.runtime.stored import StoredPlayer
 from ..scene.assets import Deformer, GarmentPose, Motion, Scene
 
@@ -75,11 +75,11 @@ def stored_time(
 ) -> Time:
     """Measure the time to play a frame of stored poses on the CPU: character, joints, blendshapes, all vertices."""
     player = StoredPlayer(deformer)
-    whole = GarmentPose.joined(poses)
+    whole, size = GarmentPose.joined(poses), vertex_block(deformer.scene.garment.mesh.vertex_count)
 
     def frames(block: range) -> None:
-        for start in range(block.start, block.stop, VERTEX_BLOCK):
-            part = slice(start, min(start + VERTEX_BLOCK, block.stop))
+        for start in range(block.start, block.stop, size):
+            part = slice(start, min(start + size, block.stop))
             player.vertices(motion, whole.part(part))
 
     return _timed(lambda: frames, motion.frame_count, seconds)

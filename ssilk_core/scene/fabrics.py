@@ -6,8 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import NoReturn
 
+import numpy as np
+
 from ..errors import fail, fail_unknown
-from .assets import PLATE_THICKNESS, SurfaceMaterial
+from .assets import PLATE_THICKNESS, Mesh, SurfaceMaterial
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
@@ -207,6 +209,17 @@ def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:
     if any("friction" in name.lower() for name in surface.others):
         text += f"; {FRICTION}"
     return text
+
+
+def stiffness_words(mesh: Mesh) -> str:
+    """Return a sentence without its stop: how much of a garment's mesh is stiffer than its fabric, and softer."""
+    assert mesh.stiffness is not None
+    least, most = float(mesh.stiffness.min()), float(mesh.stiffness.max())
+    count = int(np.count_nonzero(mesh.stiffness != 1))
+    return (
+        f"{count:,} of {mesh.vertex_count:,} vertices have another stiffness than the fabric's, which is multiplied "
+        f"by {least:.3g} to {most:.3g}"
+    )
 
 
 def _fail_without_stiffness(surface: SurfaceMaterial) -> NoReturn:

@@ -26,6 +26,7 @@ from .kinematics import bind_pose, local_transforms
 SAME_DIRECTION = 1e-6  # of the largest principal value, up to which members do not span a direction
 SAME_PLACE = 1e-4  # [m], root mean square, within which a body of a family was not moved as a whole
 SAME_ROTATION = 1e-3  # between entries of bind rotations, as for bakes
+SAME_BONES = 1e-3  # [m]
 STORED_POINTS = 512  # of a body, in model files
 MOST_DIRECTIONS = 64
 STEPS = 2000  # to find the nearest point of a hull; each costs a product with the members
@@ -280,6 +281,13 @@ def turned_joint(base: Skeleton, other: Skeleton) -> tuple[int, float] | None:
     cosine = (np.trace(turned, axis1=-2, axis2=-1) - 1) / 2
     angles = np.degrees(np.arccos(cosine.clip(-1, 1)))
     return int(angles.argmax()), float(angles.max())
+
+
+def has_bones(motion: Motion, skeleton: Skeleton) -> bool:
+    """Return whether the joints of a motion are between the bones of a skeleton, but for what moves it as a whole."""
+    others = np.setdiff1d(np.arange(skeleton.joint_count), skeleton.hub_path)
+    apart = np.abs(motion.translations - bind_pose(skeleton)[1])[:, others]
+    return bool(apart.max(initial=0.0) < SAME_BONES)
 
 
 def motion_on(motion: Motion, base: Skeleton, other: Skeleton, ratio: float) -> Motion:

@@ -83,7 +83,8 @@ class TrainJob:
             )
         need_wearable(self.over, self.scene, self.model.fps)
         if self.over:
-            scene = loosened(self.scene, self.over)
+            keeps = self.base and not self.whole and np.array_equal(self.base.scene.classes, self.scene.classes)
+            scene = self.scene if keeps else loosened(self.scene, self.over)  # a stepper alone has no shapes to learn
             object.__setattr__(self, "loosened", int((scene.classes != self.scene.classes).sum()))
             object.__setattr__(self, "scene", scene)
         if self.base:
@@ -202,16 +203,11 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
         np.array_equal(mine, theirs)
         for mine, theirs in ((own.garment.mesh.faces, mesh.faces), (own.parents, scene.parents))
     )
+    alike = alike and own.garment.mesh.points.shape == mesh.points.shape
     alike = alike and np.allclose(own.bind_transforms, scene.bind_transforms, atol=SAME)
     if alike:
         away = np.linalg.norm(own.garment.mesh.points - mesh.points, axis=1).max(initial=0)
-        changed = own.classes != scene.classes
-        if moved:
-            alike = away <= FARTHEST_MOVED
-            changed &= ~((own.classes == PINNED) & (scene.classes == TIGHT))
-        else:
-            alike = away <= SAME
-        alike = alike and not changed.any()
+        alike = away <= (FARTHEST_MOVED if moved else SAME)
     if not alike:
         fail(
             mesh.path,
@@ -220,12 +216,23 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
             + (f", whose rest points may have moved by {1000 * FARTHEST_MOVED:g} mm" if moved else ""),
             "train anew",
         )
+    changed = own.classes != scene.classes
+    if moved:
+        changed &= ~((own.classes == PINNED) & (scene.classes == TIGHT))
+    if changed.any():
+        fail(
+            mesh.path,
+            f"{int(changed.sum())} vertices of another class than in the given model",
+            "training goes on with the same classes" + (", but that pinned cloth may become tight" if moved else ""),
+            "give --over as it was trained, or train anew",
+        )
 
 
 def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> None:
     """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them."""
     mine, theirs = own.bodies, family.bodies
     alike = mine.members.shape == theirs.members.shape and mine.joints.shape == theirs.joints.shape
+    alike = alike and mine.counts == theirs.counts  # else it may lack points that the model knows
     alike = alike and all(
         np.allclose(here, there, atol=SAME)
         for here, there in (

@@ -6,6 +6,8 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -470,6 +472,34 @@ def test_classes_that_were_changed_since_the_training_are_told(ready, trained, c
     classes[0].value = 2 - classes[0].value
     assert ready.ops.ssilk.bake() == {"FINISHED"}
     assert "as it was trained: classes were changed since" in capfd.readouterr().out
+
+
+def test_cloth_that_training_loosened_over_other_cloth_was_not_changed_since(bpy, monkeypatch):
+    from blender_addon.operators import baking
+
+    skirt = add_mesh(bpy, "Skirt", *tube(6, 3, (0.5, 1.0), (0.1, 0.2)))
+    classes = np.arange(len(skirt.data.vertices)) % 3
+    skirt.data.attributes.new("ssilk:class", "INT", "POINT").data.foreach_set("value", classes.astype(np.int32))
+    loosened = np.where(classes == baking.PINNED, baking.TIGHT, classes)
+    for trained, over, note in (
+        (loosened, {"inner": "0"}, False),
+        (loosened, {}, True),
+        (classes[::-1], {"inner": "0"}, True),
+    ):
+        file = SimpleNamespace(scene=SimpleNamespace(classes=trained), provenance={"over": over})
+        monkeypatch.setattr(baking, "load_model", lambda path, file=file: file)
+        assert bool(baking.reclassed(skirt, Path("outer.safetensors"))) == note
+
+
+@pytest.mark.parametrize(
+    ("last", "words"),
+    [("shows the first one's pose", "last frame"), ("is one before the first", "frame after the last")],
+)
+def test_a_seam_is_told_of_the_frame_that_it_is_at(last, words):
+    from blender_addon.operators.baking import seam
+
+    figures = {"loop: last frame": last, "loop: seam, at most [mm]": 6.04, "loop: seam from rest, at most [mm]": 41.2}
+    assert seam(figures) == f"; the loop's {words} is within 6 mm of its first, 41.2 mm where it starts at rest"
 
 
 def test_another_file_than_a_model_fails_in_one_sentence(ready, trained, folder):

@@ -92,3 +92,35 @@ def test_edits_of_a_held_garment_are_followed(ready, trained):
     stale = shown(ready, trained, range(1, 10))
     ready.ops.ssilk.refresh_live()
     np.testing.assert_allclose(shown(ready, trained, range(1, 10)), stale, atol=1e-4)
+
+
+def cycle(bpy, frames: int = 24) -> None:
+    """Let the hips sway and turn in place, in a cycle whose last frame shows the first one's pose."""
+    hips = bpy.data.objects["Rig"].pose.bones["Hips"]
+    action = bpy.data.actions.new("Cycle")
+    bpy.data.objects["Rig"].animation_data.action = action
+    for frame in range(1, frames + 2):
+        phase = 2 * np.pi * (frame - 1) / frames
+        hips.location = (0.15 * np.sin(phase), 0.0, 0.05 * np.sin(2 * phase))
+        hips.rotation_quaternion = (np.cos(0.3 * np.sin(phase)), 0.0, np.sin(0.3 * np.sin(phase)), 0.0)
+        hips.keyframe_insert("location", frame=frame)
+        hips.keyframe_insert("rotation_quaternion", frame=frame)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, frames + 1
+
+
+def test_a_cycle_is_baked_as_a_loop(ready, trained, capfd):
+    cycle(ready)
+
+    def apart(**options) -> float:
+        activate(ready, trained)
+        assert ready.ops.ssilk.bake(**options) == {"FINISHED"}
+        first, last = shown(ready, trained, [1, 25])
+        return float(np.abs(last - first).max())
+
+    at_rest = apart(pre_roll=0.0)
+    trained.ssilk.loop = True
+    capfd.readouterr()
+    looped = apart()
+    assert looped < 1e-6 < 1e-5 < at_rest  # by as much as this toy remembers of where it started
+    assert "the loop's last frame is within" in capfd.readouterr().out
+    assert "A solver does not come back to its start: switch Loop off" in refused(ready, trained, quality="hero")

@@ -10,12 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from ssilk_usd.reading.character import read_character
 
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.layers import ClothLayers
+from ssilk_core.scene.kinematics import bind_pose
 
 TRAIN = "train rigged.usda --motions clip.usda"
 
@@ -491,3 +493,50 @@ def test_levels_of_quality_are_of_the_garment_on_their_own_body(world):
 def test_several_bodies_go_into_no_file(world, capsys):
     assert run(f"bake family.safetensors --motion clip.usda {BODIES} -o shot.usdc") == 2
     assert "bodies in one file" in capsys.readouterr().err and not Path("shot.usdc").exists()
+
+
+def test_an_evaluation_on_several_bodies_has_rows_of_each_and_tells_the_worst(world, toy, capsys):
+    (world / "clips").mkdir()
+    toy.write_clip(world / "clips" / "brief.usda", frames=6)
+    stages = "--stage rigged.usda --stage taller.usda --stage heavier.usda"
+    asked = "--motions clips --no-probes"
+    assert run(f"evaluate family.safetensors {stages} {asked} -o figures.json") == EXIT_OK
+    told = capsys.readouterr()
+    document = json.loads(Path("figures.json").read_text())
+    rows = {(row["garment"], row["method"]): row["figures"] for row in document["figures"]}
+    bodies = ("rigged", "taller", "heavier")
+    assert rows.keys() == {(f"{body}/Skirt", method) for body in bodies for method in ("LBS", "ssilk")}
+    won = {b: 1 - rows[f"{b}/Skirt", "ssilk"]["total"] / rows[f"{b}/Skirt", "LBS"]["total"] for b in bodies}
+    assert f"worst body, Skirt, ssilk, all: {min(won, key=won.get)}," in told.out + told.err
+    assert "have the bones of the model's first body, and are played on its own" in told.err
+    for body in bodies:  # as on that body alone
+        assert run(f"evaluate family.safetensors --stage {body}.usda {asked} -o one.json") == EXIT_OK
+        alone = {row["method"]: row["figures"] for row in json.loads(Path("one.json").read_text())["figures"]}
+        assert alone == {method: rows[f"{body}/Skirt", method] for method in ("LBS", "ssilk")}
+        Path("one.json").unlink()
+    capsys.readouterr()
+    assert run(f"evaluate family.safetensors {stages} {asked} -o figures.json") == EXIT_OK
+    assert "it is complete" in capsys.readouterr().err
+    assert run(f"evaluate family.safetensors --stage rigged.usda --stage ./rigged.usda {asked}") == 2
+    assert "a second body 'rigged'" in capsys.readouterr().err
+    assert run(f"evaluate model.safetensors {stages} {asked}") == 2
+
+
+def test_clips_that_were_made_for_a_body_are_played_as_they_are(world, toy, capsys):
+    (world / "clips").mkdir()
+    toy.write_clip(world / "clips" / "own.usda", frames=6)
+    clip = Usd.Stage.Open("clips/own.usda")
+    animation = next(prim for prim in clip.Traverse() if prim.IsA(UsdSkel.Animation))
+    bones = bind_pose(read_character(Path("taller.usda")).skeleton)[1].tolist()
+    own = UsdSkel.Animation(animation).GetTranslationsAttr()
+    for time in own.GetTimeSamples() or [Usd.TimeCode.Default()]:
+        values = list(own.Get(time))
+        values[1:] = [Gf.Vec3f(*bone) for bone in bones[1:]]
+        own.Set(values, time)
+    clip.Save()
+    assert run("evaluate family.safetensors --stage taller.usda --motions clips --no-probes") == EXIT_OK
+    assert "played on its own" not in capsys.readouterr().err
+    cases = (("clips/own.usda", "taller", 0), ("clip.usda", "taller", 1), ("clip.usda", "hero", 0))
+    for motion, stage, warned in cases:
+        assert run(f"bake family.safetensors --stage {stage}.usda --motion {motion} -o {stage}_shot.usda") == EXIT_OK
+        assert capsys.readouterr().err.count("retarget it to the bones of this body") == warned

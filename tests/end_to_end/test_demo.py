@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pxr import Gf, Usd, UsdGeom, UsdSkel
 from ssilk_usd.reading.character import read_character
 from ssilk_usd.stages import demo_body_path
 from ssilk_usd.writing.files import write_garment, write_motion
@@ -89,11 +90,15 @@ def rigged(garment: str, folder: Path) -> Scene:
     return load_scene(parser().parse_args(["rig", rig[-1], "-o", "unused"]), silent)
 
 
-@pytest.mark.parametrize("garment", garments.GARMENTS)
-def test_shipped_models_fit_what_the_demo_builds(garment, drafted, tmp_path):
+SHIPPED = (*garments.GARMENTS, demo.FAMILY)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_models_fit_what_the_demo_builds(name, drafted, tmp_path):
     """The garment and its classes; a model keeps its own weights and rig. Settling may move the garment."""
+    garment = name.removesuffix(shipped.FAMILY_SUFFIX)
     folder = drafted[0] if garment == "cape" else tmp_path
-    built, model = rigged(garment, folder), load_model(shipped.shipped_path(garment))
+    built, model = rigged(garment, folder), load_model(shipped.shipped_path(name))
     mine, theirs = model.scene, replace(built, character=replace(built.character, bodies=()))
     np.testing.assert_array_equal(mine.classes, theirs.classes)
     assert mine.garment.mesh.faces.shape == theirs.garment.mesh.faces.shape
@@ -116,7 +121,9 @@ def test_shipped_models_do_what_they_did_when_they_were_packed(garment, tmp_path
 @pytest.mark.parametrize("garment", SHIPPED)
 def test_shipped_models_tell_files_but_no_folders(garment):
     model = load_model(shipped.shipped_path(garment))
-    for name in (*model.provenance["inputs"], *model.provenance["motions"], model.scene.garment.mesh.path):
+    bodies = model.bodies.family.bodies.names if model.bodies else ()
+    paths = (*model.provenance["inputs"], *model.provenance["motions"], model.scene.garment.mesh.path, *bodies)
+    for name in paths:
         assert name and "/" not in name.partition(":/")[0]
 
 
@@ -149,6 +156,35 @@ def test_the_shipped_model_is_filmed_without_any_training(tmp_path, capsys):
         *("wardrobe", "motions", "shot.usdc", "cape_stage.usdc", "lbs.usdc"),
         *("cape_shipped.usdc", "shipped.png", "shipped.mp4"),
     }
+
+
+def first_points(shot: Path) -> dict[str, np.ndarray]:
+    """Points (V, 3) of the meshes of a shot in its first frame, as UsdSkel skins them."""
+    stage, cache, found = Usd.Stage.Open(str(shot)), UsdSkel.Cache(), {}
+    at = Usd.TimeCode(stage.GetStartTimeCode())
+    for prim in stage.Traverse():
+        if prim.IsA(UsdSkel.Root):
+            cache.Populate(UsdSkel.Root(prim), Usd.PrimDefaultPredicate)
+            UsdSkel.BakeSkinning(UsdSkel.Root(prim), Gf.Interval(at.GetValue()))
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Mesh):
+            found[prim.GetName()] = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(at))
+    return found
+
+
+@pytest.mark.usefixtures("brief")
+def test_one_model_is_filmed_on_three_bodies(tmp_path, capsys):
+    assert main(["demo", "--garment", "cape_family", "-o", str(tmp_path)]) == 0
+    said = capsys.readouterr().err
+    commands = typed(said)
+    assert [command[0] for command in commands] == ["bake", "bake", "bake", "view", "view"]
+    assert {command[1] for command in commands[:3]} == {str(shipped.shipped_path("cape_family"))}
+    assert commands[-1][1:4] == [str(tmp_path / f"cape_{name}.usdc") for name in ("neutral", "tall", "heavy")]
+    neutral, tall, heavy = (first_points(tmp_path / f"cape_{name}.usdc") for name in ("neutral", "tall", "heavy"))
+    high = [np.ptp(shot["Mesh"][:, 1]) for shot in (neutral, tall, heavy)]
+    assert high[1] > 1.1 * high[0] and abs(high[2] - high[0]) < 0.1 * high[0]
+    assert all(shot["Mesh"][:, 1].min() == pytest.approx(0, abs=0.03) for shot in (neutral, tall, heavy))
+    assert min(np.abs(shot["Cape"] - neutral["Cape"]).max() for shot in (tall, heavy)) > 0.03
 
 
 def test_the_draft_is_trained_and_filmed_beside_what_ships(drafted):

@@ -2,6 +2,7 @@
 """`ssilk inspect` as its users run it: on files, with exit codes, as text and as JSON, and repairing."""
 
 import json
+from contextvars import ContextVar
 from pathlib import Path
 
 import numpy as np
@@ -307,3 +308,21 @@ def test_rig_settles_what_is_inside_and_nothing_else(tmp_path, capsys):
         moved = np.linalg.norm(np.array(made["points"]) - np.array(own["points"]), axis=1).max()
         assert (moved > 5e-3) == settles == ("moves" in told.out + told.err) and (settles or moved < 1e-6)
         assert np.array_equal(np.array(made["primvars:st"]), np.array(own["primvars:st"]))
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_many_files_are_read_in_one_process_first(tmp_path, capsys, monkeypatch, whole):
+    from ssilk_usd.opening import trial
+
+    clips = [write_clip(tmp_path / f"{number}.usdc", np.zeros(30)) for number in range(3)]
+    arguments = write_hero(tmp_path / "hero.usdc"), "--garment", write_damaged(tmp_path / "tube.usdc")
+    wanted, asked, ending = inspect(capsys, *arguments, "--motion", *clips), [], trial.ending
+
+    def noted(read, *given, **options):
+        asked.append(read.__name__)
+        return "it ends" if read.__name__ == "_read_inputs" and not whole else ending(read, *given, **options)
+
+    monkeypatch.setattr(trial, "_within", ContextVar("_within", default=False))  # as for users (`read_at_once`)
+    monkeypatch.setattr(trial, "ending", noted)
+    assert inspect(capsys, *arguments, "--motion", *clips) == wanted
+    assert asked == ["_read_inputs"] if whole else asked.count("read_motion") == len(clips)

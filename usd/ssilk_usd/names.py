@@ -6,6 +6,7 @@ from __future__ import annotations
 CLASS = "primvars:ssilk:class"
 PIN = "primvars:ssilk:pin"  # 1 where a vertex is to be pinned when classes are found
 LEVEL = "primvars:ssilk:tightness"  # the least tightness at which a vertex is tight, 0 where it is pinned
+STIFFNESS = "primvars:ssilk:stiffness"  # by which the fabric's own is multiplied, 1 where there is none
 GARMENT = "ssilk:garment"
 PROXIES = "ssilk:proxyJoints"
 JOINTS = "skel:joints"
@@ -15,8 +16,9 @@ GEOM_BIND = "primvars:skel:geomBindTransform"
 LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeights", "ssilk:plainJoints")
 # Of a PhysicsScene, in the stage's units of length and its axes: wind and the RMS speed of gusts [1/s], size, seed.
 WIND, GUSTS, GUST_LENGTH, GUST_SEED = "ssilk:wind", "ssilk:gusts", "ssilk:gustLength", "ssilk:gustSeed"
-# Of a garment in a shot: 1 where it moves freely, 0 where it is held to linear blend skinning; frames of each pose.
-FREE, HOLD = "ssilk:free", "ssilk:hold"
+# Of a garment in a shot: 1 where it moves freely, 0 where it is held to linear blend skinning; frames of each pose;
+# whether the shot is a cycle.
+FREE, HOLD, LOOP = "ssilk:free", "ssilk:hold", "ssilk:loop"
 # Of what rides on a garment: the garment's mesh, three vertices of it that carry the rider, whether it is soft.
 RIDES_ON, RIDE_VERTICES, RIDE_SOFT = "ssilk:ridesOn", "ssilk:rideVertices", "ssilk:rideSoft"
 # Of a baked garment: those of its proxy joints that carry riders.

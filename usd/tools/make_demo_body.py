@@ -32,6 +32,7 @@ PHENOTYPES: dict[str, dict[str, float]] = {
     "slight": {"age": 0.45, "height": 0.42, "weight": 0.1, "muscle": 0.3},
     "muscular": {"age": 0.67, "height": 0.4, "gender": 0.1, "muscle": 1.1, "weight": 0.6},
     "man": {"age": 0.7, "height": 0.42, "gender": 0.2, "muscle": 0.6, "weight": 0.8},
+    "young": {"age": 0.55, "gender": 0.4, "height": 0.5, "muscle": 0.5},
     "stout": {"age": 0.65, "height": 0.25, "gender": 0.6, "weight": 1.1},
 }
 TO_Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

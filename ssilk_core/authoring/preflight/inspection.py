@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import SsilkError
 from ...scene.assets import Character, Garment, Mesh, Motion, ProxyRig, Scene
-from ...scene.fabrics import fabric_of_surface, surface_message
+from ...scene.fabrics import fabric_of_surface, stiffness_words, surface_message
 from ...training.settings import Preset
 from ..setup.prepare import prepare_scene
 from . import attachment, cost, fit, motion, pose, units, winding, worn_over
@@ -93,6 +93,8 @@ def _on_mesh(inputs: PreflightInput) -> Findings:
     if surface := inputs.garment.surface:
         told = surface_message(surface, fabric_of_surface(surface))
         yield Finding(severity="info", code="fabric", prim=surface.path, found=told)
+    if mesh.stiffness is not None:
+        yield Finding(severity="info", code="stiffness", prim=mesh.path, found=stiffness_words(mesh))
 
 
 def _on_fit(inputs: PreflightInput) -> Findings:

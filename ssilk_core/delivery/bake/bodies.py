@@ -11,8 +11,8 @@ import numpy as np
 from ...errors import fail
 from ...events import Event, Message
 from ...network.checkpoint import ModelFile
-from ...scene.assets import Character, Scene
-from ...scene.family import BodyPlace, names_of
+from ...scene.assets import Character, Motion, Scene, Skeleton
+from ...scene.family import BodyPlace, has_bones, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
 
 if TYPE_CHECKING:
@@ -90,6 +90,20 @@ def worn_by(file: ModelFile, character: Character, known: Character) -> WornMode
     one = replace(one, scene=replace(one.scene, character=bare))
     told = tuple(_told(place, own))
     return WornModel(one, replace(one.scene, character=own), told, _identity(place, own))
+
+
+def other_bones(path: str, motion: Motion, character: Character, first: Skeleton | None) -> tuple[Event, ...]:
+    """Return a warning where a motion has the bones of the first body of a family, and not those of its character.
+
+    Args:
+        path: of the motion.
+        first: the skeleton of that body; None where the character is the first.
+    """
+    if first is None or has_bones(motion, character.skeleton) or not has_bones(motion, first):
+        return ()
+    found = "its joints are as far apart as those of the first body of the model's family"
+    text = f"{path}: {found}, and {character.path} is drawn between these; retarget it to the bones of this body"
+    return (Message(text, "warning"),)
 
 
 def _need_like(place: BodyPlace, path: str) -> None:

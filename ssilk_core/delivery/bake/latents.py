@@ -19,7 +19,8 @@ def solved(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     if not rollout.request.latent_iterations or rollout.latents is not None:
         return rollout
     roller = rollout.latent_roller(Countdown(rollout.latent_frames(), report))
-    poses = tuple(rollout.network_poses(roller))
+    loop = rollout.in_loop(rollout.loop, roller) if rollout.loop else None
+    poses = (loop.pose,) if loop else tuple(rollout.network_poses(roller))
     found = roller.tally
     summary = LatentSummary(
         iterations=rollout.request.latent_iterations,
@@ -34,4 +35,4 @@ def solved(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     if found.failed:
         text = f"{found.failed} of {found.frames} frames are not solved: no step lowers their energy"
         report(Message(f"{rollout.request.motion}: {text}; they stay where the solver came", "warning"))
-    return replace(rollout, latents=SolvedLatents(poses, summary))
+    return replace(rollout, latents=SolvedLatents(poses, summary, loop))

@@ -16,13 +16,15 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion
+from ...scene.assets import Deformer, Floats, Motion, Skeleton
+from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
-from .bodies import WornModel, worn
+from .bodies import WornModel, other_bones, worn
 from .direction import Direction
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
+from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
 from .request import ALLOWED_FPS, BakeRequest
 from .riders import riders_of
 from .rollout import BakeRollout
@@ -31,6 +33,7 @@ from .world import ShotSurroundings, Sight, asked_world
 if TYPE_CHECKING:
     from pxr import Usd
     from ssilk_usd.opening.garment_api import GarmentRecord
+    from ssilk_usd.reading.direction import SaidDirection
     from ssilk_usd.reading.frame_range import FrameRange
     from ssilk_usd.units import StageUnits
     from ssilk_usd.writing.asset_info import AssetInfo
@@ -38,13 +41,15 @@ if TYPE_CHECKING:
     from ...network.model.network import GarmentModel
 
 VERSION_DIGITS = 12  # of a model's hash, which are its garment's version where none is given
+FREE_TOLERANCE = 0.01  # of ssilk:free, by which its first and last frame may differ in a loop
 LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
 
 
 @dataclass(frozen=True, eq=False)
 class _ReadMotion:
     """A motion as it was read, the shot's samples of it, the same with those before them, how many these are, which
-    frames the shot's are, and at which the character becomes hidden (True) or visible (False)."""
+    frames the shot's are, and at which the character becomes hidden (True) or visible (False); how it repeats, where
+    it is to be a loop."""
 
     source: Motion
     sampled: Motion
@@ -52,6 +57,7 @@ class _ReadMotion:
     lead: int
     frames: FrameRange | None
     hidden: list[tuple[int, bool]]
+    loop: Loop | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +76,7 @@ class LoadedGarment:
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
         body: which of the model's family it lies on (`bodies.WornModel.body`).
+        first: the skeleton of the first body of that family; None where it lies on that one.
     """
 
     request: BakeRequest
@@ -86,6 +93,7 @@ class LoadedGarment:
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
+    first: Skeleton | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -104,6 +112,7 @@ class LoadedGarment:
         around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
+        loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
         kept, reduction = self._cut(source) if request.keep else (self, None)
         provenance = {
             **self.provenance,
@@ -132,8 +141,9 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=self.told,
+            told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
             direction=None if request.lbs else self._directed(request, read),
+            loop=loop,
         )
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
@@ -169,7 +179,47 @@ class LoadedGarment:
             sampled = whole.clip(begun - handles, whole.frame_count)
         hidden = read_hidden(request.motion, sampled, root=root)
         source = shaped(source) if request.latent_iterations else source  # networks do not see it
-        return _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
+        read = _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
+        return self._repeating(request, read) if self._loops(request, source) else read
+
+    def _loops(self, request: BakeRequest, motion: Motion) -> bool:
+        """Return whether a shot is to be a loop; skinning alone repeats by itself."""
+        from ssilk_usd.reading.direction import read_loop
+
+        garment = split_location(self.deformer.scene.garment.mesh.path)[1]
+        asked = request.loop or (garment is not None and read_loop(request.motion, request.stage, garment, motion))
+        if request.lbs or not asked:
+            return False
+        need_alone(request)
+        return True
+
+    def _repeating(self, request: BakeRequest, read: _ReadMotion) -> _ReadMotion:
+        """Return a motion of a shot that repeats, without what comes before it."""
+        scene, shot = self.deformer.scene, read.sampled
+        loop = find_loop(request, read.source, shot, scene.character.skeleton, scene.garment.mesh.diagonal)
+        first = round(shot.start * read.source.fps / shot.fps - read.source.start)
+        source = read.source.clip(first, first + loop.cycle.frames + loop.cycle.closed)
+        return replace(read, source=source, whole=shot, lead=0, loop=loop)
+
+    def _felt_in_loop(
+        self, request: BakeRequest, loop: Loop, around: ShotSurroundings, sight: Sight, source: Motion
+    ) -> Loop:
+        """Return a loop with what the network sees of the world in each of its rounds."""
+        need_constant(request, around.pull, loop.cycle)
+        motion, skeleton = source, self.deformer.scene.character.skeleton
+        if source.proximity is not None:
+            from ...network.proximity import proximity_vectors
+
+            need_same_colliders(request, proximity_vectors(source.proximity), loop.cycle)
+            motion = rounds(replace(source, gravity=None), skeleton, loop.cycle, MOST_ROUNDS + 1)
+        else:
+            motion = loop.motion
+        if sight.pull:
+            from ...physics.world.felt import felt_gravity
+
+            gravity = felt_gravity(around.pull, motion, self.deformer.scene, self.file.fabric)
+            motion = replace(motion, gravity=gravity)
+        return replace(loop, motion=motion)
 
     def _felt(self, around: ShotSurroundings, sight: Sight) -> Motion:
         """Return a motion with the gravity, the wind and the colliders of its shot that the network sees."""
@@ -194,6 +244,8 @@ class LoadedGarment:
         garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
         if garment is not None:  # a model may know its garment by a name alone
             said = read_direction(request.motion, request.stage, garment, read.whole)
+        if read.loop is not None:
+            return self._directed_in_loop(request, read, read.loop, said)
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
@@ -204,6 +256,24 @@ class LoadedGarment:
         first = read.lead + (read.frames.before * samples if read.frames else 0)
         free = np.ones(count) if said.free is None else said.free
         return Direction(free, hold * samples, read.whole, first) if hold > 1 else Direction(free, 1, read.whole, 0)
+
+    def _directed_in_loop(
+        self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection
+    ) -> Direction | None:
+        hold = (request.hold or said.hold) * request.samples_per_frame
+        hold = 1 if hold == request.samples_per_frame else hold
+        if loop.period % hold:
+            found = f"poses that are held for {hold} samples, in a round of {loop.period}"
+            fail(request.motion, found, "they have to begin anew with each round", "give --hold 1, or another range")
+        if said.free is None and hold == 1:
+            return None
+        free = np.ones(read.whole.frame_count) if said.free is None else said.free
+        if loop.cycle.closed and abs(free[-1] - free[0]) > FREE_TOLERANCE:
+            found = f"ssilk:free is {free[0]:g} in the first frame and {free[-1]:g} in the last"
+            fail(request.motion, found, "a loop ends as it begins", "key it so")
+        rate = loop.motion.fps / read.sampled.fps
+        motion = _sampled(loop.motion, read.sampled.fps, np.arange(loop.samples) * rate)
+        return Direction(loop.tiled(free), hold, motion, 0)
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
@@ -227,7 +297,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
-    file, scene = on.file, on.scene
+    first, file, scene = file, on.file, on.scene
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -249,6 +319,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=told,
         body=on.body,
+        first=first.scene.character.skeleton if on.body else None,
     )
 
 

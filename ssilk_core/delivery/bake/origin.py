@@ -23,12 +23,14 @@ def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
     """Return what a shot says of its origin and quality; `recovered` fills while poses are written."""
     refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
     solved = {"solved in latents": rollout.latents.summary.to_metadata()} if rollout.latents else {}
+    loop = {"loop": rollout.loop_summary.to_metadata()} if rollout.loop_summary else {}
     request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
     return {
         **rollout.provenance,
         "request": request,
         "recovered": rollout.recovered,
         **solved,
+        **loop,
         **refined,
         **met_metadata(rollout.around.seen, output),
     }

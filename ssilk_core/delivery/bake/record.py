@@ -20,7 +20,7 @@ from .result import BakeResult
 from .task import OF_ASSET, BakeTask
 
 RECORD = "bake.json"
-OF_FEW = ("sunk", "entered", "certificate")  # what records of shots without it do not name
+OF_FEW = ("sunk", "entered", "certificate", "loop")  # what records of shots without it do not name
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,7 @@ class BakeRequest:
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
             numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
+        loop: whether the motion is a cycle whose last frame is to flow into its first; False for what the stage says.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
         garment, shot: names in a folder of layers; None for those of the model and the motion.
@@ -96,6 +97,7 @@ class BakeRequest:
     gusts: str | None = None
     gravity: str | None = None
     hold: int = 0
+    loop: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
     garment: str | None = None

@@ -202,6 +202,61 @@ class LatentSummary:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class LoopSummary:
+    """How the end of a loop meets its beginning, in the vertices of the garment.
+
+    Attributes:
+        samples: of the shot in a round.
+        closed: whether the last frame shows the pose of the first, else the one before that.
+        rounds: that were played until the written one ended.
+        repeats: whether the garment's state had come to repeat by then.
+        blended_mm: distance between the beginnings of this round and the next, of the vertex that is farthest off in
+            two frames [mm]: what the last frames are blended over.
+        seam_at_rest_mm, seam_mm: distance between the first frame and where the last ones lead, of the vertex that
+            misses it most [mm]: of a round that starts at rest, and of the one that is written.
+        body_mm: likewise, of the character's joints.
+        jump_at_rest, jump: RMS change of the velocity at the seam [m/s], likewise.
+        usual_jump, largest_jump: the same from sample to sample within the round, in the mean and at most.
+        travel_m: how far a round takes the garment [m].
+        turn_degrees: by how much it turns it about the vertical.
+    """
+
+    samples: int
+    closed: bool
+    rounds: int
+    repeats: bool
+    blended_mm: float
+    seam_at_rest_mm: float
+    seam_mm: float
+    body_mm: float
+    jump_at_rest: float
+    jump: float
+    usual_jump: float
+    largest_jump: float
+    travel_m: float
+    turn_degrees: float
+
+    def to_metadata(self) -> dict[str, float | str]:
+        """Return figures of three digits, as a shot stores them and for people."""
+        last = "shows the first one's pose" if self.closed else "is one before the first"
+        figures = {
+            "seam from rest, at most [mm]": self.seam_at_rest_mm,
+            "seam before blending, at most [mm]": self.blended_mm,
+            "seam, at most [mm]": self.seam_mm,
+            "joints miss, at most [mm]": self.body_mm,
+            "velocity jumps from rest [m/s]": self.jump_at_rest,
+            "velocity jumps [m/s]": self.jump,
+            "within the round, mean [m/s]": self.usual_jump,
+            "within the round, at most [m/s]": self.largest_jump,
+            "travels [m]": self.travel_m,
+            "turns [degrees]": self.turn_degrees,
+        }
+        rounded = {name: float(f"{value:.3g}") for name, value in figures.items()}
+        state = "repeats" if self.repeats else "does not repeat"
+        return {"samples": self.samples, "last frame": last, "rounds": self.rounds, "state": state, **rounded}
+
+
 def certified_frames(frames: int, intersecting: int, showing: int, over: Sequence[str] = ()) -> str:
     """Return in words in how many frames triangles intersect others, and covered skin shows.
 
@@ -290,6 +345,7 @@ class BakeResult:
         reduction: what was kept of the model, where less than all.
         refinement: what the solver changed, where it was asked to.
         latent: how well states were solved for in latents, where that was asked for.
+        loop: how its end meets its beginning; None where it is no loop.
         shapes: how the vertices of another simulator became joints and blendshapes; None where nothing was fitted.
         hidden_faces: faces of the bodies that are hidden; None where that was not asked for.
         recovered: frames at which the rollout was lost and the garment was put to rest.
@@ -312,6 +368,7 @@ class BakeResult:
     reduction: SizeReduction | None = None
     refinement: RefinementSummary | None = None
     latent: LatentSummary | None = None
+    loop: LoopSummary | None = None
     shapes: ShotShapes | None = None
     hidden_faces: int | None = None
     recovered: tuple[FrameSpan, ...] = ()
@@ -328,6 +385,7 @@ class BakeResult:
             return {kind: str(self.path), "current": True}
         refined = self.refinement.figures() if self.refinement else {}
         latent = self.latent.to_metadata() if self.latent else {}
+        loop = self.loop.to_metadata() if self.loop else {}
         return {
             kind: str(self.path),
             "frames": self.frames,
@@ -338,6 +396,7 @@ class BakeResult:
             "bytes": self.size_bytes,
             **(self.reduction.to_metadata() if self.reduction else {}),
             **{f"latents: {name}": value for name, value in latent.items()},
+            **{f"loop: {name}": value for name, value in loop.items()},
             **{f"refined: {name}": value for name, value in refined.items()},
             **(self.shapes.to_metadata() if self.shapes else {}),
             **(self.shown_skin.summary("time code") if self.shown_skin else {}),

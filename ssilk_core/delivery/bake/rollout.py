@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,8 +28,9 @@ from ...scene.riders import Rider, RiderJoints
 from ..targets import JointNames
 from .direction import CHUNK, DirectedPoses, Direction
 from .inputs import InputHashes
+from .looped import MOST_ROUNDS, Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
-from .result import CertificateSummary, FrameSpan, LatentSummary, RefinementSummary
+from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
 from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
@@ -59,10 +60,15 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class SolvedLatents:
-    """The poses of states that were solved for in latents, all in memory: 4 MB for 1,000 frames; and how it went."""
+    """The poses of states that were solved for in latents, all in memory: 4 MB for 1,000 frames; and how it went.
+
+    Attributes:
+        loop: the round that they are, where the shot is a loop.
+    """
 
     poses: tuple[GarmentPose, ...]
     summary: LatentSummary
+    loop: LoopedPoses | None = None
 
 
 @dataclass(eq=False)
@@ -112,6 +118,7 @@ class BakeRollout:
         certificate: the frames that `certified` has moved, once it has.
         riders: what rides on the garment; `told` is what was found about them, to be reported.
         direction: where the garment is held; None where it moves freely throughout.
+        loop: how the shot repeats; None where it need not.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
         held_off: RMS distance from linear blend skinning of frames that are held [m], likewise.
@@ -142,6 +149,7 @@ class BakeRollout:
     riders: tuple[Rider, ...] = ()
     told: tuple[Event, ...] = ()
     direction: Direction | None = None
+    loop: Loop | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
 
@@ -182,22 +190,62 @@ class BakeRollout:
             return
         if roller is None and self.request.latent_iterations:
             roller = self.latent_roller()
-        self.recovered.clear()
-        stop = self.lead + self.motion.frame_count
-        if self.direction is not None:
-            directed = DirectedPoses(self.direction, self.deformer, partial(self._rolled, roller=roller))
-            yield from directed.poses(self.lead, stop)
-            self.held_off[:] = directed.off
+        if self.loop is not None:
+            yield self._looped.pose
             return
-        for pose in self._rolled(0, stop, 1, roller):
-            part = pose.part(slice(max(self.lead - pose.start, 0), None))
-            if part.frame_count:
-                yield replace(part, start=part.start - self.lead)
+        self.recovered.clear()
+        yield from self._course(self.lead, self.lead + self.motion.frame_count, roller, self.recovered)
 
-    def _rolled(self, first: int, stop: int, step: int, roller: LatentRoller | None) -> Iterator[GarmentPose]:
+    def _course(
+        self, start: int, stop: int, roller: LatentRoller | None, lost: list[FrameSpan]
+    ) -> Iterator[GarmentPose]:
+        """Yield the poses of samples of `whole`, counted from `start`, and list where the rollout was lost."""
+        rolled = partial(self._rolled, roller=roller, lost=lost, start=start)
+        if self.direction is not None:
+            directed = DirectedPoses(self.direction, self.deformer, rolled)
+            for pose in directed.poses(start, stop):
+                self.held_off[:] = directed.off  # now: a loop may ask for no more
+                yield pose
+            return
+        for pose in rolled(0, stop, 1):
+            part = pose.part(slice(max(start - pose.start, 0), None))
+            if part.frame_count:
+                yield replace(part, start=part.start - start)
+
+    @cached_property
+    def _looped(self) -> LoopedPoses:
+        if self.latents is not None and self.latents.loop is not None:
+            return self.latents.loop
+        assert self.loop is not None
+        return self.in_loop(self.loop, self.latent_roller() if self.request.latent_iterations else None)
+
+    def in_loop(self, loop: Loop, roller: LatentRoller | None) -> LoopedPoses:
+        """Return the round of a loop that repeats best; `roller` as for `network_poses`."""
+        lost, count = list[FrameSpan](), self.motion.frame_count
+        course = self._course(0, loop.samples, roller, lost)
+        found = looped(course, loop, count, self.motion.fps, partial(deform, self.deformer, self.motion))
+        del self.held_off[len(self.held_off) // MOST_ROUNDS :]  # those of one round
+        within = [(span.first - found.begins, span.last - found.begins) for span in lost]
+        spans = [(max(first, 0), min(last, count - 1)) for first, last in within]
+        self.recovered[:] = [FrameSpan(first, last) for first, last in spans if first <= last]
+        return found
+
+    @cached_property
+    def loop_summary(self) -> LoopSummary | None:
+        """How the end of the shot meets its beginning; None where it is no loop."""
+        if self.loop is None or self.model is None:
+            return None
+        found, count = self._looped, self.motion.frame_count
+        rest = np.concatenate([self._network_decoded(found.first.part(slice(0, 3))),
+                               self._network_decoded(found.first.part(slice(count - 2, count)))])  # fmt: skip
+        return summary(found, self.loop, self.vertices(), list(rest), self.motion.fps)
+
+    def _rolled(
+        self, first: int, stop: int, step: int, roller: LatentRoller | None, lost: list[FrameSpan], start: int
+    ) -> Iterator[GarmentPose]:
         """Yield the network's poses at samples of `whole`, first, first + step, ..., below stop; it starts at first.
 
-        In between the motion is seen as straight.
+        In between the motion is seen as straight. Where the rollout is lost is listed, counted from `start`.
         """
         from ...network.rollout import garment_poses
 
@@ -205,7 +253,9 @@ class BakeRollout:
         count, pre_roll = len(range(first, stop, step)), self.request.pre_roll
 
         def note(frames: range) -> None:
-            self._note(range(first + frames[0] * step, min(first + (frames[-1] + 1) * step, stop)))
+            begin, end = first + frames[0] * step, min(first + (frames[-1] + 1) * step, stop) - 1
+            if end >= start:
+                lost.append(FrameSpan(max(begin - start, 0), end - start))
 
         driver, rate = self._driver(first, stop, step), self.motion.fps / step
         for pose in garment_poses(self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller):
@@ -228,19 +278,24 @@ class BakeRollout:
 
         assert self.model is not None
         skeleton = self.deformer.scene.character.skeleton
-        driver = self._driver(0, self.lead + self.motion.frame_count, 1)
+        driver = self._driver(0, self._end, 1)
         return frames_to_solve(driver, skeleton, self.model.config.fps, self.request.pre_roll)
 
     def _driver(self, first: int, stop: int, step: int) -> Motion:
         """Return the motion that is rolled over, from a sample of `whole` on: at its own rate, or in steps."""
-        skeleton, source = self.deformer.scene.character.skeleton, self.source
+        skeleton, source = self.deformer.scene.character.skeleton, self.loop.motion if self.loop else self.source
         at = [self._source_frame(sample - self.lead) for sample in range(first, stop, step)]
         if step == 1:
             driver = _from_fraction(source, skeleton, at[0])
-            return driver if stop == self.lead + self.motion.frame_count else driver.clip(0, int(at[-1] - at[0]) + 2)
+            return driver if stop == self._end else driver.clip(0, int(at[-1] - at[0]) + 2)
         position = held_at_cuts(source, skeleton, np.array(at).clip(0, source.frame_count - 1))
         felt, poses = sample_felt(source, position), sample_motion(source, position)
         return Motion(source.path, self.motion.fps / step, *poses, **felt)
+
+    @property
+    def _end(self) -> int:
+        """Samples of `whole` to roll: those before the shot and its own, or all rounds of a loop."""
+        return self.loop.samples if self.loop else self.lead + self.motion.frame_count
 
     def with_lead(self) -> BakeRollout:
         """Return the rollout of the shot together with the samples before it."""
@@ -254,11 +309,6 @@ class BakeRollout:
         """Return the frame of `source` at a sample of the shot, a fraction where the grids differ."""
         frame = (self.motion.start + sample) * self.source.fps / self.motion.fps - self.source.start
         return float(round(frame)) if abs(frame - round(frame)) < 1e-6 else frame
-
-    def _note(self, frames: range) -> None:
-        first, last = max(frames[0] - self.lead, 0), min(frames[-1] - self.lead, self.motion.frame_count - 1)
-        if first <= last:
-            self.recovered.append(FrameSpan(first, last))
 
     def vertices(self, report: Reporter = silent) -> Iterator[Floats]:
         """Yield the decoder's garment vertices in the world [m], shape (V, 3), of each of the shot's poses."""
@@ -357,6 +407,8 @@ class BakeRollout:
             off = 1000 * float(np.sqrt(np.mean(np.square(self.held_off))))
             text = f"{len(self.held_off)} poses are held or let go; proxies hold the garment within"
             report(Message(f"{self.request.motion}: {text} {off:.2g} mm (RMS) of linear blend skinning"))
+        if self.loop_summary and (words := seam_words(self.loop_summary)):
+            report(Message(f"{self.request.motion}: {words}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
 

@@ -110,6 +110,7 @@ def result_of(
         reduction=rollout.reduction,
         refinement=rollout.refinement.summary if rollout.refinement else None,
         latent=rollout.latents.summary if rollout.latents else None,
+        loop=rollout.loop_summary,
         hidden_faces=None if hidden is None else sum(int(mask.sum()) for mask in hidden.masks),
         recovered=tuple(rollout.recovered),
         shown_skin=counts.shown_skin,

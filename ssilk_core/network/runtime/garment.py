@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,9 @@ from .kinematics import ProxyKinematics
 from .networks import evaluate, layers
 from .skinning import tiles
 from .stepper import NumpyStepper, SoftClamp, SpringStepper, VerletStepper, diverged
+
+if TYPE_CHECKING:
+    from .compiled import SparseSkin
 
 STEPPERS = {"spring_verlet": SpringStepper, "verlet": VerletStepper, "quasi_static": None}  # by scheme
 
@@ -53,6 +57,13 @@ class NumpyGarment:
             points = ClothPoints(file, self.decoder)
             sizes = descriptor_sizes(scene, file.joints, config)
             self.stepper = stepper(config, file.parameters, *sizes, points)
+
+    @cached_property
+    def sparse_skin(self) -> SparseSkin:
+        """The same skin as that of the tiles, for compiled loops; needs numba."""
+        from .compiled import SparseSkin
+
+        return SparseSkin.of(self.tiles)
 
     def deformer(self) -> Deformer:
         """Return the trained garment's skin and shapes, as files and host applications hold them."""

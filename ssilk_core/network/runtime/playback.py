@@ -11,16 +11,17 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ...physics.loops import installed
 from ...scene.assets import Floats, GarmentPose, Motion
 from ...scene.kinematics import resample, split_at_cuts
 from ..sampling import sample_pose
 from .character import character_matrices
 from .garment import NumpyGarment
-from .skinning import skin_garment
+from .skinning import skin_garment, vertex_block
 from .span import DecodedFrames, RolledSpan, roll_span
 
 BLOCK = 64  # frames computed together: a product of matrices takes a third of the time of 64 with vectors
-VERTEX_BLOCK = 16  # frames whose vertices are computed together
+COMPILED_FROM = 8192  # frames of a motion that gain more by compiled loops than it takes to load these, a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +55,13 @@ class Playback:
     def __init__(self, player: NumpyGarment, motion: Motion, block: int, pre_roll: float) -> None:
         self.player, self.motion, self.block, self.pre_roll = player, motion, block, pre_roll
         self.rate = player.file.config.fps / motion.fps
+        self.vertex_block = vertex_block(player.file.scene.garment.mesh.vertex_count)
         self.spans = split_at_cuts(motion, player.skeleton)
         self.firsts = [int(first) for first in np.cumsum([0, *(span.frame_count for span in self.spans[:-1])])]
         fps = motion.fps if self._steps_with_frames else player.file.config.fps
+        self.compiled = motion.frame_count >= COMPILED_FROM and installed()
         self.rolled_spans = [
-            roll_span(player, resample(span, fps, cover=True), block, pre_roll) for span in self.spans
+            roll_span(player, resample(span, fps, cover=True), block, pre_roll, self.compiled) for span in self.spans
         ]
         # Blocks begin at fixed frames, so that rounding does not depend on which frames are requested.
         self._block = lru_cache(2)(self._compute_block)
@@ -99,7 +102,7 @@ class Playback:
     def vertices(self, frame: int) -> Floats:
         """Return the garment's vertices at a frame in world space [m], shape (V, 3)."""
         block, within = self._at(frame)
-        return self._vertices(block.first, within // VERTEX_BLOCK)[within % VERTEX_BLOCK]
+        return self._vertices(block.first, within // self.vertex_block)[within % self.vertex_block]
 
     def poses(self) -> Iterator[GarmentPose]:
         """Yield the poses that a shot stores, one block at a time."""
@@ -136,6 +139,7 @@ class Playback:
 
     def _compute_vertices(self, first: int, part: int) -> Floats:
         """Return vertices (F, V, 3) of a few frames."""
-        block, chosen = self._at(first)[0], slice(part * VERTEX_BLOCK, (part + 1) * VERTEX_BLOCK)
+        block, chosen = self._at(first)[0], slice(part * self.vertex_block, (part + 1) * self.vertex_block)
         activations = block.decoded.activations[:, chosen]
-        return skin_garment(self.player.tiles, activations, block.matrices[..., chosen], block.origins[chosen])
+        given = activations, block.matrices[..., chosen], block.origins[chosen]
+        return self.player.sparse_skin.skin(*given) if self.compiled else skin_garment(self.player.tiles, *given)

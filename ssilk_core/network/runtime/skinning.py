@@ -16,6 +16,12 @@ from ...scene.assets import PINNED, Floats, Ints, Scene
 from .networks import Parameters
 
 TILE = 512  # vertices
+FEWEST, MOST, AT_ONCE = 16, 64, 2**19  # frames that are skinned together, and vertices in all of these
+
+
+def vertex_block(vertices: int) -> int:
+    """Return how many frames of so many vertices are computed together: they share the reading of blendshapes."""
+    return min(max(AT_ONCE // max(vertices, 1), FEWEST), MOST)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,10 +34,12 @@ class RolledSpan:
         motion: the pre-roll, then the span, at the model's rate.
         block: frames that are computed together.
         before: number of pre-roll frames, zero or at least two.
+        compiled: whether latents are rolled in compiled loops.
     """
 
-    def __init__(self, player: NumpyGarment, motion: Motion, block: int, before: int) -> None:
+    def __init__(self, player: NumpyGarment, motion: Motion, block: int, before: int, compiled: bool) -> None:
         self.player, self.motion, self.block, self.before = player, motion, block, before
+        self.compiled = compiled
         self.latents = np.empty((motion.frame_count, player.file.config.latent), dtype=np.float32)
         sees = player.stepper is not None and player.stepper.points.size > 0
         size = len(player.decoder.layers[-1].bias) if sees else 0
@@ -88,7 +90,7 @@ class RolledSpan:
         if player.stepper:
             past = self.latents[done - 2 : done] if done else None
             inputs = player.stepper.prepare(latents, character, past)
-            latents = player.stepper.roll(inputs)
+            latents = player.stepper.roll(inputs, self.compiled)
             if inputs.outputs is not None:
                 self.outputs[done : done + len(latents)] = inputs.outputs
         self.rolled = done + len(latents)
@@ -114,9 +116,9 @@ class RolledSpan:
         return DecodedFrames(*decoder.decode(states))
 
 
-def roll_span(player: NumpyGarment, span: Motion, block: int, pre_roll: float) -> RolledSpan:
+def roll_span(player: NumpyGarment, span: Motion, block: int, pre_roll: float, compiled: bool) -> RolledSpan:
     """Return a span at the model's rate, with `pre_roll` seconds in which the motion approaches its first frame."""
     if not pre_roll:
-        return RolledSpan(player, span, block, 0)
+        return RolledSpan(player, span, block, 0, compiled)
     before = run_up(span, max(pre_roll, HISTORY / span.fps))
-    return RolledSpan(player, span.after(before), block, before.frame_count)
+    return RolledSpan(player, span.after(before), block, before.frame_count, compiled)

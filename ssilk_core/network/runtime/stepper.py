@@ -16,13 +16,17 @@ Of `Verlet`, the first layer of S is linear in zbar, z_{t-1} and m plus what the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from math import sqrt
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ...physics.loops import installed
+from ..feedback import LIMIT
 from ..settings import (
     DISTANCE_SCALE,
     DIVERGENCE_BOUND,
@@ -36,7 +40,7 @@ from ..settings import (
     ModelConfig,
 )
 from .character import CharacterFrames
-from .feedback import BodyCourse, ClothPoints, SeenCloth
+from .feedback import SATURATION, BodyCourse, ClothPoints, SeenCloth
 from .networks import Layer, LayerBuffers, Parameters, as_float32, evaluate, evaluate_tail, layers
 
 MAX_SCALED_OUTPUT = OUTPUT_SCALE * MAX_OUTPUT
@@ -136,6 +140,10 @@ class NumpyStepper(ABC, Generic[Inputs]):
     def _advance(self, inputs: Inputs, start: int) -> None:
         """Compute the latents from frame `start` on, and write them into `inputs`."""
 
+    def _compiled(self) -> Callable[[Inputs, int], None] | None:
+        """Return what does as `_advance` in loops that numba compiles; None where nothing does."""
+        return None
+
     def _given(
         self, rest: NDArray, character: CharacterFrames, before: NDArray | None
     ) -> tuple[NDArray, BodyCourse | None, NDArray | None, int]:
@@ -152,12 +160,17 @@ class NumpyStepper(ABC, Generic[Inputs]):
         history[:2, 1] = before
         return history, course, outputs, 0
 
-    def roll(self, inputs: Inputs) -> NDArray:
-        """Return the latents of all frames (F, latent), written into `inputs` with the outputs of D there."""
+    def roll(self, inputs: Inputs, compiled: bool = False) -> NDArray:
+        """Return the latents of all frames (F, latent), written into `inputs` with the outputs of D there.
+
+        Args:
+            compiled: whether loops that numba compiles take the steps, where there are some for these.
+        """
         z, rest, start = inputs.history[2:, 1], inputs.history[:-2, 0], inputs.first
         self._decode(inputs, slice(0, start))
+        advance = (self._compiled() if compiled else None) or self._advance
         while start < len(z):
-            self._advance(inputs, start)
+            advance(inputs, start)
             bad = diverged(z[start:])
             if not bad.any():
                 break
@@ -270,6 +283,36 @@ class SpringStepper(NumpyStepper[SpringInputs]):
                 np.clip(new, -clamp, clamp, new)
                 if cloth:
                     cloth.keep(new)
+
+    @cached_property
+    def _arrays(self) -> tuple[tuple[Any, ...], ...]:
+        """Spring, limits, weights of S and of D, and the rig of the points, as `compiled.roll_spring` takes them."""
+        from .compiled import matrices, rig_arrays
+
+        config, decoder, hidden = self.config, self.points.decoder, np.ones(self.first.shape[1], np.float32)
+        allowances = (SPRING_ALLOWANCE, config.velocity_allowance, SEEN_ALLOWANCE)
+        clamps = MAX_SCALED_OUTPUT, config.max_latent_step / 2 or np.inf, config.latent_bound or np.inf
+        limits = tuple(np.float32(value) for value in (*clamps, *allowances, SATURATION, LIMIT))
+        first = tuple(each[0] for each in matrices(decoder.layers[:1]))
+        return (
+            (self.beta, self.stiffness), limits, (self.first, hidden, matrices(self.later)),
+            (first, matrices(decoder.layers[1:])), rig_arrays(self.points.rig),
+        )  # fmt: skip
+
+    def _compiled(self) -> Callable[[SpringInputs, int], None] | None:
+        points, decoder = self.points, self.points.decoder
+        usual = points.size and decoder.tanh and decoder.readout is None
+        return self._advance_compiled if usual and installed() else None
+
+    def _advance_compiled(self, inputs: SpringInputs, start: int) -> None:
+        from .compiled import roll_spring
+
+        assert inputs.course is not None and inputs.outputs is not None
+        course = tuple(vars(inputs.course).values())
+        past = np.empty((3, inputs.outputs.shape[1]), np.float32)
+        past[:2] = evaluate(self.points.decoder.layers, inputs.history[start : start + 2, 1].T).T
+        poses = inputs.pose_sums, inputs.output_at_rest, as_float32(inputs.rate_allowance)
+        roll_spring(inputs.history, poses, *self._arrays, course, past, inputs.outputs, start)
 
 
 class VerletStepper(NumpyStepper[StepperInputs]):

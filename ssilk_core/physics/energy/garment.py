@@ -19,7 +19,7 @@ from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
 from .collision import ContactLaw
 from .stitching import Stitching, held_stitches
-from .stretch import column_weights, deformation_gradient_operator, stretch_density, stretched_areas
+from .stretch import column_weights, deformation_gradient_operator, stiffened, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether", "stitch")
 """The paper's terms, and tether and stitches, which its fabric does without.
@@ -193,6 +193,8 @@ def _stiffness_shares(
 def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
     """Return l^2 / (8 (A_1 + A_2)) of each hinge at rest, from the length of its edge and the adjacent areas, (H,).
 
+    It is multiplied by the stiffness of its two triangles, of which each has the mean of its corners.
+
     The derivative of the angle grows with the inverse of a face's height. Heights below edge / `SLIVER` count as
     that, and such hinges are softened, so that no sliver is stiffer than the thinnest regular triangle.
     """
@@ -200,4 +202,5 @@ def _hinge_shapes(mesh: Mesh, hinges: Ints) -> Floats:
     squared = np.sum((x1 - x0) ** 2, axis=1)
     doubled = [np.linalg.norm(np.cross(x1 - x0, tip - x0), axis=1) for tip in (left, right)]
     slim = np.minimum(1.0, SLIVER * np.minimum(*doubled) / np.maximum(squared, np.finfo(float).tiny))
-    return slim**2 * squared / (4 * sum(np.maximum(each, squared / SLIVER) for each in doubled))
+    shapes = slim**2 * squared / (4 * sum(np.maximum(each, squared / SLIVER) for each in doubled))
+    return stiffened(shapes, mesh, hinges[:, [0, 1, 2, 0, 1, 3]])

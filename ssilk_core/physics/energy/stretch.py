@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
-from ...scene.assets import Floats, Mesh
+from ...scene.assets import Floats, Ints, Mesh
 from ...scene.fabrics import Fabric
 from ...scene.mesh.topology import NO_AREA, SLIVER
 from ..operators import SparseOperator
@@ -56,9 +56,19 @@ def stretched_areas(mesh: Mesh) -> Floats:
     A vertex displaced by d stretches a triangle of height h by d / h, and StVK takes the fourth power of that: a few
     accidental slivers would outweigh a whole garment. Where h < h_0 = longest edge / `SLIVER`, the area is scaled by
     (h / h_0)^3, so that for equal d the energy is at most that of a triangle of height h_0.
+
+    Stiffer cloth counts as more of it: both stretch models are linear in their stiffness.
     """
     _, areas = rest_frames(mesh)
-    return areas * np.minimum(1.0, SLIVER * 2 * areas / _longest_squared(mesh)) ** 3
+    return stiffened(areas * np.minimum(1.0, SLIVER * 2 * areas / _longest_squared(mesh)) ** 3, mesh, mesh.faces)
+
+
+def stiffened(values: Floats, mesh: Mesh, corners: Ints) -> Floats:
+    """Return energies of elements (E,) with the stiffness of the mesh at their corners (E, C).
+
+    It is linear over each triangle; so an element has the mean of its corners.
+    """
+    return values if mesh.stiffness is None else values * mesh.stiffness[corners].mean(axis=1)
 
 
 def _longest_squared(mesh: Mesh) -> Floats:

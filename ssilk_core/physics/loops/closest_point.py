@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 TRIANGLES = 8  # of a patch; their corners are four rows of a table, the last of them padding
 SAFE = np.float32(1 - 1e-5)  # as in `loops.nearest_vertex`

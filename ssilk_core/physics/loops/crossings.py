@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 # A crossing lies outside of its triangle by at most this many times the tolerance and the rounding error, relative to
 # the triangle's size; segments whose boxes do not reach so far are not looked at.

@@ -18,7 +18,8 @@ from torch.autograd.function import once_differentiable
 
 from ...scene.fabrics import Fabric
 from ..kernels.corners import ElasticTables
-from .running import array, blocks_of, compiled, run_parts
+from .compiling import compiled
+from .running import array, blocks_of, run_parts
 
 LANES = 8  # frames that a loop processes at once, in one vector register
 

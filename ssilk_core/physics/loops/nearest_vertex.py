@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 SAFE = np.float32(1 - 1e-5)  # bounds the relative rounding error of a gap, so that rounding skips no group
 FAR = np.float32(np.inf)

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 TINY = np.float32(1e-30)
 LEAST = np.float32(1e-5)  # [m], for the length that a direction is divided by, as in the reference

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 
 def points_loop(

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from .running import array, blocks_of, compiled, run_parts
+from .compiling import compiled
+from .running import array, blocks_of, run_parts
 
 LANES = 8  # frames that a loop processes at once, in one vector register
 

@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.autograd import Function
 from torch.autograd.function import once_differentiable
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 MIN_LENGTH = np.float32(1e-8)  # floor for the length that a vector is divided by
 

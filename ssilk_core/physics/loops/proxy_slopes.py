@@ -12,7 +12,8 @@ from math import sqrt
 import numpy as np
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 MIN_LENGTH = np.float32(1e-8)  # floor for the length that a vector is divided by
 

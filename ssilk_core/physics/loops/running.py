@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How loops are compiled, and distributed over threads.
+"""How loops are distributed over threads.
 
 Loops release Python's lock, so that ordinary threads run them side by side. numba's own threads are left out: they
 compile three times as long, differ between systems, and do not survive a fork. What a loop writes does not depend on
@@ -15,27 +15,14 @@ from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
-
-# Sums keep their order, and values that are not finite stay so. Compiled code that is kept does not know of these.
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lent: list[int] = []  # threads that PyTorch leaves to loops
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_pools.clear)  # a child has none of the threads
-
-
-def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a loop that numba compiles when it is called; it is kept where numba has a folder to write to."""
-    try:
-        kept: Callable[..., Any] = numba.njit(cache=True, **OPTIONS)(loop)
-    except RuntimeError:  # no folder that this user may write to
-        kept = numba.njit(**OPTIONS)(loop)
-    return kept
 
 
 @contextmanager

@@ -14,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 GROUP = 16  # consecutive triangles with one bounding sphere
 ROUNDING = 1 + 1e-6  # by which spheres are larger than what they hold

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene.fabrics import Fabric
-from .running import array, compiled, run_parts
+from .compiling import compiled
+from .running import array, run_parts
 
 TINY = 1e-18  # as in `simulate.hinges`
 MIN_SQUARED_LENGTH = 1e-12  # as in `simulate.membrane`

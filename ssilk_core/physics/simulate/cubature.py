@@ -158,7 +158,8 @@ def sampled_potential(whole: IncrementalPotential, scene: Scene, cubature: Cubat
         return values.new_zeros(len(vertices), 1).index_add(0, owners, kept)
 
     def part(corners: Ints) -> Mesh:
-        return Mesh(mesh.path, mesh.points[vertices], place[corners])
+        stiffness = None if mesh.stiffness is None else mesh.stiffness[vertices]
+        return Mesh(mesh.path, mesh.points[vertices], place[corners], stiffness=stiffness)
 
     found = copy.copy(whole)
     found.mass, found.tether = lumped(whole.mass), lumped(whole.tether)

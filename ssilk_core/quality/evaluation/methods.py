@@ -73,6 +73,7 @@ class EvaluationScene:
         fps: of every method.
         exact: tight cloth collides with the nearest point of the body beneath it, as in the simulator, rather than
             of the triangles around the nearest vertex, as in training.
+        character: its name, where there are several.
 
     Attributes:
         columns: maps positions to both columns of all deformation gradients.
@@ -80,9 +81,17 @@ class EvaluationScene:
     """
 
     def __init__(
-        self, scene: Scene, fabric: Fabric, fps: float, device: torch.device, *, exact: bool = False
+        self,
+        scene: Scene,
+        fabric: Fabric,
+        fps: float,
+        device: torch.device,
+        *,
+        exact: bool = False,
+        character: str = "",
     ) -> None:
         mesh = scene.garment.mesh
+        self.character = character
         self.scene, self.fabric, self.fps, self.device, self.exact = scene, fabric, fps, device, exact
         sewn = scene.garment.sewn_mesh
         self.energy = GarmentEnergy(sewn, fabric, scene.classes, device=device)
@@ -95,9 +104,14 @@ class EvaluationScene:
         self.weight = float(self.energy.mass.sum()) * GRAVITY * float(np.ptp(mesh.points[:, 1]))
 
     @property
-    def name(self) -> str:
+    def prim(self) -> str:
         """Name of the garment's prim."""
         return self.scene.garment.mesh.path.rpartition("/")[2]
+
+    @property
+    def name(self) -> str:
+        """That name, with the character's in front where there are several: "heavy/Cape"."""
+        return f"{self.character}/{self.prim}" if self.character else self.prim
 
     @cached_property
     def covered(self) -> CoveredSkin:

@@ -13,6 +13,7 @@ from ...errors import fail
 from ...events import Countdown, Message, Reporter, silent
 from ...network.model.network import GarmentModel
 from .asked import EvaluationClips, EvaluationOptions
+from .bodies import LBS, SIMULATOR
 from .closed_loop import closed_loop
 from .figures import ClosedLoop, Figures, ResultRow, SolverErrors
 from .kept_parts import NOTHING_KEPT, KeptParts
@@ -30,8 +31,6 @@ from .probes import joined_loop_drift, joined_minimum_errors, joined_settling
 from .solver_errors import solver_errors, windows_of
 from .takes import Take, takes_of
 from .tally import Tally, figures, pose_novelty, reference_errors
-
-LBS, SIMULATOR = "LBS", "simulator"
 
 
 def evaluate(

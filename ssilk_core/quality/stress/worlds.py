@@ -64,7 +64,8 @@ def add_slivers(scene: Scene, height: float, every: int = 100) -> Scene:
     """
     garment, mesh = scene.garment, scene.garment.mesh
     sewn = None if garment.sewn is None else _with_slivers(garment.sewn, mesh.faces, height, every)
-    thin = Mesh(mesh.path, _with_slivers(mesh.points, mesh.faces, height, every), mesh.faces)
+    places = _with_slivers(mesh.points, mesh.faces, height, every)
+    thin = Mesh(mesh.path, places, mesh.faces, stiffness=mesh.stiffness)
     return replace(scene, garment=replace(garment, mesh=thin, sewn=sewn))
 
 

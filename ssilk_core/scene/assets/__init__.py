@@ -11,7 +11,7 @@ from .body_shape import BodyShape
 from .character import Body, Character
 from .deformer import Deformer, GarmentPose
 from .garment import CLASS_NAMES, LOOSE, PINNED, TIGHT, Garment, classes_at
-from .mesh import Mesh
+from .mesh import SOFTEST, STIFFEST, Mesh
 from .motion import Motion
 from .rig import ProxyRig
 from .scene import Scene
@@ -25,6 +25,8 @@ __all__ = [
     "LOOSE",
     "PINNED",
     "PLATE_THICKNESS",
+    "SOFTEST",
+    "STIFFEST",
     "TIGHT",
     "UP",
     "Air",

@@ -10,6 +10,9 @@ import numpy as np
 from ...errors import fail
 from .arrays import Floats, Ints, assign, frozen, need_finite
 
+SOFTEST, STIFFEST = 0.01, 100.0  # of a fabric's own resistance to stretching and bending
+ROUNDING = 1e-6  # of values that were stored as float32
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -21,6 +24,11 @@ class Mesh:
         faces: triangles, shape (F, 3).
         polygon_counts, polygon_indices: the authored polygons, for writing back; by default the triangles.
         uvs: texture coordinates per polygon corner, shape (len(polygon_indices), 2), or None.
+        stiffness: of cloth at each vertex, by which its fabric's resistance to stretching and to bending is
+            multiplied, shape (V,); None where it is 1 everywhere.
+
+    Raises:
+        SsilkError: a shape or an index does not fit, a value is not finite, or a stiffness is out of range.
     """
 
     path: str
@@ -29,6 +37,7 @@ class Mesh:
     polygon_counts: Ints | None = None
     polygon_indices: Ints | None = None
     uvs: Floats | None = None
+    stiffness: Floats | None = None
 
     def __post_init__(self) -> None:
         assign(self, points=frozen(self.points, np.float64), faces=frozen(self.faces, np.int64))
@@ -38,6 +47,20 @@ class Mesh:
         uvs = None if self.uvs is None else frozen(self.uvs, np.float32)
         assign(self, polygon_counts=frozen(counts, np.int32), polygon_indices=frozen(indices, np.int32), uvs=uvs)
         self._check_polygons(int(np.sum(counts)))
+        if self.stiffness is not None:
+            assign(self, stiffness=self._checked_stiffness(frozen(self.stiffness, np.float64)))
+
+    def _checked_stiffness(self, stiffness: Floats) -> Floats | None:
+        if stiffness.shape != (len(self.points),):
+            found = f"{stiffness.size} values of stiffness for {len(self.points)} points"
+            fail(self.path, found, "primvars:ssilk:stiffness needs one for each point", "paint it again")
+        within = (stiffness >= SOFTEST * (1 - ROUNDING)) & (stiffness <= STIFFEST * (1 + ROUNDING))
+        bad = np.flatnonzero(~within)  # NaN too
+        if len(bad):
+            found = f"a stiffness of {stiffness[bad[0]]:g} at {len(bad)} points, first at point {bad[0]}"
+            allowed = f"{SOFTEST:g} to {STIFFEST:g} times the fabric's are allowed"
+            fail(self.path, found, allowed, "paint less, or choose another fabric")
+        return None if (stiffness == 1).all() else stiffness
 
     def _check_triangles(self) -> None:
         points, faces = self.points, self.faces

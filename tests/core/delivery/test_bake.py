@@ -20,7 +20,7 @@ CHANGED = BakeRequest(
     latent_iterations=2, latent_elements="few", refined_output="points", hide_covered=True,
     keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk",
     range="1001-1100", handles=8, level_of="coat", asset_version="v012", asset_identifier="studio:/cape",
-    colliders=("/Floor", "/Wall"), wind="0,0,5", gusts="2", gravity="0,-3,0", hold=2,
+    colliders=("/Floor", "/Wall"), wind="0,0,5", gusts="2", gravity="0,-3,0", hold=2, loop=True,
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,17 +13,20 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.demo.motions import demo_shot
+from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import model_file, save_model
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import parameter_shapes
 from ssilk_core.network.rollout import decode, garment_poses, roll
-from ssilk_core.network.runtime import Player
+from ssilk_core.network.runtime import Playback, Player
 from ssilk_core.network.runtime.character import character_matrices
 from ssilk_core.network.runtime.decoder import NumpyDecoder
 from ssilk_core.network.runtime.playback import BLOCK
 from ssilk_core.network.runtime.stepper import SoftClamp
 from ssilk_core.network.schemes import SCHEMES
+from ssilk_core.scene.assets import Motion
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.scene.kinematics import deform, resample
 
@@ -275,6 +279,67 @@ def test_what_s_saw_of_each_state_is_what_its_frame_shows(scene, toy_model, moti
     for name, value in zip(("activations", "transforms"), expected):
         shown = np.concatenate([getattr(decoded, name) for decoded in found], axis=-1)
         np.testing.assert_allclose(shown, value, atol=1e-4)
+
+
+@pytest.fixture
+def compiled(monkeypatch) -> Callable[[Player, Motion], tuple[Playback, Playback]]:
+    """What plays a motion with numpy alone, and again in compiled loops, as a longer one."""
+    pytest.importorskip("numba")
+
+    def play(player: Player, motion: Motion) -> tuple[Playback, Playback]:
+        alone = player.play(motion)
+        monkeypatch.setattr("ssilk_core.network.runtime.playback.COMPILED_FROM", motion.frame_count)
+        looped = player.play(motion)
+        assert player.stepper._compiled() and looped.compiled and not alone.compiled
+        return alone, looped
+
+    return play
+
+
+@pytest.mark.parametrize("options", [{}, {"translations": True}, {"proximity_points": 3}])
+@pytest.mark.parametrize("proxies, shuffled", [(2, True), (0, False)])
+def test_compiled_loops_are_what_numpy_is(toy_scene, toy_model, toy_motion, compiled, options, proxies, shuffled):
+    scene = toy_scene(proxies=proxies, shuffled=shuffled)
+    model, motion = toy_model(scene, scale=0.1, **options).eval(), toy_motion(scene, 70)
+    if "proximity_points" in options:  # planes in which points lie
+        near = np.random.default_rng(0).normal(size=(70, model.proximity // 3, 5)) * [1, 1, 1, 0.1, 0.5]
+        motion = replace(motion, proximity=near)
+    alone, looped = compiled(player_of(model), motion)
+    np.testing.assert_allclose(all_vertices(looped), all_vertices(alone), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options", [{"latent_bound": 0.2, "max_latent_step": 0.02}, {"scale": 0.2, "velocity_allowance": 0.0}]
+)
+def test_compiled_loops_are_what_numpy_is_where_limits_are_met(scene, toy_model, motion, compiled, options):
+    model = toy_model(scene, **({"scale": 0.1} | options)).eval()  # as above
+    alone, looped = map(all_vertices, compiled(player_of(model), motion))
+    np.testing.assert_allclose(looped, alone, rtol=0, atol=1e-4)
+
+
+def test_compiled_loops_lose_states_as_numpy_does(scene, toy_model, motion, compiled):
+    model = toy_model(scene, scale=0.1, latent_bound=0.0, max_latent_step=0.0).eval()
+    with torch.no_grad():
+        model.integrator.beta.fill_(1.6)  # flies off
+    alone, looped = (playback.rolled_spans[0].states(FRAMES) for playback in compiled(player_of(model), motion))
+    assert 100 < np.abs(alone).max() < 1000
+    np.testing.assert_allclose(looped, alone, rtol=1e-3, atol=1e-3)
+
+
+def test_integers_of_a_file_stay_integers_in_compiled_loops(compiled):
+    player = Player.load(shipped_path("cape"))
+    alone, looped = compiled(player, demo_shot(player.skeleton).clip(0, FRAMES))
+    # What rounding in another order comes to in a recurrence; PyTorch is as far off (see above).
+    np.testing.assert_allclose(all_vertices(looped), all_vertices(alone), rtol=0, atol=1e-5)
+    assert {weights.dtype for weights in player.stepper._arrays[2][2][0]} == {np.dtype(np.int16)}
+
+
+def test_schemes_without_loops_play_long_motions_with_numpy(scene, toy_model, toy_motion, monkeypatch):
+    monkeypatch.setattr("ssilk_core.network.runtime.playback.COMPILED_FROM", 20)
+    model = toy_model(scene, scale=0.1, scheme="verlet").eval()
+    motion, player = toy_motion(scene, 20), player_of(model)
+    assert player.stepper._compiled() is None
+    np.testing.assert_allclose(all_vertices(player.play(motion)), expected_vertices(model, motion), rtol=0, atol=1e-5)
 
 
 def test_a_motion_of_another_character_is_refused(model, scene, toy_motion):

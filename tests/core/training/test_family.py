@@ -12,12 +12,16 @@ import torch
 from ssilk_core.authoring.bodies.carry import dressed_family
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, model_file, network, save_model
+from ssilk_core.network.descriptors import pose_features
 from ssilk_core.network.model.bodies import SeenBody
 from ssilk_core.network.model.network import GarmentModel
+from ssilk_core.network.proximity import proximity_reach
 from ssilk_core.network.runtime.player import Player
+from ssilk_core.network.runtime.sight import seen_proximity
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody, limb_axes
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.scene.assets import Collider, ShotWorld
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
@@ -26,6 +30,7 @@ from ssilk_core.training.family_bank import build_family_bank
 from ssilk_core.training.inner_garments import InnerModel
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.motion_bank import build_bank
+from ssilk_core.training.obstacles import Obstacles
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step import Stepper
@@ -332,6 +337,13 @@ def test_what_a_family_cannot_go_on_from_is_refused(scene, members, family, mode
     other = dressed_family(scene, BodyFamily.of([members[0], members[2], members[1]]), [members[2], members[1]])[0]
     with pytest.raises(SsilkError, match="another family"):
         family_job(scene, other, motion, path, base=file, whole=True)
+    bodies, last = family.bodies, len(family.bodies.points) - 1
+    fewer = replace(
+        bodies, points=bodies.points[:last], point_moves=bodies.point_moves[:, :last], rows=bodies.rows[:last],
+        counts=(last,),
+    )  # fmt: skip
+    with pytest.raises(SsilkError, match="another family"):
+        family_job(scene, replace(family, bodies=fewer), motion, path, base=file, whole=True)
 
 
 SEEING_COLLIDERS = TrainConfig(batch=64, window=4, static_batch=2, static_fraction=0, collider_fraction=1.0)
@@ -411,3 +423,39 @@ def test_the_best_model_of_a_family_is_that_of_all_its_bodies():
     then = Score({"stretch": 1.5}, 0.0, bodies=(BodyScore("/a", 2.0, 9.0, 0.0),))
     assert then.judged < first.judged and then.total > first.total
     assert Score({"stretch": 1.5}, 0.0).judged == 1.5
+
+
+@torch.no_grad()
+def test_colliders_are_seen_on_a_body_as_in_training(scene, members, family, toy_motion, tmp_path):
+    """A player on a body tells a network what training told it there, although the garment is larger."""
+    motion, row = toy_motion(scene, 40), 1
+    parts, stepper, drawer = colliding_parts(scene, family, motion, tmp_path / "m.safetensors")
+    generator = torch.Generator().manual_seed(1)
+    for value in parts.model.parameters():
+        value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    coordinates = family.bodies.members[row].copy()
+    stepper.bodies.wear(coordinates)
+    file = model_file(parts.model, Fabric("toy"), {}).on_body(coordinates)
+    assert proximity_reach(file.scene) == drawer.reach
+    ratio = 1 + float(family.bodies.taller @ coordinates)
+    its = motion_on(motion, scene.character.skeleton, members[row].skeleton, ratio)
+    frames = torch.arange(motion.frame_count)  # others are made of it
+    down = torch.tensor([0.0, -1.0, 0.0]).expand(len(frames), 3)
+    height = float(drawer._resting(frames, down)[:, 1].min()) - 0.02
+    floor = Obstacles(
+        torch.eye(3).expand(1, len(frames), 3, 3),
+        torch.tensor([0.0, height - 50.0, 0.0]).expand(1, len(frames), 3),
+        torch.full((1, len(frames), 3), 50.0),
+        torch.zeros(1, len(frames)),
+    )
+    told = drawer.seen(drawer.near(floor, frames, down), frames)
+    assert told.abs().max() > 0.1
+    start = motion_transforms(its, scene.character.skeleton.parents)[0, scene.character.skeleton.hub, :3, 3]
+    corners = np.array([[-1.0, 0, -1], [-1, 0, 1], [1, 0, 1], [1, 0, -1]]) * 50 + start + [0, height, 0]
+    faces, whole = np.array([[0, 1, 2], [0, 2, 3]]), np.ones(1, dtype=bool)
+    world = ShotWorld(its.fps, (Collider("floor", faces, corners[None], np.eye(4)[None], whole),))
+    seen = seen_proximity(world, its, Player(file))
+    features = pose_features(
+        replace(its, proximity=seen), file.scene.character.skeleton, parts.model.joints
+    ).proximity
+    np.testing.assert_allclose(features, told, atol=2e-3)

@@ -99,6 +99,15 @@ def test_pinned_cloth_is_tight_where_it_lies_over_cloth_that_moves(asked, inner)
     assert replace(asked, scene=worn, over=[away]).loosened == 0
 
 
+def test_a_stepper_alone_leaves_pinned_what_its_model_has_pinned(asked, scene, toy_model):
+    """It has no shapes for what would become tight; what is tight in the model already becomes so here."""
+    worn = moved(scene, [0, 0, -0.012])
+    for own, count in ((worn, 0), (asked.scene, 5)):
+        base = model_file(toy_model(own), Fabric("toy"), {})
+        found = replace(asked, scene=worn, base=base)
+        assert found.loosened == count and np.array_equal(found.scene.classes, own.classes)
+
+
 def test_inner_garments_see_the_obstacles_that_the_outer_one_meets(asked, scene, toy_model, tmp_path):
     path = tmp_path / "sees.safetensors"
     seeing = toy_model(scene, scale=0.05, proximity_points=3)

@@ -83,6 +83,20 @@ def test_a_model_of_another_garment_is_refused(scene, toy_model, toy_scene, toy_
         job(scene, base, toy_motion(scene, 9))
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_garment_with_another_vertex_in_no_face_is_refused(scene, toy_model, toy_motion, whole):
+    def longer(skin):
+        return replace(skin, indices=skin.indices[rows], weights=skin.weights[rows])
+
+    base, garment = model_file(toy_model(scene), FABRICS["silk"], {}), scene.garment
+    rows = np.append(np.arange(len(scene.classes)), 0)
+    mesh = replace(garment.mesh, points=garment.mesh.points[rows])
+    more = replace(garment, mesh=mesh, classes=scene.classes[rows], skin=garment.skin and longer(garment.skin))
+    other = replace(scene, garment=more, rig=replace(scene.rig, skin=longer(scene.rig.skin)))
+    with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
+        job(other, base, toy_motion(scene, 9), whole=whole)
+
+
 def shifted(scene: Scene, by: float, loosened: int = 0) -> Scene:
     """The garment with every other vertex moved forwards [m], and so many pinned vertices made tight."""
     mesh, classes = scene.garment.mesh, scene.classes.copy()
@@ -96,11 +110,16 @@ def test_a_whole_model_goes_on_where_its_garment_was_settled(scene, toy_model, t
     """Within 10 cm, and with fewer pinned vertices; never the other way round, and never its stepper alone."""
     base = model_file(toy_model(scene), FABRICS["silk"], {})
     assert job(shifted(scene, 0.04, 3), base, toy_motion(scene, 9), whole=True).scene.classes[2] == TIGHT
-    for other, whole in ((shifted(scene, 0.2), True), (shifted(scene, 0.04), False), (shifted(scene, 0, 3), False)):
-        with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
+    another, classes = "another garment, rig or skeleton", "3 vertices of another class"
+    for other, whole, found in (
+        (shifted(scene, 0.2), True, another),
+        (shifted(scene, 0.04), False, another),
+        (shifted(scene, 0, 3), False, classes),
+    ):
+        with pytest.raises(SsilkError, match=found):
             job(other, base, toy_motion(scene, 9), whole=whole)
     base = model_file(toy_model(shifted(scene, 0, 3)), FABRICS["silk"], {})
-    with pytest.raises(SsilkError, match="another garment, rig or skeleton"):
+    with pytest.raises(SsilkError, match=f"{classes}.*give --over as it was trained"):
         job(scene, base, toy_motion(scene, 9), whole=True)
 
 

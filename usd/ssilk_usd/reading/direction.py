@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read how an animator directs a garment: where it is held to linear blend skinning, and how long each pose is held.
+"""Read how an animator directs a garment: where it is held to linear blend skinning, how long each pose is held, and
+whether the shot is a cycle.
 
-Both are attributes of the garment's prim, in the shot or in the character's stage: `ssilk:free`, a number that may be
-keyed, and `ssilk:hold`, a whole number. A shot that plays a clip alone may have an `over` at the garment's path.
+All are attributes of the garment's prim, in the shot or in the character's stage: `ssilk:free`, a number that may be
+keyed, `ssilk:hold`, a whole number, and `ssilk:loop`, a bool. A shot that plays a clip alone may have an `over` at
+the garment's path.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Motion
 from ssilk_core.scene.kinematics import MAX_HOLD
 
-from ..names import FREE, HOLD
+from ..names import FREE, HOLD, LOOP
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, location, open_stage
 from ..opening.times import change_times
 from .mesh import is_garment
@@ -51,14 +53,33 @@ def read_direction(source: str, stage: str, garment: str, motion: Motion) -> Sai
     Raises:
         SsilkError: a value is no number or out of range, or several prims of the shot may be the garment.
     """
-    file, prim = split_location(source)
+    file, _ = split_location(source)
     shot, home = open_stage(file), open_stage(stage)
-    _, placed = find_animation(shot, prim or split_location(motion.path)[1], None)
-    prims = [*_in_shot(shot, garment, placed), *filter(None, [home.GetPrimAtPath(garment)])]
+    prims = _prims(shot, home, source, garment, motion)
     free = next((prim for prim in prims if has_value(prim, FREE)), None)
     hold = next((prim for prim in prims if has_value(prim, HOLD)), None)
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
     return SaidDirection(_free(free, seconds) if free else None, _hold(hold) if hold else 1)
+
+
+@explains_damage
+def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
+    """Return whether a shot is said to be a cycle; arguments and errors as `read_direction`."""
+    file, _ = split_location(source)
+    shot, home = open_stage(file), open_stage(stage)  # prims live as long as these
+    prim = next((prim for prim in _prims(shot, home, source, garment, motion) if has_value(prim, LOOP)), None)
+    if prim is None:
+        return False
+    found = prim.GetAttribute(LOOP).Get()
+    if change_times([prim.GetAttribute(LOOP)]) or not isinstance(found, bool):
+        fail(location(prim), f"{LOOP} is {str(found)[:40]}", "true or false is needed, without time samples")
+    return found
+
+
+def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: str, motion: Motion) -> list[Usd.Prim]:
+    """Return the garment's prims in the shot, then in the character's stage."""
+    _, placed = find_animation(shot, split_location(source)[1] or split_location(motion.path)[1], None)
+    return [*_in_shot(shot, garment, placed), *filter(None, [home.GetPrimAtPath(garment)])]
 
 
 def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd.Prim]:

@@ -12,7 +12,7 @@ from ssilk_core.errors import fail
 from ssilk_core.events import Reporter, silent
 from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
 
-from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, STIFFNESS
 from ..opening.stage import (
     EARLIEST,
     PRIMS,
@@ -74,6 +74,7 @@ def read_garment(
     place = garment_place(prim, skel, skeleton)
     mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
     mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
+    mesh = replace(mesh, stiffness=_per_point(prim, STIFFNESS))
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
     if skel and is_skinned(prim, skel):
         need_skinned(prim)

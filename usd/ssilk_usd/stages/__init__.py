@@ -7,7 +7,7 @@ from pathlib import Path
 
 # The neutral adult, those that garments of a family are trained for as well, and those that training never sees.
 TRAINED_BODIES = ("tall", "heavy", "slight", "muscular")
-DEMO_BODIES = ("", *TRAINED_BODIES, "man", "stout")
+DEMO_BODIES = ("", *TRAINED_BODIES, "man", "young", "stout")
 
 
 def demo_body_path(name: str = "") -> Path:

@@ -29,7 +29,7 @@ from ssilk_core.scene.assets import (
 )
 from ssilk_core.scene.kinematics import local_transforms, sorted_influences, world_transforms
 
-from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, RIDER_JOINTS, RIDES_ON, shape_name
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, RIDER_JOINTS, RIDES_ON, STIFFNESS, shape_name
 from ..opening.garment_api import GarmentRecord, apply_garment_api
 from ..reading.mesh import display_colour
 from ..reading.skin import leaf
@@ -294,7 +294,7 @@ def extent_array(low: Floats, high: Floats) -> Vt.Vec3fArray:
 
 
 def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None) -> None:
-    """Author a garment's vertex classes, what finds them, the joint paths of its proxies, each unless None.
+    """Author a garment's vertex classes, what finds them, its stiffness, the paths of its proxies, each unless None.
 
     Its colour is authored where the prim has none, and that both sides are seen where it says nothing of that.
     """
@@ -308,6 +308,8 @@ def mark_garment(prim: Usd.Prim, garment: Garment, proxies: Sequence[str] | None
         _author_rows(prim, PIN, garment.pins[:, None].astype(np.int32))
     if garment.levels is not None:
         _author_rows(prim, LEVEL, garment.levels[:, None].astype(np.float32))
+    if garment.mesh.stiffness is not None:
+        _author_rows(prim, STIFFNESS, garment.mesh.stiffness[:, None].astype(np.float32))
     if proxies is not None:
         _author_names(prim, PROXIES, proxies)
 

@@ -16,7 +16,7 @@ from ssilk_core.errors import fail
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
-from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL
+from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL, STIFFNESS
 from ..opening.garment_api import apply_garment_api
 from ..opening.stage import (
     PRIMS,
@@ -278,7 +278,7 @@ def _bind_garment(
     Its own joint order holds the names, so that its weights survive joints that are removed or reordered by hand.
     """
     prim, character_joints = mesh.GetPrim(), scene.character.skeleton.joint_names
-    for name in (CLASS, PIN, LEVEL, *SKEL, *LBS_SKIN):
+    for name in (CLASS, PIN, LEVEL, STIFFNESS, *SKEL, *LBS_SKIN):
         prim.RemoveProperty(name)
         prim.RemoveProperty(f"{name}:indices")  # of an indexed primvar
     apply_garment_api(prim)

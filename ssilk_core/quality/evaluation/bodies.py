@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evaluations on several bodies of a family: their motions, and the body that fares worst."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ...scene.assets import Motion, Skeleton
+from ...scene.family import motion_on
+from ...training.verdict import percent, share_below
+from .figures import ResultRow
+
+LBS, SIMULATOR = "LBS", "simulator"
+
+
+def on_body(motion: Motion, base: Skeleton, taller: float, other: Skeleton) -> Motion:
+    """Return a motion of a family's base on another body of it, as training plays it there.
+
+    Args:
+        taller: how much higher than the base's its hub is over the ground, as a share.
+    """
+    return motion_on(motion, base, other, 1 + taller)
+
+
+@dataclass(frozen=True)
+class WorstBody:
+    """The body on which a method wins least over linear blend skinning.
+
+    Attributes:
+        garment, method, split: of the rows that were compared.
+        body: its name.
+        total, lbs: energies there [J].
+    """
+
+    garment: str
+    method: str
+    split: str
+    body: str
+    total: float
+    lbs: float
+
+    @property
+    def place(self) -> str:
+        """What was compared, in words."""
+        return f"{self.garment}, {self.method}, {self.split}"
+
+    @property
+    def words(self) -> str:
+        """How it fares, in words."""
+        share = share_below(self.total, self.lbs)
+        side = "below" if share >= 0 else "above"
+        return f"{self.body}, {self.total:.4g} J, {percent(share)} {side} linear blend skinning"
+
+
+def worst_bodies(rows: Sequence[ResultRow]) -> list[WorstBody]:
+    """Return the worst body of each garment, method and split; none where rows are of one body."""
+    lbs = {(row.garment, row.split): row.figures.total for row in rows if row.method == LBS}
+    found: dict[tuple[str, str, str], WorstBody] = {}
+    for row in rows:
+        body, _, garment = row.garment.rpartition("/")
+        if not body or row.method in (LBS, SIMULATOR):
+            continue
+        key = (garment, row.method, row.split)
+        one = WorstBody(*key, body, row.figures.total, lbs[row.garment, row.split])
+        worst = found.get(key)
+        if worst is None or share_below(one.total, one.lbs) < share_below(worst.total, worst.lbs):
+            found[key] = one
+    return list(found.values())
