@@ -216,9 +216,10 @@ def stiffness_words(mesh: Mesh) -> str:
     assert mesh.stiffness is not None
     least, most = float(mesh.stiffness.min()), float(mesh.stiffness.max())
     count = int(np.count_nonzero(mesh.stiffness != 1))
+    factors = f"{least:.3g}" if least == most else f"{least:.3g} to {most:.3g}"
     return (
         f"{count:,} of {mesh.vertex_count:,} vertices have another stiffness than the fabric's, which is multiplied "
-        f"by {least:.3g} to {most:.3g}"
+        f"by {factors}"
     )
 
 

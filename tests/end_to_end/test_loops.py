@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake
+from ssilk_core.delivery.bake.load import load_rollout
+from ssilk_core.delivery.bake.looped import seam_words
 
 from .test_direction import direct, lively, points_of
 
@@ -110,6 +113,24 @@ def test_a_cycle_without_the_repeated_frame_is_found_and_told(stage):
     found = baked("open.usdc", "open.usda", "--loop")
     assert said("open.usdc")["last frame"] == "is one before the first" and len(found) == ROUND
     np.testing.assert_allclose(found, whole[:-1], atol=2e-3)
+
+
+def test_an_open_round_that_lacks_frames_is_told(stage):
+    write_cycle("open.usda", ROUND)
+    found = bake(
+        BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="open.usda", loop=True), "o.usdc"
+    )
+    assert found.loop is not None and not found.loop.closed and not seam_words(found.loop)
+    assert "20 mm past its beginning" in seam_words(replace(found.loop, body_mm=20.0))
+
+
+def test_a_round_is_told_of_a_shot_with_more_shapes_than_the_network_has(stage):
+    """As a certificate adds them."""
+    request = BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="cycle.usda", loop=True)
+    rollout = load_rollout(request)
+    more = np.concatenate([rollout.deformer.shapes, rollout.deformer.shapes[:1]])
+    larger = replace(rollout, deformer=replace(rollout.deformer, shapes=more))
+    assert larger.loop_summary == rollout.loop_summary
 
 
 @pytest.mark.parametrize(

@@ -52,7 +52,7 @@ def test_the_simulator_has_it_as_another_fabric_has_its_own(stage, capsys):
     stiffen("rigged.usda", np.full(count_of("rigged.usda"), 16.0))
     capsys.readouterr()
     found = simulated("stiff.usdc")
-    assert "another stiffness than the fabric's, which is multiplied by 16 to 16" in capsys.readouterr().err
+    assert "another stiffness than the fabric's, which is multiplied by 16\n" in capsys.readouterr().err
     np.testing.assert_allclose(found, wanted, atol=1e-5)
     assert np.abs(found - plain).max() > 2e-3
 
@@ -79,6 +79,19 @@ def test_rig_model_and_shot_keep_it(stage, capsys):
     shot = Usd.Stage.Open("own.usdc")
     (mesh,) = (prim for prim in shot.Traverse() if prim.GetName() == "Skirt")
     np.testing.assert_array_equal(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("ssilk:stiffness").Get(), values)
+
+
+def test_what_was_painted_after_the_training_is_told(stage, capsys):
+    bake = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "clip.usda", "-o"]
+    assert main([*bake, "plain.usdc"]) == 0 and "stiffness" not in capsys.readouterr().err
+    values = np.ones(count_of("rigged.usda"))
+    values[:5] = 10
+    stiffen("rigged.usda", values)
+    assert main([*bake, "painted.usdc"]) == 0
+    assert (
+        "/Hero/Skirt: its stiffness is painted otherwise than when the garment was trained" in capsys.readouterr().err
+    )
+    np.testing.assert_array_equal(points_of("painted.usdc"), points_of("plain.usdc"))
 
 
 def test_a_model_without_it_has_the_file_that_it_had(stage):

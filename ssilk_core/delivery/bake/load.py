@@ -11,12 +11,12 @@ import numpy as np
 
 from ...devices import select_device
 from ...errors import fail
-from ...events import Event
+from ...events import Event, Message
 from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Motion, Skeleton
+from ...scene.assets import Deformer, Floats, Mesh, Motion, Skeleton
 from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.riders import Rider
@@ -332,9 +332,18 @@ def _on_stage(
 
     stage = open_stage(request.stage)
     on = worn(file, stage, request.root)
-    told: list[Event] = [*on.told]
+    told: list[Event] = [*on.told, *_stiffened(on.scene.garment.mesh, stage)]
     riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event))
     return on, _units(stage, request.receiver), riders, tuple(told)
+
+
+def _stiffened(mesh: Mesh, stage: Usd.Stage) -> list[Event]:
+    """Return a warning where a garment is painted otherwise on a stage than it was when it was trained."""
+    from ssilk_usd.writing.look import stiff_otherwise
+
+    where = stiff_otherwise(mesh, stage)
+    found = "its stiffness is painted otherwise than when the garment was trained, which is what a bake keeps"
+    return [Message(f"{where}: {found}; train it again", "warning")] if where else []
 
 
 def load_rollout(request: BakeRequest) -> BakeRollout:

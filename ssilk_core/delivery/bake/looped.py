@@ -28,6 +28,7 @@ REPEATED = 5e-4  # [m] between the same vertex at the beginnings of two rounds, 
 BLENDED = 0.5  # [s] before the end, at most half of a round
 LARGEST_GAP = 0.03  # of the garment's diagonal, by which a joint may miss where it began
 LARGEST_SEAM = 5.0  # [mm] above which a bake warns
+LARGEST_MISS = 15.0  # [mm] likewise, at the joints of a round without the repeated frame: captured ones miss by 10
 LARGEST_TURN = np.radians(1)  # of a round whose world has a direction
 
 Decode = Callable[[GarmentPose], Floats]
@@ -97,9 +98,10 @@ def need_alone(request: BakeRequest) -> None:
     """Raise `SsilkError` where a loop is asked for together with what it does not go with."""
     name = "--loop" if request.loop else f"{request.motion}: ssilk:loop"
     if request.refine:
-        fail(name, "a loop that is refined", "the solver does not come back to where it began", "leave --refine out")
+        fail(name, "a loop that is refined", "the solver does not come back to where it began",
+             "leave --refine and --quality hero out")  # fmt: skip
     if request.handles:
-        fail(name, "a loop with handles", "its frames before and after are its own", "leave --handles out")
+        fail(name, "a loop with handles", "what comes before and after it is the round itself", "leave --handles out")
     if request.pre_roll:
         fail(name, "a loop with a run-up", "the rounds before are its run-up", "leave --pre-roll out")
 
@@ -276,8 +278,13 @@ def summary(
 
 
 def seam_words(found: LoopSummary) -> str:
-    """Return the words for a seam that shows; empty where none does, or where no frame is shown twice."""
-    if not (found.closed and found.seam_mm > LARGEST_SEAM):
+    """Return the words for a seam that shows; empty where none does."""
+    if not found.closed:
+        if found.body_mm <= LARGEST_MISS:
+            return ""
+        miss = f"the frames at its end lead up to {found.body_mm:.0f} mm past its beginning at the joints"
+        return f"{miss}, and none shows the pose of the first: where the loop skips, add the frames that it lacks"
+    if found.seam_mm <= LARGEST_SEAM:
         return ""
     why = f"the end of the motion misses its beginning by up to {found.body_mm:.0f} mm at the joints"
     return f"the last frame is up to {found.seam_mm:.0f} mm off the first; {why}: close the cycle, and bake it again"

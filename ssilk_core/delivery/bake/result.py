@@ -238,7 +238,7 @@ class LoopSummary:
     turn_degrees: float
 
     def to_metadata(self) -> dict[str, float | str]:
-        """Return figures of three digits, as a shot stores them and for people."""
+        """Return figures of three digits and three decimals, as a shot stores them and for people."""
         last = "shows the first one's pose" if self.closed else "is one before the first"
         figures = {
             "seam from rest, at most [mm]": self.seam_at_rest_mm,
@@ -252,7 +252,8 @@ class LoopSummary:
             "travels [m]": self.travel_m,
             "turns [degrees]": self.turn_degrees,
         }
-        rounded = {name: float(f"{value:.3g}") for name, value in figures.items()}
+        # Files hold single precision: what is smaller than a thousandth is noise.
+        rounded = {name: float(f"{round(value, 3) + 0.0:.3g}") for name, value in figures.items()}
         state = "repeats" if self.repeats else "does not repeat"
         return {"samples": self.samples, "last frame": last, "rounds": self.rounds, "state": state, **rounded}
 

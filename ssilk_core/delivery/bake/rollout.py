@@ -223,7 +223,8 @@ class BakeRollout:
         """Return the round of a loop that repeats best; `roller` as for `network_poses`."""
         lost, count = list[FrameSpan](), self.motion.frame_count
         course = self._course(0, loop.samples, roller, lost)
-        found = looped(course, loop, count, self.motion.fps, partial(deform, self.deformer, self.motion))
+        # The network's decoder: that of the shot may have shapes of a certificate, which these poses lack.
+        found = looped(course, loop, count, self.motion.fps, self._network_decoded)
         del self.held_off[len(self.held_off) // MOST_ROUNDS :]  # those of one round
         within = [(span.first - found.begins, span.last - found.begins) for span in lost]
         spans = [(max(first, 0), min(last, count - 1)) for first, last in within]

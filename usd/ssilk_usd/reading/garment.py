@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Reporter, silent
-from ssilk_core.scene.assets import Floats, Garment, Ints, Skeleton, SkinWeights
+from ssilk_core.scene.assets import Floats, Garment, Ints, Mesh, Skeleton, SkinWeights
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, STIFFNESS
 from ..opening.stage import (
@@ -74,7 +74,7 @@ def read_garment(
     place = garment_place(prim, skel, skeleton)
     mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
     mesh = mesh if place.moves is None else replace(mesh, points=place.moved(mesh.points))
-    mesh = replace(mesh, stiffness=_per_point(prim, STIFFNESS))
+    mesh = with_stiffness(mesh, prim)
     skin = lbs_skin(prim, skel.joints if skel else (), skeleton, report)
     if skel and is_skinned(prim, skel):
         need_skinned(prim)
@@ -89,6 +89,11 @@ def read_garment(
     surface = read_surface(prim, mesh)
     tell_parts(prim, report)
     return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface, display_colour(prim))
+
+
+def with_stiffness(mesh: Mesh, prim: Usd.Prim) -> Mesh:
+    """Return a garment's mesh with the stiffness that is painted on a prim of as many points."""
+    return replace(mesh, stiffness=_per_point(prim, STIFFNESS))
 
 
 def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:

@@ -21,6 +21,7 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Garment, Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
+from ..reading.garment import with_stiffness
 from ..reading.mesh import display_colour, is_garment, kept_faces, polygons
 from ..reading.uv_sets import texture_coordinates
 from .body_faces import face_kind
@@ -72,6 +73,17 @@ def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
     name first.
     """
     return next(_look_sources(mesh, stage), None)
+
+
+def stiff_otherwise(mesh: Mesh, stage: Usd.Stage) -> str | None:
+    """Return where a garment has its look, if another stiffness is painted there than it has; else None."""
+    look = look_source(mesh, stage)
+    if look is None or len(UsdGeom.Mesh(look.prim).GetPointsAttr().Get(EARLIEST) or ()) != mesh.vertex_count:
+        return None
+    own, found = mesh.stiffness, with_stiffness(mesh, look.prim).stiffness
+    none = np.ones(mesh.vertex_count)
+    same = np.allclose(none if found is None else found, none if own is None else own)
+    return None if same else location(look.prim)
 
 
 def as_it_looks(garment: Garment, source: str) -> Garment:
