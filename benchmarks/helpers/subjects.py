@@ -24,10 +24,10 @@ from ssilk_core.network.checkpoint import ModelFile, load_model, network
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.energy import GarmentEnergy
-from ssilk_core.quality.evaluation.bodies import on_body
+from ssilk_core.quality.evaluation.bodies import base_of
 from ssilk_core.quality.evaluation.methods import EvaluationScene
 from ssilk_core.scene.assets import Motion, Scene, Skeleton
-from ssilk_core.scene.family import has_bones
+from ssilk_core.scene.family import has_bones, motion_on
 from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.validation import Validator
 
@@ -36,7 +36,7 @@ from ssilk_core.training.validation import Validator
 class Subject:
     """A trained garment on a whole character; `dressed` holds every body vertex, reachable or not.
 
-    `base` is the skeleton of the first body of a family, and by how much this one is taller; None for that body.
+    `base` is the skeleton of the first body of a family, and this one's ratio of heights; None for that body.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Subject:
         """Return a motion on this body, where it has the bones of the first body of its family."""
         if self.base is None or not has_bones(motion, self.base[0]):
             return motion
-        return on_body(motion, *self.base, self.scene.character.skeleton)
+        return motion_on(motion, self.base[0], self.scene.character.skeleton, self.base[1])
 
     def validator(self, *motions: Motion) -> Validator:
         """Return a validator of this garment that holds whole motions at the model's rate."""
@@ -86,9 +86,7 @@ def open_subject(path: Path, stage: Path, device: str) -> Subject:
     if file.bodies:
         on = worn(file, open_stage(stage), None)
         dressed = EvaluationScene(on.scene, file.fabric, file.config.fps, select_device(device))
-        base, bodies = None, file.bodies.family.bodies
-        if on.body:
-            base = file.scene.character.skeleton, float(bodies.taller @ on.body[: bodies.size])
+        base = base_of(file, on.body)
         return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed, base)
     dressed = dressed_in(file, stage, device)
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)

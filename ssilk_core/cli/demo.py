@@ -210,6 +210,6 @@ def _make_shots(out: Path, report: Reporter) -> None:
     family, base = BodyFamily.of(characters), characters[0].skeleton
     shot = demo_shot(base)
     for caption, character, coordinates in zip(FILMED_BODIES, characters, family.members):
-        moved = motion_on(shot, base, character.skeleton, 1 + float(family.taller @ coordinates))
+        moved = motion_on(shot, base, character.skeleton, family.height_ratio(coordinates))
         write_motion(out / f"shot_{caption}.usdc", moved, character.skeleton)
     report(Message(f"made a shot for each of {len(characters)} bodies"))

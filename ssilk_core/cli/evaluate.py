@@ -94,7 +94,7 @@ class OpenedModel:
     Attributes:
         file: as a model for that body.
         name: of its method; `on` returns that over takes.
-        base: the skeleton of the first body of its family, and by how much this one is taller; None for one body.
+        base: the skeleton of the first body of its family, and this one's ratio of heights; None for one body.
     """
 
     path: Path
@@ -130,17 +130,15 @@ def open_model(
 
     from ..delivery.bake import worn
     from ..network.checkpoint import load_model, network
+    from ..quality.evaluation.bodies import base_of
     from ..quality.evaluation.methods import Network
 
     whole = load_model(path)
     on = worn(whole, open_stage(stage), options.root)
     for event in on.told:
         report(event)
-    file, base = on.file, None
-    if whole.bodies and on.body:
-        bodies = whole.bodies.family.bodies
-        base = whole.scene.character.skeleton, float(bodies.taller @ on.body[: bodies.size])
-    return OpenedModel(path, file, "ssilk", partial(Network, network(file).to(device)), base)
+    build = partial(Network, network(on.file).to(device))
+    return OpenedModel(path, on.file, "ssilk", build, base_of(whole, on.body))
 
 
 def evaluated(
@@ -253,8 +251,7 @@ def _playlist(
     from ssilk_usd.reading.motion import read_motion, read_motions
 
     from ..quality.evaluation.asked import EvaluationClips
-    from ..quality.evaluation.bodies import on_body
-    from ..scene.family import has_bones
+    from ..scene.family import has_bones, motion_on
     from ._reference import References
 
     skeleton = dressed.scene.character.skeleton
@@ -264,7 +261,7 @@ def _playlist(
         reference = References(folder, dressed.prim, vertices, dressed.fps)
     clips = {name: read_motion(path, skeleton) for name, path in listed.files.items()}
     if base and (moved := [name for name, motion in clips.items() if has_bones(motion, base[0])]):
-        clips |= {name: on_body(clips[name], *base, skeleton) for name in moved}
+        clips |= {name: motion_on(clips[name], base[0], skeleton, base[1]) for name in moved}
         text = (
             f"{len(moved)} of {len(clips)} clips have the bones of the model's first body, and are played on its own"
         )

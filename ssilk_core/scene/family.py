@@ -150,6 +150,10 @@ class BodyFamily:
             meshes=tuple(_leaf(mesh.path) for mesh in meshes), counts=tuple(mesh.vertex_count for mesh in meshes),
         )  # fmt: skip
 
+    def height_ratio(self, coordinates: Floats) -> float:
+        """Return the height of a body's hub over its lowest point, relative to the base's; coordinates (K,)."""
+        return 1 + float(self.taller @ coordinates)
+
     def place(self, joints: Floats, points: Floats) -> BodyPlace:
         """Return where a body is in this space.
 

@@ -205,7 +205,7 @@ def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
     for coordinates in bodies.members[1:]:
         other = job.family.scene_at(job.scene, coordinates)
         skeleton = other.character.skeleton
-        ratio = 1 + float(bodies.taller @ coordinates)
+        ratio = bodies.height_ratio(coordinates)
         reach = reachable_body(other, [motion_on(motion, base, skeleton, ratio) for motion in motions])
         vertices, joints = np.union1d(vertices, reach.vertices), np.logical_or(joints, reach.joints)
     return vertices, joints
@@ -224,7 +224,7 @@ def _validated_members(
     for row in chosen:
         coordinates = bodies.members[row]
         scene = job.family.scene_at(job.scene, coordinates)
-        skeleton, ratio = scene.character.skeleton, 1 + float(bodies.taller @ coordinates)
+        skeleton, ratio = scene.character.skeleton, bodies.height_ratio(coordinates)
         motions = [motion_on(motion, base, skeleton, ratio) for motion in job.held_out]
         bank = build_bank(motions, skeleton, joints, job.model.fps, device)
         body = CollisionBody(

@@ -214,6 +214,8 @@ class BakeRollout:
 
     @cached_property
     def _looped(self) -> LoopedPoses:
+        if self.certificate is not None:  # its rounds were rolled before frames were moved
+            return self.certificate.work.base._looped
         if self.latents is not None and self.latents.loop is not None:
             return self.latents.loop
         assert self.loop is not None

@@ -5,22 +5,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from ...scene.assets import Motion, Skeleton
-from ...scene.family import motion_on
+import numpy as np
+
+from ...scene.assets import Skeleton
 from ...training.verdict import percent, share_below
 from .figures import ResultRow
+
+if TYPE_CHECKING:
+    from ...network.checkpoint import ModelFile
 
 LBS, SIMULATOR = "LBS", "simulator"
 
 
-def on_body(motion: Motion, base: Skeleton, taller: float, other: Skeleton) -> Motion:
-    """Return a motion of a family's base on another body of it, as training plays it there.
+def base_of(file: ModelFile, body: Sequence[float] | None) -> tuple[Skeleton, float] | None:
+    """Return what plays motions of a family's base on another body of it (`scene.family.motion_on`), as in training:
+    the base's skeleton, and the body's ratio of heights. None for a model of one body, and for the base.
 
     Args:
-        taller: how much higher than the base's its hub is over the ground, as a share.
+        file: the model for the family.
+        body: which it lies on (`bodies.WornModel.body`).
     """
-    return motion_on(motion, base, other, 1 + taller)
+    if not (file.bodies and body):
+        return None
+    bodies = file.bodies.family.bodies
+    return file.scene.character.skeleton, bodies.height_ratio(np.array(body[: bodies.size]))
 
 
 @dataclass(frozen=True)
