@@ -4,6 +4,7 @@
     python benchmarks/dial.py errors --garment cape --stage character.usdc --motions FOLDER --device cuda
     python benchmarks/dial.py times --garment cape --stage character.usdc --motions FOLDER --device cuda
     OMP_NUM_THREADS=1 python benchmarks/dial.py times --garment cape ... --device cpu --threads 1
+    python benchmarks/dial.py join --garment cape --stage ... --motions FOLDER --parts FILES
     python benchmarks/dial.py picture
 
 Places are the network, as trained and reduced to quality levels, the solver in latents on few elements and on all,
@@ -20,13 +21,15 @@ distances are told, and RMS third differences of positions [m].
 
 Times are those of a frame of one shot: on one processor core of a shot alone, on a GPU of --shots at once, but of
 refinement, whose frames are solved at once instead. Both write the garment's file, which grows by the rows of --batch
-windows; the same command goes on where it was cut off. On an H200 a step of 60 windows took 12 s beside two others.
-`picture` draws what the files of the garments that ship hold.
+windows; the same command goes on where it was cut off. A step of the simulator takes as long as its slowest window:
+on a GPU, `errors --clips CLIP --output PART` of all clips at once, each in a process of its own, are soonest done,
+and `join` makes one file of the parts. `picture` draws what the files of the garments that ship hold.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -50,7 +53,9 @@ from ssilk_core.physics.skin.covered_skin import ShownCounts
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
 from ssilk_core.quality.evaluation.record import frame_energies
+from ssilk_core.quality.kept_rows import UNFINISHED
 from ssilk_core.scene.assets import Motion
+from ssilk_core.scene.plain import from_plain
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
 LOOKS = ("total", "shown", "limbs", "intersecting", "jitter")
@@ -182,6 +187,31 @@ def appearance(bench: DialBench, take: int, frames: range, local: Tensor, x: Ten
     }
 
 
+def joined(options: argparse.Namespace, report: Reporter) -> None:
+    """Write the garment's file with the windows of all parts, in the order of the clips."""
+    bench = DialBench(options, report)
+    clips = [(split, clip) for split, names in bench.splits.items() for clip in names]
+    found: dict[tuple[str, str], DialErrors] = {}
+    parts = {}
+    for path in options.parts:
+        document = json.loads(path.read_text())
+        own = document[bench.kept.inputs_at]
+        if UNFINISHED in document or {**own, "clips": None} != {**bench.kept.inputs, "clips": None}:
+            fail(path, "not finished, or of other inputs", "parts are of one model and its clips", "measure it again")
+        for split, names in own["clips"].items():
+            parts.update({(split, name): (document, names) for name in names})
+    missing = [clip for clip in clips if clip not in parts]
+    if missing or any(names != [clip] for (_, clip), (_, names) in parts.items()):
+        fail("--parts", f"no part of {', '.join(clip for _, clip in missing)} alone", "each clip needs one")
+    for split, clip in clips:
+        document = parts[split, clip][0]
+        for row in (from_plain(DialErrors, each, figures=True) for each in document[bench.kept.rows_at]):
+            at = split, row.place
+            found[at] = row if at not in found else found[at].followed_by(row)
+    bench.rows = list(found.values())
+    bench.write(**{name: document[name] for name in provenance(options) if name in document})
+
+
 def times(options: argparse.Namespace, report: Reporter) -> None:
     """Time the places that the garment's file lacks on this device."""
     bench = DialBench(options, report)
@@ -216,7 +246,7 @@ def timed_shots(bench: DialBench, count: int) -> list[Motion]:
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("what", choices=("errors", "times", "picture"), help="to measure, or to draw")
+    found.add_argument("what", choices=("errors", "join", "times", "picture"), help="to do")
     found.add_argument("--garment", default="cape", help="garment that ships (default cape)")
     found.add_argument("--model", type=Path, metavar="FILE", help="another model, written by 'ssilk train'")
     found.add_argument("--stage", type=Path, default=demo_body_path(),
@@ -236,6 +266,7 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--batch", type=int, default=BATCH,
                        help="windows, about, that the simulator goes on from at once, and that are written together "
                        f"(default {BATCH})")  # fmt: skip
+    found.add_argument("--parts", type=Path, nargs="+", default=[], metavar="FILE", help="of single clips, to join")
     found.add_argument("--shots", type=int, help="that are timed at once (default: 64 on a GPU, 1 on a processor)")
     found.add_argument("--output", type=Path, metavar="FILE",
                        help="figures, or picture (default: in results/, and docs/images/dial.png)")  # fmt: skip
@@ -256,7 +287,7 @@ def main() -> None:
         if options.windows < 1 or min(options.after) < 1:
             found = f"{options.windows} windows, after {options.after} frames"
             fail("windows", found, "at least 1 is needed of each")
-        (errors if options.what == "errors" else times)(options, TextReporter())
+        {"errors": errors, "join": joined, "times": times}[options.what](options, TextReporter())
     except SsilkError as error:
         raise SystemExit(f"error: {error}") from error
 

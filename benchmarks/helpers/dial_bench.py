@@ -50,6 +50,13 @@ class DialErrors:
     intersecting: tuple[float, ...]
     jitter: tuple[float, ...]
 
+    def followed_by(self, other: DialErrors) -> DialErrors:
+        """Return the figures of this place in more windows of its split."""
+        lists = ("velocity", "total", "shown", "limbs", "intersecting", "jitter")
+        told = {name: getattr(self, name) + getattr(other, name) for name in lists}
+        distance = {after: own + other.distance[after] for after, own in self.distance.items()}
+        return replace(self, lost=self.lost + other.lost, distance=distance, **told)
+
 
 @dataclass(frozen=True, kw_only=True)
 class DialTime:
@@ -77,11 +84,14 @@ class DialBench:
         self.options, self.report = options, report
         self.path = options.model or shipped_path(options.garment)
         self.subject: Subject = open_subject(self.path, options.stage, options.device)
-        index = splits_of(read_index(options.index or options.motions / "index.json"), options.clips)
-        self.splits = {name: clips for name, clips in index.items() if name in options.splits}
+        index = read_index(options.index or options.motions / "index.json")
+        self.splits, whole = (
+            {name: clips for name, clips in splits_of(index, chosen).items() if name in options.splits}
+            for chosen in (options.clips, ())
+        )
         if not self.splits:
             fail("clips", f"none of the splits {', '.join(options.splits)} is chosen", "one at least is needed")
-        names = [clip for clips in self.splits.values() for clip in clips]
+        names = [clip for clips in whole.values() for clip in clips]  # networks are reduced for all of them
         self.clips = {name: clip_of(options, name, self.subject) for name in names}
         self.kept = KeptRows(
             path=options.output or RESULTS / f"dial_{self.path.stem}.json",
@@ -104,6 +114,7 @@ class DialBench:
             "windows": self.options.windows,
             "lead": self.options.lead,
             "after": self.options.after,
+            "clips": self.splits,
         }
 
     @cached_property
