@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import fail
 from ..network.checkpoint import ModelFile
 from ..network.settings import PROXIMITY_POINTS, ModelConfig
+from ..physics.energy.stretch import rest_frames
 from ..scene.assets import LOOSE, PINNED, TIGHT, Motion, Scene
 from ..scene.fabrics import Fabric
 from ..scene.family import DressedFamily
@@ -52,7 +53,8 @@ class TrainJob:
             Otherwise its initialiser and decoder stay as they are while a new stepper learns.
         over: trained garments that are worn beneath this one, in some of the windows. What is pinned over cloth that
             moves becomes tight in `scene` (`inner_garments.loosened`).
-        family: bodies to train for, the scene's as the base; None for that one alone.
+        family: bodies to train for, the scene's as the base; None for that one alone. The garment in `scene` says
+            whether it is graded to them.
         loosened: how many vertices become tight.
     """
 
@@ -76,6 +78,9 @@ class TrainJob:
     def __post_init__(self) -> None:
         if self.family:
             self._need_family()
+        elif self.scene.garment.graded:
+            found = "a garment that is graded to bodies, and one body alone"
+            fail(self.scene.garment.mesh.path, found, "a family has two or more", "name further bodies with --family")
         if self.base and self.base.bodies and not self.family:
             found = "training that goes on from a model of a family of bodies, without the family"
             fail(
@@ -136,10 +141,16 @@ class TrainJob:
         for found, there in (
             ("a stepper alone that learns", self.stepper_alone),
             ("garments beneath", bool(self.over)),
+            ("newton_weight for a graded garment", self.scene.garment.graded and self.train.newton_weight > 0),
             (f"descriptors '{self.model.descriptors}'", self.model.descriptors != "relative"),
         ):
             if there:
                 fail(self.scene.garment.mesh.path, f"{found} and a family of bodies", "one of both", "leave one out")
+        assert self.family
+        for name, coordinates in zip(self.family.bodies.names, self.family.bodies.members):
+            if self.scene.garment.graded:
+                mesh = self.family.scene_at(self.scene, coordinates).garment.rest_mesh
+                rest_frames(replace(mesh, path=f"{mesh.path} on {name}"))  # each triangle has an area on each body
 
     @property
     def stepper_alone(self) -> bool:
@@ -187,7 +198,7 @@ class TrainJob:
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
-                **({"family": family_digest(self.family)} if self.family else {}),
+                **({"family": family_digest(self.family, self.scene.garment.graded)} if self.family else {}),
             }
         )
 
