@@ -224,10 +224,10 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
     if base and base.bodies and base.scene.garment.graded != options.graded:
-        was, now = (
-            ("one for all bodies", "graded to each") if options.graded else ("graded to each body", "one for all")
-        )
-        report(Message(f"{trained}: its garment is {was}, and is trained on as {now}", "warning"))
+        was, now = "one garment for all bodies", "graded to each"
+        if not options.graded:
+            was, now = now, was
+        report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}

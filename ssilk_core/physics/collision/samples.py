@@ -82,8 +82,9 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
         weights.append(np.tile(middles, (own.sum(), 1)))
         of.append(np.repeat(np.flatnonzero(own), len(middles)))
         areas.append(np.repeat((area - at_corners)[own] / len(middles), len(middles)))
-    parts = np.concatenate(corners), np.concatenate(weights), np.concatenate(areas), np.concatenate(of)
-    return ContactSamples(mesh.vertex_count, *parts)
+    return ContactSamples(
+        mesh.vertex_count, np.concatenate(corners), np.concatenate(weights), np.concatenate(areas), np.concatenate(of)
+    )
 
 
 class SampledCloth:

@@ -3,9 +3,9 @@
 
 A `GarmentEnergy` is made of the rest shape in numpy, once. Here its numbers are made again on its device, for other
 rest points of the same topology, and copied into the tensors that it has: a captured CUDA graph reads these where
-they were, and nothing waits for the device. They are what a new `GarmentEnergy` has, with two exceptions. Samples stay
-at the places in their triangles that they have on the first body, and stitches between the vertices that they join
-there.
+they were, and nothing waits for the device. They are what a new `GarmentEnergy` has, with two exceptions. Samples
+stay at the places in their triangles that they have on the first body, and stitches between the vertices that they
+join there.
 """
 
 from __future__ import annotations
