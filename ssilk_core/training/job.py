@@ -95,7 +95,8 @@ class TrainJob:
         if self.base:
             _need_same_scene(self.base, self.scene, moved=self.whole)
         if self.base and self.base.bodies and self.family:
-            _need_same_family(self.base.bodies.family, self.family, self.scene.garment.mesh.path)
+            object.__setattr__(self, "family", self.family.along(self.base.bodies.family))
+            _need_same_family(self.base, self.base.bodies.family, self.scene, self.family)
         if self.base and self.whole:
             object.__setattr__(self, "model", self.base.config)
             # P and D are trained.
@@ -239,8 +240,12 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
         )
 
 
-def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> None:
-    """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them."""
+def _need_same_family(base: ModelFile, own: DressedFamily, scene: Scene, family: DressedFamily) -> None:
+    """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them.
+
+    The garment may lie elsewhere on each, as after it was settled.
+    """
+    where = scene.garment.mesh.path
     mine, theirs = own.bodies, family.bodies
     alike = mine.members.shape == theirs.members.shape and mine.joints.shape == theirs.joints.shape
     alike = alike and mine.counts == theirs.counts  # else it may lack points that the model knows
@@ -250,12 +255,18 @@ def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> 
             (mine.members, theirs.members),
             (mine.joint_moves, theirs.joint_moves),
             (mine.point_moves, theirs.point_moves[:, mine.rows]),
-            (own.cloth_moves, family.cloth_moves),
         )
     )
     if not alike:
         found = "another family of bodies than the given model was trained for"
         fail(where, found, "training goes on for the same one", "name the same stages in the same order")
+    for name, at in zip(theirs.names, theirs.members):
+        before, after = own.scene_at(base.scene, at), family.scene_at(scene, at)
+        away = np.linalg.norm(after.garment.mesh.points - before.garment.mesh.points, axis=1).max(initial=0)
+        if away > FARTHEST_MOVED:
+            found = f"its garment lies up to {1000 * away:.0f} mm off where the given model has it on {name}"
+            allowed = f"rest points may have moved by {1000 * FARTHEST_MOVED:g} mm"
+            fail(where, found, allowed, "settle it as it was, or train anew")
 
 
 def _frames(motions: Sequence[Motion]) -> dict[str, list[tuple[float, int, float]]]:
