@@ -195,13 +195,6 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     if not options.preset:
         options.preset = default_preset(device)
         report(Message(f"preset '{options.preset}' is taken, the default on {select_device(device).type}"))
-    if options.graded and not options.family:
-        fail(
-            "--graded",
-            "no --family",
-            "a garment is graded to further bodies",
-            "name them with --family, or leave it out",
-        )
     model, train = configured(options)
     _take_fabric(options, report)
     scene = shared.load_scene(options, report)
@@ -306,8 +299,10 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
     """Return the network and the schedule that the options ask for; check what they ask of the fabric, too.
 
     Raises:
-        SsilkError: a setting that does not exist, or a value that it cannot have.
+        SsilkError: a setting that does not exist, or a value that it cannot have; or --graded without --family.
     """
+    if options.graded and not options.family:
+        fail("--graded", "no --family", "garments are graded to further bodies", "name these, or leave it out")
     preset = preset_named(options.preset or default_preset(options.device))
     shared.asked_fabric(options)
     return _settings(options.settings, preset.model, preset.train)

@@ -235,6 +235,16 @@ class BodyFamily:
         )
         return -np.linalg.lstsq(moves.T, wanted[0], rcond=None)[0][self.size :]
 
+    def nearest_member(self, coordinates: Floats) -> tuple[str, float]:
+        """Return the name of the member whose body is nearest, and how far its points are off on average [m].
+
+        Args:
+            coordinates: of a body, shape (K,).
+        """
+        off = np.tensordot(coordinates - self.members, self.point_moves, 1)
+        away = np.linalg.norm(off, axis=-1).mean(axis=-1)
+        return self.names[int(away.argmin())], float(away.min())
+
     def beyond(self, coordinates: Floats) -> float:
         """Return how far coordinates (K,) are beyond the members, as `BodyPlace.beyond`."""
         apart = float(np.linalg.norm(self.nearest(coordinates) - coordinates))

@@ -126,7 +126,7 @@ def test_live_play_and_bakes_dress_the_body_that_is_there(ready, wearing, folder
     assert np.abs(played - wanted).max() < EXACT
     from blender_addon.panels.playback import live_line
 
-    assert "a body of the model's family, at (" in live_line(wearing)
+    assert "a body of the model's family, that of member_" in live_line(wearing)
     other = decoded_on(ssilk_python, folder, "../" + str(model_of_training(wearing)))
     assert np.abs(played - other).max() > 0.01
 

@@ -132,6 +132,27 @@ def test_a_family_is_learned_and_the_model_file_holds_it(world):
     assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
 
 
+def test_a_garment_is_graded_where_it_is_asked_for(world, toy, capsys):
+    names = ("taller.usda", "heavier.usda")
+    train = f"{TRAIN} --family {' '.join(names)} --graded -o graded.safetensors"
+    assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    told = capsys.readouterr()
+    assert "along 2 directions, and graded to each" in told.out + told.err
+    file, same = load_model("graded.safetensors"), load_model("family.safetensors")
+    assert file.scene.garment.graded and not same.scene.garment.graded
+    assert set(names) <= file.provenance["inputs"].keys()
+    assert [name.partition(":")[0] for name in file.provenance["bodies"]] == ["rigged.usda", *names]
+    assert run("bake graded.safetensors --motion clip.usda --stage heavier.usda --refine 2 -o heavy.usda") == 0
+    assert run("verify heavy.usda") == 0
+    assert run(f"{TRAIN} --graded -o new.safetensors", *toy.training) == 2
+    assert "--graded: no --family" in capsys.readouterr().err
+    onward = f"{TRAIN} --family {' '.join(names)} --start-from graded.safetensors -o onward.safetensors"
+    steps = [word.replace("static_fraction=0.5", "static_fraction=0") for word in toy.training]
+    assert run(onward, *steps) in (EXIT_OK, EXIT_WORSE)
+    told = capsys.readouterr()
+    assert "it was trained as graded to each, and goes on as one garment for all bodies" in told.out + told.err
+
+
 def test_a_training_tells_the_figures_of_each_body_and_the_worst(world, toy, capsys):
     run(f"{TRAIN} --family taller.usda heavier.usda -o new.safetensors", *toy.training)
     told = capsys.readouterr()
@@ -225,13 +246,24 @@ def member_clip(path: str, ratio: float) -> None:
 def test_a_member_is_baked_as_plain_usdskel_with_its_own_body_and_garment(world, capsys):
     assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
     told = capsys.readouterr()
-    assert "a body of the model's family" in told.out + told.err
+    assert "heavier.usda:/Hero: a body of the model's family, that of heavier.usda:/Hero" in told.out + told.err
     assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
     own, its = shown("base.usda", 0), shown("heavy.usda", 0)
     np.testing.assert_allclose(its["Body"], heavier(own["Body"]), atol=1e-4)
     assert run("verify heavy.usda") == 0
     away = np.linalg.norm(its["Skirt"] - own["Skirt"], axis=1)
     assert 0.005 < away.mean() < 0.3
+
+
+def test_a_look_that_no_member_has_is_told_with_what_brings_it(world, capsys):
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o bare.usda") == 0
+    told = capsys.readouterr()
+    assert "'ssilk rig STAGE --onto heavier.usda' writes a stage that has it" in told.out + told.err
+    assert run("rig rigged.usda --onto heavier.usda -o heavier_skirt.usda") == 0
+    capsys.readouterr()
+    assert run("bake family.safetensors --motion clip.usda --stage heavier_skirt.usda -o dressed.usda") == 0
+    told = capsys.readouterr()
+    assert "loses its look" not in told.out + told.err and "that of heavier.usda:/Hero" in told.out + told.err
 
 
 def test_a_taller_body_has_its_garment_higher(world):
@@ -242,9 +274,18 @@ def test_a_taller_body_has_its_garment_higher(world):
     assert its["Skirt"][:, 1].max() == pytest.approx(1.15 * own["Skirt"][:, 1].max(), rel=0.02)
 
 
+def points_of(path: str) -> np.ndarray:
+    stage = Usd.Stage.Open(path)
+    return np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get())
+
+
 def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(world, capsys):
-    write_member(world / "between.usda", lambda points: points * [1.15, 1.05, 1.15])
+    write_member(world / "between.usda", lambda points: points * [1.2, 1.05, 1.2])
+    capsys.readouterr()
     assert run(f"{BAKE} --stage between.usda -o between_shot.usda") == 0
+    told, member = capsys.readouterr(), points_of("heavier.usda")
+    away = 1000 * np.linalg.norm(points_of("between.usda") - member, axis=1).mean()
+    assert f"nearest to heavier.usda:/Hero, whose skin is {away:.0f} mm away on average" in told.out + told.err
     write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
     capsys.readouterr()
     assert run(f"{BAKE} --stage large.usda -o large_shot.usda") == 0
@@ -252,7 +293,8 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
     assert "beyond the bodies of the training" in told.out + told.err
     write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
     assert run(f"{BAKE} --stage huge.usda -o huge_shot.usda") == 2
-    assert "beyond the bodies that the model was trained for" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "beyond the bodies that the model was trained for, nearest to heavier.usda:/Hero" in told
     write_member(world / "bent.usda", lambda points: points + [0.2, 0, 0] * np.sin(4 * points[:, 1:2]))
     assert run(f"{BAKE} --stage bent.usda -o bent_shot.usda") == 2
     assert "from all that the model's family of bodies adds up to" in capsys.readouterr().err
