@@ -105,8 +105,10 @@ class OpenedModel:
 
     @property
     def garment(self) -> tuple[object, ...]:
-        """What models must share to be measured on the same takes: mesh, fabric and rate."""
-        return self.prim, self.file.scene.garment.mesh.points.tobytes(), self.file.fabric, self.file.config.fps
+        """What models must share to be measured on the same takes: mesh, rest shape, fabric and rate."""
+        garment = self.file.scene.garment
+        shape = garment.mesh.points.tobytes(), garment.rest_mesh.points.tobytes()
+        return self.prim, *shape, self.file.fabric, self.file.config.fps
 
     @property
     def prim(self) -> str:
@@ -155,7 +157,7 @@ def evaluated(
 
     need_predicates()
     device = select_device(options.device)
-    bodies, listed = _bodies(options.stage), _listed(options)
+    bodies, listed = shared.bodies(options.stage), _listed(options)
     opened = {body: [opener(path, stage, device) for path in options.models] for body, stage in bodies.items()}
     results = _results(options, asked, [one for each in opened.values() for one in each], listed)
     known = results.known(report)
@@ -174,22 +176,6 @@ def evaluated(
             raise
     results.finish()
     return results
-
-
-def _bodies(stages: Sequence[Path]) -> dict[str, Path]:
-    """Return the stages of bodies by their names, that of one alone by none.
-
-    Raises:
-        SsilkError: two have one name.
-    """
-    if len(stages) == 1:
-        return {"": stages[0]}
-    found: dict[str, Path] = {}
-    for stage in stages:
-        if stage.stem in found:
-            fail(str(stage), f"a second body '{stage.stem}'", "names of stages tell bodies apart", "rename one")
-        found[stage.stem] = stage
-    return found
 
 
 def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
@@ -325,7 +311,7 @@ def _results(
     garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
     simulated = {
         f"{body}/{name}" if body else name: shots(options.reference / body, name)
-        for body in _bodies(options.stage)
+        for body in shared.bodies(options.stage)
         for name in garments
     }
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}

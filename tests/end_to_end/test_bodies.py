@@ -5,10 +5,12 @@ import json
 import shlex
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.reading.character import read_character
 
@@ -353,6 +355,62 @@ def test_what_there_is_to_say_of_a_body_is_said_by_all_that_measure_it(world, ca
     run(f"{command} --stage large.usda")
     told = capsys.readouterr()
     assert "beyond the bodies of the training" in told.out + told.err
+
+
+def test_a_stress_on_several_bodies_has_cases_of_each_and_says_which_they_are(world, capsys):
+    stages = "--stage rigged.usda --stage heavier.usda"
+    assert run(f"stress family.safetensors {stages} --quick --only 'rate: 60' 'motion: NaN' -o out.json") == 0
+    told = capsys.readouterr()
+    told = told.out + told.err
+    assert "rigged.usda:/Hero: the first body of the model's family" in told
+    assert "heavier.usda:/Hero: a body of the model's family, that of heavier.usda:/Hero" in told
+    found = json.loads(Path("out.json").read_text())["outcomes"]
+    labels = [f"{each['group']}: {each['name'][:3]}" for each in found]
+    assert labels == ["rigged/rate: 60 ", "rigged/motion: NaN", "heavier/rate: 60 ", "heavier/motion: NaN"]
+    extents = [each["measured"]["extent"] for each in found if each["measured"]["extent"]]
+    assert extents[0] != extents[1]
+    assert run(f"stress family.safetensors {stages} --quick --only 'rate: 60' 'motion: NaN' -o out.json") == 0
+    assert "4 rows were measured before" in capsys.readouterr().err
+    shutil.copytree(".", "more", ignore=shutil.ignore_patterns("more"))
+    assert run("stress family.safetensors --stage heavier.usda --stage more/heavier.usda --quick") == 2
+    assert "a second body 'heavier'" in capsys.readouterr().err
+
+
+def stretch_in(page: str) -> float:
+    """The mean of the energy of stretch on a page."""
+    row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
+    return float(row.partition(">")[2].partition("<")[0])
+
+
+def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_trained(world, capsys):
+    from ssilk_core.physics.energy import GarmentEnergy
+
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
+    assert run("report heavy.usda -o heavy.html") == 0
+    said = Path("heavy.html").read_text()
+    assert "stretch counts from its shape on the first of them" in said
+    file, found = load_model("family.safetensors"), []
+    energy = GarmentEnergy(file.scene.garment.mesh, file.fabric)
+    for frame in range(10):
+        points = shown("heavy.usda", frame)["Skirt"]
+        found.append(float(energy.stretch(torch.tensor(points[:, :, None], dtype=torch.float32))))
+    assert stretch_in("heavy.html") == pytest.approx(np.mean(found), rel=0.02)
+    Path("family.safetensors").rename("elsewhere.safetensors")
+    assert run("report heavy.usda -o other.html") == 0
+    assert "its model is not where it was baked from" in capsys.readouterr().err
+    assert abs(stretch_in("other.html") - stretch_in("heavy.html")) > 0.1 * stretch_in("heavy.html")
+    Path("elsewhere.safetensors").rename("family.safetensors")
+    file = replace(file, scene=replace(file.scene, garment=replace(file.scene.garment, graded=True)))
+    save_model("graded.safetensors", file)
+    assert run("bake graded.safetensors --motion clip.usda --stage heavier.usda -o graded.usda") == 0
+    assert run("report graded.usda -o graded.html") == 0
+    assert "graded to this body" in Path("graded.html").read_text()
+    assert stretch_in("graded.html") == pytest.approx(stretch_in("other.html"), rel=1e-3)
+    model = "report family.safetensors --stage heavier.usda --motion clip.usda -o model.html"
+    assert run(model) == 0
+    assert stretch_in("model.html") == pytest.approx(stretch_in("heavy.html"), rel=1e-3)
+    page = Path("model.html").read_text()
+    assert "The garment is one for all bodies." in page and "<td>taller.usda:/Hero</td>" in page
 
 
 def test_which_body_a_network_is_exported_for_is_told(world, capsys):
