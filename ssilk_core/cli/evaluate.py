@@ -161,9 +161,12 @@ def evaluated(
     opened = {body: [opener(path, stage, device) for path in options.models] for body, stage in bodies.items()}
     results = _results(options, asked, [one for each in opened.values() for one in each], listed)
     known = results.known(report)
-    groups = [(body, models) for body, each in opened.items() for models in _by_garment(each)]
-    for number, (body, models) in enumerate(groups):
-        dressed, methods = _dressed(models[0].file, bodies[body], body, options, device, exact), _methods(models)
+    groups = [(body, models, each) for body, each in opened.items() for models in _by_garment(each)]
+    for number, (body, models, each) in enumerate(groups):
+        dressed, methods = (
+            _dressed(models[0].file, bodies[body], body, options, device, exact),
+            _methods(models, each),
+        )
         playlist = _playlist(options, dressed, listed, models[0].base, report)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
@@ -186,14 +189,20 @@ def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
     return list(groups.values())
 
 
-def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
-    """Return the methods of one garment, named after their files where several have one name."""
+def _methods(models: Sequence[OpenedModel], opened: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
+    """Return the methods of one garment, named after their files where several have one name.
+
+    Args:
+        opened: all on that body: garments of one name may be of other fabrics or rest shapes.
+    """
     from ..quality.evaluation.methods import EvaluatedMethod
 
-    names = [one.name for one in models]
+    alike = [one for one in opened if one.prim == models[0].prim]
+    every = [one.name for one in alike]
     for told in (lambda path: path.stem, lambda path: path.with_suffix("")):
-        count = Counter(names)
-        names = [name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)]
+        count = Counter(every)
+        every = [name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(every, alike)]
+    names = [name for name, one in zip(every, alike) if one in models]
     return [
         EvaluatedMethod(name, one.file.joints, one.on, one.file.config.descriptors)
         for name, one in zip(names, models)

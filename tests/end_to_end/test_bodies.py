@@ -376,6 +376,13 @@ def test_a_stress_on_several_bodies_has_cases_of_each_and_says_which_they_are(wo
     assert "a second body 'heavier'" in capsys.readouterr().err
 
 
+def save_graded(model: str, output: str) -> None:
+    """Write a model whose garment is graded to bodies, with the same networks."""
+    file = load_model(model)
+    garment = replace(file.scene.garment, graded=True)
+    save_model(output, replace(file, scene=replace(file.scene, garment=garment)))
+
+
 def stretch_in(page: str) -> float:
     """The mean of the energy of stretch on a page."""
     row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
@@ -400,8 +407,7 @@ def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_train
     assert "its model is not where it was baked from" in capsys.readouterr().err
     assert abs(stretch_in("other.html") - stretch_in("heavy.html")) > 0.1 * stretch_in("heavy.html")
     Path("elsewhere.safetensors").rename("family.safetensors")
-    file = replace(file, scene=replace(file.scene, garment=replace(file.scene.garment, graded=True)))
-    save_model("graded.safetensors", file)
+    save_graded("family.safetensors", "graded.safetensors")
     assert run("bake graded.safetensors --motion clip.usda --stage heavier.usda -o graded.usda") == 0
     assert run("report graded.usda -o graded.html") == 0
     assert "graded to this body" in Path("graded.html").read_text()
@@ -620,6 +626,30 @@ def test_an_evaluation_on_several_bodies_has_rows_of_each_and_tells_the_worst(wo
     assert run(f"evaluate family.safetensors --stage rigged.usda --stage ./rigged.usda {asked}") == 2
     assert "a second body 'rigged'" in capsys.readouterr().err
     assert run(f"evaluate model.safetensors {stages} {asked}") == 2
+
+
+def test_two_ways_to_meet_a_body_are_each_compared_with_what_is_sewn_alike(world, toy, capsys):
+    (world / "clips").mkdir()
+    toy.write_clip(world / "clips" / "brief.usda", frames=6)
+    save_graded("family.safetensors", "graded.safetensors")
+    asked = "--stage rigged.usda --stage heavier.usda --motions clips --no-probes"
+    assert run(f"evaluate family.safetensors graded.safetensors {asked} -o both.json") == EXIT_OK
+    told = capsys.readouterr()
+    found = json.loads(Path("both.json").read_text())["figures"]
+    rows = [(row["garment"], row["method"]) for row in found]
+    ways = [("heavier/Skirt", f"ssilk ({name})") for name in ("family", "graded")]
+    assert rows[-4:] == [("heavier/Skirt", "LBS"), ways[0], ("heavier/Skirt", "LBS"), ways[1]]
+    totals = [row["figures"]["total"] for row in found[-4:]]
+    assert totals[0] > 2 * totals[2] > 0  # linear blend skinning is stretched, too
+    on_base = [row["figures"]["total"] for row in found[:-4]]
+    for own, lbs, name, base in zip(totals[1::2], totals[::2], ("family", "graded"), on_base[1:]):
+        body, total, below = min(
+            (("rigged", base, on_base[0]), ("heavier", own, lbs)), key=lambda each: 1 - each[1] / each[2]
+        )
+        assert f"worst body, Skirt, ssilk ({name}), all: {body}, {total:.4g} J, " in told.out + told.err
+        side = "below" if total <= below else "above"
+        words = f"{abs(1 - total / below):.1%} {side} linear blend skinning"
+        assert words in told.out + told.err
 
 
 def test_clips_that_were_made_for_a_body_are_played_as_they_are(world, toy, capsys):
