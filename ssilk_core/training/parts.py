@@ -102,6 +102,8 @@ class TrainingParts:
         group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         drawer, family = None, self.model.family
+        if self.graded and family:  # a run that restarts leaves it on some body, and weights count from the first
+            self.graded.wear(torch.zeros(family.bodies.size, device=self.device))
         if self.model.proximity and own.collider_fraction:
             hub = place_of_hub(self.model.scene.character.skeleton, self.model.joints)
             known = family.bodies if family else None

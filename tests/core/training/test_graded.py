@@ -149,6 +149,8 @@ def test_tensors_stay_where_a_captured_graph_reads_them(graded, family, toy_moti
     after = tensors_of(parts.energy)
     assert [at for at, _ in before] == [value.data_ptr() for value in after]
     assert sum(not torch.equal(old, new) for (_, old), new in zip(before, after)) >= 8
+    parts.graded.wear(torch.tensor(family.bodies.members[2]))
+    assert parts.stepper(SCHEDULE, 0).objective.scale == stepper.objective.scale  # of a run that restarts
 
 
 @torch.no_grad()
