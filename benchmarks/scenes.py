@@ -5,7 +5,8 @@
 
 The same cloak of synthetic.py around the same body, as the classes, the body and the motion ask for less or more: all
 of it pinned, all of it tight, a fifth of it loose, the whole of it, away from the body, on a character that stands
-still, and four at once. Each is measured in a process of its own. What a scene does not need must not be paid for.
+still, four at once, and one for two bodies, graded to them or not, which is rolled and baked on the second. Each is
+measured in a process of its own. What a scene does not need must not be paid for.
 """
 
 from __future__ import annotations
@@ -28,12 +29,14 @@ from helpers.reports import table, write_results
 from ssilk_usd.shots.shot import write_shot
 from ssilk_usd.units import StageUnits
 
-from ssilk_core.network.checkpoint import ModelFile, save_model
+from ssilk_core.authoring.bodies.carry import dressed_family
+from ssilk_core.network.checkpoint import ModelFile, model_file, network, save_model
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import garment_poses
 from ssilk_core.network.settings import ModelConfig
 from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Character, Motion, ProxyRig, Scene
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
@@ -46,10 +49,12 @@ HEADER = ("scene", "free vertices", "proxies", "body vertices", "train step [ms]
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One scene: its garments, which are trained and baked one after another, and what the character does."""
+    """One scene: its garments, which are trained and baked one after another, what the character does, and whether
+    they are for a second body as well."""
 
     garments: tuple[Scene, ...]
     motions: tuple[Motion, ...]
+    two_bodies: bool = False
 
 
 def dressed(loose: float, *, tight: bool = True) -> Scene:
@@ -79,6 +84,19 @@ def beside(scene: Scene) -> Scene:
     return replace(scene, character=character)
 
 
+def graded(scene: Scene) -> Scene:
+    """Return the scene with a garment whose rest shape follows the body."""
+    return replace(scene, garment=replace(scene.garment, graded=True))
+
+
+def larger(character: Character) -> Character:
+    """Return another body of the character's family."""
+    skeleton, grown = character.skeleton, np.array([1.15, 1.05, 1.15])
+    bodies = [replace(body, mesh=replace(body.mesh, points=body.mesh.points * grown)) for body in character.bodies]
+    joints = skeleton.bind_transforms[:, :3, 3] * grown
+    return replace(character, path="/larger", skeleton=with_joints(skeleton, joints), bodies=tuple(bodies))
+
+
 def moving() -> tuple[Motion, ...]:
     skeleton = synthetic.chain()
     return tuple(synthetic.motion(skeleton, ModelConfig().fps, seed) for seed in range(CLIPS))
@@ -104,23 +122,30 @@ WORLDS: dict[str, Callable[[], World]] = {
     "loose, still character": lambda: World((dressed(0.9),), still()),
     "loose": lambda: World((dressed(0.9),), moving()),
     "four loose garments": lambda: World((dressed(0.9),) * 4, moving()),
+    "loose, two bodies": lambda: World((dressed(0.9),), moving(), two_bodies=True),
+    "loose, graded to two bodies": lambda: World((graded(dressed(0.9)),), moving(), two_bodies=True),
 }
 
 
 def measure(name: str) -> dict[str, float]:
     """Return the figures of one scene, summed over its garments."""
     world = WORLDS[name]()
-    found = [measured(scene, world.motions) for scene in world.garments]
+    found = [measured(scene, world.motions, world.two_bodies) for scene in world.garments]
     return {key: sum(each[key] for each in found) for key in found[0]} | {"memory": max(f["memory"] for f in found)}
 
 
-def measured(scene: Scene, motions: tuple[Motion, ...]) -> dict[str, float]:
+def measured(scene: Scene, motions: tuple[Motion, ...], two_bodies: bool) -> dict[str, float]:
     """Train a few steps, roll and bake one garment."""
+    family = None
+    if two_bodies:
+        other = larger(scene.character)
+        family = dressed_family(scene, BodyFamily.of([scene.character, other]), [other])[0]
     config = TrainConfig(batch=SIZE.batch, window=SIZE.window, static_batch=SIZE.static_batch,
                          pretraining_batch=SIZE.decoded,
                          recombinations=0)  # fmt: skip
     job = TrainJob(scene=scene, motions=motions, held_out=motions[:1], model=ModelConfig(shapes=SIZE.shapes),
-                   train=config, fabric=Fabric("default"), output=Path("none"), device="cpu")  # fmt: skip
+                   train=config, fabric=Fabric("default"), output=Path("none"), device="cpu",
+                   family=family)  # fmt: skip
     parts = build_parts(job, torch.device("cpu"))
     stepper, first = parts.stepper(job.train, 0), job.train.static_iterations
     peak = Peak(torch.device("cpu"))
@@ -130,9 +155,15 @@ def measured(scene: Scene, motions: tuple[Motion, ...]) -> dict[str, float]:
         stepper.run(first + 1 + step)
     train = (time.perf_counter() - began) / STEPS
     memory = peak.bytes()
+    file, motion = model_file(parts.model, Fabric("default"), {}), repeated(motions[0])
+    if not family:
+        model = network(file)
+    else:
+        model = network(file.on_body(family.bodies.members[1]))
+        motion = motion_on(motion, scene.character.skeleton, model.scene.character.skeleton, 1.05)
     return {
         "free vertices": int((scene.classes != PINNED).sum()), "proxies": scene.rig.proxy_count,
-        "body vertices": parts.reached, "train": train, "memory": memory, **baked(parts.model, repeated(motions[0])),
+        "body vertices": parts.reached, "train": train, "memory": memory, **baked(file, model, motion),
     }  # fmt: skip
 
 
@@ -142,23 +173,22 @@ def repeated(motion: Motion) -> Motion:
     return replace(motion, rotations=rotations, translations=translations)
 
 
-def baked(model: GarmentModel, motion: Motion) -> dict[str, float]:
-    """Roll and bake one garment and write its model; times are for each frame [s], sizes in bytes."""
+def baked(file: ModelFile, model: GarmentModel, motion: Motion) -> dict[str, float]:
+    """Roll and bake one garment of a file and write the file; times are for each frame [s], sizes in bytes."""
     began = time.perf_counter()
     for _ in garment_poses(model, motion, motion.fps):
         pass
     rolled = time.perf_counter() - began
     with tempfile.TemporaryDirectory() as folder:
-        shot, file = Path(folder) / "shot.usdc", Path(folder) / "model.safetensors"
+        shot, path = Path(folder) / "shot.usdc", Path(folder) / "model.safetensors"
         began = time.perf_counter()
         poses = garment_poses(model, motion, motion.fps)
         write_shot(shot, model.deformer(), motion, poses, units=StageUnits(1.0, "Y"), include_body=False)
         bake = time.perf_counter() - began
-        parameters = {name: value.numpy() for name, value in model.state_dict().items()}
-        save_model(file, ModelFile(model.scene, model.config, Fabric("default"), model.joints, parameters), pack=True)
+        save_model(path, file, pack=True)
         count = motion.frame_count
         return {
-            "roll": rolled / count, "bake": bake / count, "model": file.stat().st_size,
+            "roll": rolled / count, "bake": bake / count, "model": path.stat().st_size,
             "shot": shot.stat().st_size,
         }  # fmt: skip
 

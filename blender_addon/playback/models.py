@@ -168,6 +168,7 @@ class TrainingProgress:
         return bool(self.state and self.state.alive)
 
 
+_sewn: dict[Path, tuple[float, Sewing | None]] = {}  # likewise, and how the garment is sewn
 _sees: dict[Path, tuple[float, bool]] = {}  # when a model was written that was read, and whether it sees colliders
 _known: dict[int, tuple[Question, TrainingProgress | None]] = {}
 
@@ -268,6 +269,29 @@ def sees_colliders(garment: bpy.types.Object) -> bool:
     if _sees.get(path, (0.0, False))[0] != written:
         _sees[path] = written, load_model(path).config.proximity_points > 0
     return _sees[path][1]
+
+
+@dataclass(frozen=True, eq=False)
+class Sewing:
+    """How a garment of a family of bodies is sewn: its points on the first body [m], shape (V, 3), and whether it is
+    graded to each."""
+
+    first: np.ndarray
+    graded: bool
+
+
+def sewing_of(path: Path) -> Sewing | None:
+    """Return how a model has its garment sewn; None for one body. The file is read where it is another by now.
+
+    Raises:
+        SsilkError: it cannot be read.
+    """
+    written = path.stat().st_mtime
+    if path not in _sewn or _sewn[path][0] != written:
+        file = load_model(path)
+        garment = file.scene.garment
+        _sewn[path] = written, Sewing(garment.mesh.points, garment.graded) if file.bodies else None
+    return _sewn[path][1]
 
 
 class TrainedGarment:

@@ -25,9 +25,10 @@ from ..scene.masks import need_unmasked
 from ..scene.meshes import rest_points, triangles_of, world_points
 from ..scene.modifiers import cage_points, is_refined
 from ..scene.objects import need_enabled
-from ..scene.shapes import mixed_points, worn_points
+from ..scene.shapes import mixed_points
 from .intersections import crossing_triangles
 from .repairs import displacements
+from .sewn import sewn_points
 
 ATTRIBUTE = "SSILK Heat"
 IN_FRONT_BEFORE = "ssilk_in_front"  # custom property of a garment that is drawn over the skin: whether it was before
@@ -116,9 +117,7 @@ def measuring(
         return HeatMap(kind, values, (float(found[0].mean()), float(found[1].mean())))
     points = cage_points(garment, depsgraph)
     if kind == STRETCH:
-        world = np.array(garment.matrix_world)[:3, :3]
-        rest = worn_points(garment) @ world.T
-        return HeatMap(kind, heat.elongations(rest, points, triangles_of(garment.data)))
+        return HeatMap(kind, heat.elongations(sewn_points(garment), points, triangles_of(garment.data)))
     scale, depths = bpy.context.scene.unit_settings.scale_length, []
     bodies = bodies_of(garment, armature_of(garment))
     need_unmasked(bodies)

@@ -98,6 +98,7 @@ def _options_of(
         "stage": Path(table["stage"]),
         "garment": table.get("garment"),
         "motion": [*options.motion, *map(Path, _listed(table, "motions"))],
+        "family": [*map(Path, _listed(table, "family"))],
         "preset": options.preset or table.get("preset"),
         "over": [*(_location(tables[name]) for name in entry.over), *entry.models(table)],
         "over_names": [*entry.over, *_model_names(entry, entry.models(table))],

@@ -105,8 +105,10 @@ class OpenedModel:
 
     @property
     def garment(self) -> tuple[object, ...]:
-        """What models must share to be measured on the same takes: mesh, fabric and rate."""
-        return self.prim, self.file.scene.garment.mesh.points.tobytes(), self.file.fabric, self.file.config.fps
+        """What models must share to be measured on the same takes: mesh, rest shape, fabric and rate."""
+        garment = self.file.scene.garment
+        shape = garment.mesh.points.tobytes(), garment.rest_mesh.points.tobytes()
+        return self.prim, *shape, self.file.fabric, self.file.config.fps
 
     @property
     def prim(self) -> str:
@@ -155,13 +157,16 @@ def evaluated(
 
     need_predicates()
     device = select_device(options.device)
-    bodies, listed = _bodies(options.stage), _listed(options)
+    bodies, listed = shared.bodies(options.stage), _listed(options)
     opened = {body: [opener(path, stage, device) for path in options.models] for body, stage in bodies.items()}
     results = _results(options, asked, [one for each in opened.values() for one in each], listed)
     known = results.known(report)
-    groups = [(body, models) for body, each in opened.items() for models in _by_garment(each)]
-    for number, (body, models) in enumerate(groups):
-        dressed, methods = _dressed(models[0].file, bodies[body], body, options, device, exact), _methods(models)
+    groups = [(body, models, each) for body, each in opened.items() for models in _by_garment(each)]
+    for number, (body, models, each) in enumerate(groups):
+        dressed, methods = (
+            _dressed(models[0].file, bodies[body], body, options, device, exact),
+            _methods(models, each),
+        )
         playlist = _playlist(options, dressed, listed, models[0].base, report)
         report(Started("evaluate", len(playlist.clips), {"garment": dressed.name, "clips": list(playlist.clips)}))
         paths = {method.name: str(one.path) for method, one in zip(methods, models)}
@@ -176,22 +181,6 @@ def evaluated(
     return results
 
 
-def _bodies(stages: Sequence[Path]) -> dict[str, Path]:
-    """Return the stages of bodies by their names, that of one alone by none.
-
-    Raises:
-        SsilkError: two have one name.
-    """
-    if len(stages) == 1:
-        return {"": stages[0]}
-    found: dict[str, Path] = {}
-    for stage in stages:
-        if stage.stem in found:
-            fail(str(stage), f"a second body '{stage.stem}'", "names of stages tell bodies apart", "rename one")
-        found[stage.stem] = stage
-    return found
-
-
 def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
     """Return the models of each garment, in the order of the first of each."""
     groups: dict[tuple[object, ...], list[OpenedModel]] = {}
@@ -200,14 +189,20 @@ def _by_garment(opened: Iterable[OpenedModel]) -> list[list[OpenedModel]]:
     return list(groups.values())
 
 
-def _methods(models: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
-    """Return the methods of one garment, named after their files where several have one name."""
+def _methods(models: Sequence[OpenedModel], opened: Sequence[OpenedModel]) -> list[EvaluatedMethod]:
+    """Return the methods of one garment, named after their files where several have one name.
+
+    Args:
+        opened: all on that body: garments of one name may be of other fabrics or rest shapes.
+    """
     from ..quality.evaluation.methods import EvaluatedMethod
 
-    names = [one.name for one in models]
+    alike = [one for one in opened if one.prim == models[0].prim]
+    every = [one.name for one in alike]
     for told in (lambda path: path.stem, lambda path: path.with_suffix("")):
-        count = Counter(names)
-        names = [name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(names, models)]
+        count = Counter(every)
+        every = [name if count[name] == 1 else f"{one.name} ({told(one.path)})" for name, one in zip(every, alike)]
+    names = [name for name, one in zip(every, alike) if one in models]
     return [
         EvaluatedMethod(name, one.file.joints, one.on, one.file.config.descriptors)
         for name, one in zip(names, models)
@@ -325,7 +320,7 @@ def _results(
     garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
     simulated = {
         f"{body}/{name}" if body else name: shots(options.reference / body, name)
-        for body in _bodies(options.stage)
+        for body in shared.bodies(options.stage)
         for name in garments
     }
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}

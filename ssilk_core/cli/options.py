@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -474,3 +474,19 @@ def load_scene(
 
     character, garment, rig = read(options, report)
     return prepare_scene(character, garment, rig, rig_options=rigging, report=report)
+
+
+def bodies(stages: Sequence[Path]) -> dict[str, Path]:
+    """Return the stages of bodies by their names, that of one alone by none.
+
+    Raises:
+        SsilkError: two have one name.
+    """
+    if len(stages) == 1:
+        return {"": stages[0]}
+    found: dict[str, Path] = {}
+    for stage in stages:
+        if stage.stem in found:
+            fail(str(stage), f"a second body '{stage.stem}'", "names of stages tell bodies apart", "rename one")
+        found[stage.stem] = stage
+    return found

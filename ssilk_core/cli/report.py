@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, fail
-from ..events import Reporter, Result, Started
+from ..events import Message, Reporter, Result, Started
 from ..files import replacing
 from ..physics.intersections.figures import LAYERS, LayerFigures, SelfIntersections
 from ..physics.skin.figures import ShownSkin
@@ -27,9 +27,12 @@ from .options import check_output
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
+    from ssilk_usd.shots.read import ShotPart
 
     from ..delivery.report.page import Section
     from ..delivery.view.props import ShotProps
+    from ..network.checkpoint import ModelFile
+    from ..scene.assets import Mesh
 
 MODEL = ".safetensors"
 
@@ -99,11 +102,14 @@ def _check(options: argparse.Namespace) -> None:
         fail(str(options.subject), "--stage for a shot", "shots hold their character")
 
 
-def _shot(path: Path, report: Reporter, props: ShotProps | None = None) -> list[Section]:
+def _shot(
+    path: Path, report: Reporter, props: ShotProps | None = None, file: ModelFile | None = None
+) -> list[Section]:
     """Return the sections of a shot, its provenance last.
 
     Args:
         props: the colliders that its cloth met; by default those that it names.
+        file: the model that was baked; by default that which it names.
     """
     from ssilk_usd.reading.facts import read_provenance
     from ssilk_usd.shots.play import Shot
@@ -118,8 +124,9 @@ def _shot(path: Path, report: Reporter, props: ShotProps | None = None) -> list[
     shot = Shot(open_with_full_bodies(path))  # cloth is measured against all of the body
     parts = read_parts(shot)
     report(Started("report", len(shot.frame_times)))
+    said = read_provenance(path)
     garments = [
-        ShotGarment(index, part.mesh, _fabric(part.record))
+        ShotGarment(index, part.mesh, _fabric(part.record), *_sewn(path, said, part, file, report))
         for index, (mesh, part) in enumerate(zip(shot.meshes, parts))
         if mesh.is_garment
     ]
@@ -133,10 +140,29 @@ def _shot(path: Path, report: Reporter, props: ShotProps | None = None) -> list[
     props = props or props_of(path, report)
     sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
-    said = read_provenance(path)
     if isinstance(certificate := said.get("certificate"), Mapping):
         sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))
     return [*sections, Section("Provenance", facts({**said, **records}))]
+
+
+def _sewn(
+    path: Path, said: Mapping[str, Any], part: ShotPart, file: ModelFile | None, report: Reporter
+) -> tuple[Mesh, str]:
+    """Return a garment in the rest shape of its energies, and what there is to say of that."""
+    from ..delivery.report.sewn import model_of, sewn_mesh
+
+    if part.record is None or not part.record.model_hash:
+        return part.mesh, ""
+    file = file or model_of(path, said, part.record.model_hash)
+    if file is not None:
+        sewn = sewn_mesh(part.mesh, file)
+        how = "The garment is one for all bodies of its model: stretch counts from its shape on the first of them."
+        graded = "The garment is graded to this body: stretch counts from where it lies on it."
+        return sewn, how if sewn is not part.mesh else graded if file.scene.garment.graded else ""
+    name = part.mesh.path.rpartition("/")[2]
+    text = "its model is not where it was baked from, so that stretch counts from where the garment lies on this body"
+    report(Message(f"{path}: {name}: {text}"))
+    return part.mesh, f"{text[0].upper()}{text[1:]}."
 
 
 def _fabric(record: GarmentRecord | None) -> Fabric:
@@ -150,14 +176,14 @@ def _fabric(record: GarmentRecord | None) -> Fabric:
 
 def _model(options: argparse.Namespace, report: Reporter) -> list[Section]:
     """Return the sections of a model, its provenance last."""
-    from ..delivery.report.figures import learning_of
+    from ..delivery.report.figures import bodies_of, learning_of
     from ..delivery.report.page import Section, facts
     from ..network.checkpoint import load_model
 
     path: Path = options.subject
     file = load_model(path)
     sections = _baked(options, report) if options.stage else []
-    sections += learning_of(path.with_suffix(".curve.json"))
+    sections += [*bodies_of(file), *learning_of(path.with_suffix(".curve.json"))]
     scene = file.scene
     sizes = {
         "vertices": scene.garment.mesh.vertex_count,
@@ -177,6 +203,7 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     from ..delivery.bake.counted import state_rollout_counts
     from ..delivery.bake.refinement import refined
     from ..delivery.view.props import ShotProps
+    from ..network.checkpoint import load_model
 
     model, stage, motion = (str(path) for path in (options.subject, options.stage, options.motion))
     rollout = load_rollout(BakeRequest(model=model, stage=stage, motion=motion, root=options.root))
@@ -190,4 +217,5 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
         rollout.warn(report)
         state_rollout_counts(shot, rollout)
         world = rollout.around.seen
-        return _shot(shot, report, ShotProps(world, rollout.seconds) if world else None)[:-1]
+        props = ShotProps(world, rollout.seconds) if world else None
+        return _shot(shot, report, props, load_model(model))[:-1]

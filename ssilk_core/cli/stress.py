@@ -4,18 +4,19 @@
 A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
 error is, and what happens: it works, falls back to rest, or is refused with a sentence. The exit code is 3 where
 anything else happens. --output writes each case when it has run; the same command, given again, goes on from there.
+--stage given several times tests each body of a family: cases then have the name of the body's stage in front.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from .options import check_output
+from .options import bodies, check_output
 
 if TYPE_CHECKING:
     from ..quality.kept_rows import KeptRows
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
+    verb.add_argument("--stage", type=Path, action="append", required=True,
+                      help="USD file with the character (repeatable: one for each body of a family)")  # fmt: skip
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument(
         "--motion",
@@ -49,8 +51,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..quality.stress.outcome import markdown
 
     if options.output:
-        check_output(options.output, options.model, options.stage)
-    subject, cases = _subject(options, report), [case for case in CASES if case.matches(options.only)]
+        check_output(options.output, options.model, *options.stage)
+    subjects = {body: _subject(options, stage, report) for body, stage in bodies(options.stage).items()}
+    cases = [replace(case, body=body) for body in subjects for case in CASES if case.matches(options.only)]
     if not cases:
         fail(
             "--only",
@@ -66,12 +69,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     told = Countdown(len(missing), report)
 
     def write(*, finished: bool) -> None:
-        rows = [asdict(found[case.label]) for case in CASES if case.label in found]
+        order = [replace(case, body=body).label for body in subjects for case in CASES]
+        rows = [asdict(found[label]) for label in order if label in found]
         kept.write({"model": options.model.name}, rows, finished=finished)
 
     try:
         for case in missing:
-            outcome = found[case.label] = case.run(subject)
+            outcome = found[case.label] = case.run(subjects[case.body])
             if outcome.verdict not in case.allowed:
                 report(Message(f"{case.label} {outcome.verdict}: {outcome.said}", "warning"))
             write(finished=False)
@@ -87,19 +91,28 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return EXIT_VERIFICATION if faults else EXIT_OK
 
 
-def _subject(options: argparse.Namespace, report: Reporter) -> StressSubject:
-    """Load the model, its character and the motion."""
+def _subject(options: argparse.Namespace, stage: Path, report: Reporter) -> StressSubject:
+    """Load the model, the character of a stage and the motion, and say which body of a family that is."""
     from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
 
     from ..delivery.bake import worn
     from ..network.checkpoint import load_model
+    from ..quality.evaluation.bodies import base_of
     from ..quality.stress.subject import FULL, QUICK, StressSubject
+    from ..scene.family import has_bones, motion_on
 
-    on = worn(load_model(options.model), open_stage(options.stage), options.root)
+    whole = load_model(options.model)
+    on = worn(whole, open_stage(stage), options.root)
+    if whole.bodies and on.body is None:
+        report(Message(f"{on.scene.character.path}: the first body of the model's family"))
     for event in on.told:
         report(event)
-    clip = read_motion(str(options.motion), on.scene.character.skeleton) if options.motion else None
+    skeleton, base = on.scene.character.skeleton, base_of(whole, on.body)
+    clip = read_motion(str(options.motion), skeleton) if options.motion else None
+    if clip and base and has_bones(clip, base[0]) and not has_bones(clip, skeleton):
+        clip = motion_on(clip, base[0], skeleton, base[1])
+        report(Message(f"{options.motion}: it has the bones of the model's first body, and is played on this one's"))
     return StressSubject(on.file, on.scene, clip, QUICK if options.quick else FULL)
 
 
@@ -112,7 +125,10 @@ def _kept(options: argparse.Namespace) -> KeptRows[CaseOutcome]:
     inputs: dict[str, Any] = {}
     if options.output:
         clips = {"motion": options.motion} if options.motion else {}
-        inputs = measured_inputs(models=[options.model], stage=options.stage, clips=clips, device="cpu", others={})
+        others = {"further bodies": options.stage[1:]} if options.stage[1:] else {}
+        inputs = measured_inputs(
+            models=[options.model], stage=options.stage[0], clips=clips, device="cpu", others=others
+        )
         inputs |= {"root": options.root, "quick": options.quick}
     return KeptRows(
         path=options.output,

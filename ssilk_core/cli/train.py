@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,7 +90,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--family", type=Path, nargs="+", default=[], metavar="STAGE",
         help="other bodies of the character's skeleton and topology, which the model is to dress as well: steps are "
-             "done on bodies drawn among these, and the garment's rest shape stays",
+             "done on bodies drawn among these",
+    )  # fmt: skip
+    verb.add_argument(
+        "--graded", action="store_true",
+        help="with --family: grade the garment to each body, as a pattern is by sizes, so that its rest shape is "
+             "where it lies there (default: one garment for all, tight on a heavy body and loose on a slight one)",
     )  # fmt: skip
     shared.add_fabric(verb)
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
@@ -192,6 +198,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     model, train = configured(options)
     _take_fabric(options, report)
     scene = shared.load_scene(options, report)
+    scene = replace(scene, garment=replace(scene.garment, graded=options.graded))
     fabric = shared.fabric(options, scene.garment, report)
     if fabric.friction:
         report(Message(f"friction = {fabric.friction:g} is left out; {FRICTION}", "warning"))
@@ -209,6 +216,11 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         if options.stepper_of and train.collider_fraction and not base.config.proximity_points:
             text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
+    if base and base.bodies and base.scene.garment.graded != options.graded:
+        was, now = "one garment for all bodies", "graded to each"
+        if not options.graded:
+            was, now = now, was
+        report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
@@ -247,7 +259,8 @@ def _family(options: argparse.Namespace, scene: Scene, report: Reporter) -> Dres
 
     others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
     bodies = need_family([scene.character, *others], trained=True)
-    report(Message(f"the garment is carried onto {len(others)} more bodies, along {bodies.size} directions"))
+    how = ", and graded to each" if options.graded else ""
+    report(Message(f"the garment is carried onto {len(others)} more bodies, along {bodies.size} directions{how}"))
     dressed, carried = dressed_family(scene, bodies, others)
     for one, other in zip(carried, others):
         if left := describe_left(one.settled, one.unsettled, other):
@@ -286,8 +299,10 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
     """Return the network and the schedule that the options ask for; check what they ask of the fabric, too.
 
     Raises:
-        SsilkError: a setting that does not exist, or a value that it cannot have.
+        SsilkError: a setting that does not exist, or a value that it cannot have; or --graded without --family.
     """
+    if options.graded and not options.family:
+        fail("--graded", "no --family", "garments are graded to further bodies", "name these, or leave it out")
     preset = preset_named(options.preset or default_preset(options.device))
     shared.asked_fabric(options)
     return _settings(options.settings, preset.model, preset.train)

@@ -37,7 +37,7 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
-    "family": (), "body_meshes": (),
+    "family": (), "body_meshes": (), "graded": False,
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 
@@ -159,6 +159,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         "fabric": asdict(model.fabric),
         "provenance": model.provenance,
         **({} if (colour := model.scene.garment.colour) is None else {"colour": colour}),
+        **({"graded": True} if model.scene.garment.graded else {}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
         **({} if model.bodies is None else _names(model.bodies.family.bodies)),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
@@ -330,7 +331,9 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         red, green, blue = (min(max(float(part), 0.0), 1.0) for part in colour)
         colour = red, green, blue
     sewn = tensors.get("scene.mesh.sewn")
-    garment = Garment(mesh, skin("plain", paths["garment"]), tensors["scene.classes"], colour=colour, sewn=sewn)
+    graded = document.get("graded", False)
+    plain = skin("plain", paths["garment"])
+    garment = Garment(mesh, plain, tensors["scene.classes"], colour=colour, sewn=sewn, graded=graded)
     return Scene(Character(paths["skeleton"], skeleton, ()), garment, rig)
 
 

@@ -41,7 +41,7 @@ class SparseOperator:
         dtype: torch.dtype,
     ) -> None:
         def sorted_by(first: Ints, second: Ints, size: tuple[int, int]) -> Tensor:
-            order = np.lexsort((second, first))
+            order = _order(first, second)
             row, column = (torch.as_tensor(np.asarray(part)[order], device=device) for part in (first, second))
             return csr(row, column, torch.as_tensor(np.asarray(values)[order], dtype=dtype, device=device), size)
 
@@ -56,6 +56,27 @@ class SparseOperator:
     def adjoint(self, y: Tensor) -> Tensor:
         """Apply the transposed operator to `y`, shape (rows, 3, frames); without gradients."""
         return (self.transposed @ y.flatten(1)).reshape(-1, *y.shape[1:])
+
+
+class Entries:
+    """Changes the entries of operators in place, which a captured CUDA graph reads where they were.
+
+    Args:
+        rows, columns: of the entries, in the order in which the operators were given them.
+    """
+
+    def __init__(self, rows: Ints, columns: Ints, device: torch.device) -> None:
+        orders = _order(rows, columns), _order(columns, rows)
+        self._order, self._transposed = (torch.as_tensor(order, device=device) for order in orders)
+
+    def fill(self, operator: SparseOperator, values: Tensor) -> None:
+        """Give an operator other entries, in the same order."""
+        operator.matrix.values().copy_(values[self._order])
+        operator.transposed.values().copy_(values[self._transposed])
+
+
+def _order(first: Ints, second: Ints) -> Ints:
+    return np.lexsort((second, first))
 
 
 def csr(rows: Tensor, columns: Tensor, values: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -100,6 +100,11 @@ class BodyFamily:
                 "body family", f"{len(self.names)} members along {size} directions", "two members or more are needed"
             )
 
+    def mirrored(self, signs: Floats) -> BodyFamily:
+        """Return the family with some of its directions the other way round, where signs (K,) are negative."""
+        moves = {name: getattr(self, name) * signs[:, None, None] for name in ("joint_moves", "point_moves")}
+        return replace(self, members=self.members * signs, taller=self.taller * signs, **moves)
+
     @property
     def size(self) -> int:
         """The number K of directions."""
@@ -134,6 +139,10 @@ class BodyFamily:
             fail(characters[1].path, f"the same body as {characters[0].path}", "members differ", "leave one out")
         kept = axes[values > SAME_DIRECTION * values[0]][:MOST_DIRECTIONS]
         along = (moved - moved[0]) @ kept.T
+        # Linear algebra leaves open which way a direction goes: each goes to its farthest member, the first of these.
+        reached = np.abs(along) >= (1 - SAME_DIRECTION) * np.abs(along).max(axis=0)
+        signs = np.sign(along[reached.argmax(axis=0), np.arange(len(kept))])
+        kept, along = kept * signs[:, None], along * signs
         farthest = np.abs(along).max(axis=0)
         moves = kept * farthest[:, None]
         joints, count = places.shape[1], bodies[0].shape[0]
@@ -225,6 +234,16 @@ class BodyFamily:
             )
         )
         return -np.linalg.lstsq(moves.T, wanted[0], rcond=None)[0][self.size :]
+
+    def nearest_member(self, coordinates: Floats) -> tuple[str, float]:
+        """Return the name of the member whose body is nearest, and how far its points are off on average [m].
+
+        Args:
+            coordinates: of a body, shape (K,).
+        """
+        off = np.tensordot(coordinates - self.members, self.point_moves, 1)
+        away = np.linalg.norm(off, axis=-1).mean(axis=-1)
+        return self.names[int(away.argmin())], float(away.min())
 
     def beyond(self, coordinates: Floats) -> float:
         """Return how far coordinates (K,) are beyond the members, as `BodyPlace.beyond`."""
@@ -340,6 +359,17 @@ class DressedFamily:
             [(each.rig.bind_transforms - dressed[0].rig.bind_transforms)[:, :3, 3] for each in dressed]
         )
         return cls(bodies, np.tensordot(inverse, cloth, 1), np.tensordot(inverse, proxies, 1))
+
+    def along(self, other: DressedFamily) -> DressedFamily:
+        """Return this with its directions the way round that another of the same bodies has them.
+
+        Model files of earlier versions have them as linear algebra left them.
+        """
+        if self.bodies.joint_moves.shape != other.bodies.joint_moves.shape:
+            return self
+        signs = np.where((self.bodies.members * other.bodies.members).sum(axis=0) < 0, -1.0, 1.0)
+        moves = {name: getattr(self, name) * signs[:, None, None] for name in ("cloth_moves", "proxy_moves")}
+        return replace(self, bodies=self.bodies.mirrored(signs), **moves)
 
     def stored(self) -> DressedFamily:
         """Return the family as model files hold it."""

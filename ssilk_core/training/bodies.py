@@ -3,7 +3,8 @@
 
 A body is a random point of a triangle of members, drawn evenly, and as far again from the members' mean as `BEYOND`
 says. The garment that it wears is the same for all: the energy keeps the base's rest shape, so that a large body
-stretches it. A window that goes on does so on another body: its latents are taken along as a start.
+stretches it. One that is graded has the rest shape in which it lies on each (`physics.energy.graded`). A window that
+goes on does so on another body: its latents are taken along as a start.
 """
 
 from __future__ import annotations

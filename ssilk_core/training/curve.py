@@ -60,7 +60,8 @@ def summary(score: Score) -> dict[str, Any]:
         "step_errors": score.step_errors,
     }
     measured: dict[str, Any] = {name: asdict(part) for name, part in parts.items() if part}
-    measured |= {"layers": [asdict(part) for part in score.layers]} if score.layers else {}
+    for name, several in (("layers", score.layers), ("bodies", score.bodies)):
+        measured |= {name: [asdict(part) for part in several]} if several else {}
     return {
         **score.terms, "total": score.total, "collisions": score.collisions, "dynamics": score.dynamics, **measured
     }  # fmt: skip

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import fail
 from ..network.checkpoint import ModelFile
 from ..network.settings import PROXIMITY_POINTS, ModelConfig
+from ..physics.energy.stretch import rest_frames
 from ..scene.assets import LOOSE, PINNED, TIGHT, Motion, Scene
 from ..scene.fabrics import Fabric
 from ..scene.family import DressedFamily
@@ -52,7 +53,8 @@ class TrainJob:
             Otherwise its initialiser and decoder stay as they are while a new stepper learns.
         over: trained garments that are worn beneath this one, in some of the windows. What is pinned over cloth that
             moves becomes tight in `scene` (`inner_garments.loosened`).
-        family: bodies to train for, the scene's as the base; None for that one alone.
+        family: bodies to train for, the scene's as the base; None for that one alone. The garment in `scene` says
+            whether it is graded to them.
         loosened: how many vertices become tight.
     """
 
@@ -76,6 +78,9 @@ class TrainJob:
     def __post_init__(self) -> None:
         if self.family:
             self._need_family()
+        elif self.scene.garment.graded:
+            found = "a garment that is graded to bodies, and one body alone"
+            fail(self.scene.garment.mesh.path, found, "a family has two or more", "name further bodies with --family")
         if self.base and self.base.bodies and not self.family:
             found = "training that goes on from a model of a family of bodies, without the family"
             fail(
@@ -90,7 +95,8 @@ class TrainJob:
         if self.base:
             _need_same_scene(self.base, self.scene, moved=self.whole)
         if self.base and self.base.bodies and self.family:
-            _need_same_family(self.base.bodies.family, self.family, self.scene.garment.mesh.path)
+            object.__setattr__(self, "family", self.family.along(self.base.bodies.family))
+            _need_same_family(self.base, self.base.bodies.family, self.scene, self.family)
         if self.base and self.whole:
             object.__setattr__(self, "model", self.base.config)
             # P and D are trained.
@@ -136,10 +142,16 @@ class TrainJob:
         for found, there in (
             ("a stepper alone that learns", self.stepper_alone),
             ("garments beneath", bool(self.over)),
+            ("newton_weight for a graded garment", self.scene.garment.graded and self.train.newton_weight > 0),
             (f"descriptors '{self.model.descriptors}'", self.model.descriptors != "relative"),
         ):
             if there:
                 fail(self.scene.garment.mesh.path, f"{found} and a family of bodies", "one of both", "leave one out")
+        assert self.family
+        for name, coordinates in zip(self.family.bodies.names, self.family.bodies.members):
+            if self.scene.garment.graded:
+                mesh = self.family.scene_at(self.scene, coordinates).garment.rest_mesh
+                rest_frames(replace(mesh, path=f"{mesh.path} on {name}"))  # each triangle has an area on each body
 
     @property
     def stepper_alone(self) -> bool:
@@ -187,7 +199,7 @@ class TrainJob:
                 "garment": self.scene.garment.mesh.path,
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
-                **({"family": family_digest(self.family)} if self.family else {}),
+                **({"family": family_digest(self.family, self.scene.garment.graded)} if self.family else {}),
             }
         )
 
@@ -228,8 +240,12 @@ def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:
         )
 
 
-def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> None:
-    """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them."""
+def _need_same_family(base: ModelFile, own: DressedFamily, scene: Scene, family: DressedFamily) -> None:
+    """Raise `SsilkError` unless a model was trained for these bodies; it stores few points of them.
+
+    The garment may lie elsewhere on each, as after it was settled.
+    """
+    where = scene.garment.mesh.path
     mine, theirs = own.bodies, family.bodies
     alike = mine.members.shape == theirs.members.shape and mine.joints.shape == theirs.joints.shape
     alike = alike and mine.counts == theirs.counts  # else it may lack points that the model knows
@@ -239,12 +255,18 @@ def _need_same_family(own: DressedFamily, family: DressedFamily, where: str) -> 
             (mine.members, theirs.members),
             (mine.joint_moves, theirs.joint_moves),
             (mine.point_moves, theirs.point_moves[:, mine.rows]),
-            (own.cloth_moves, family.cloth_moves),
         )
     )
     if not alike:
         found = "another family of bodies than the given model was trained for"
         fail(where, found, "training goes on for the same one", "name the same stages in the same order")
+    for name, at in zip(theirs.names, theirs.members):
+        before, after = own.scene_at(base.scene, at), family.scene_at(scene, at)
+        away = np.linalg.norm(after.garment.mesh.points - before.garment.mesh.points, axis=1).max(initial=0)
+        if away > FARTHEST_MOVED:
+            found = f"its garment lies up to {1000 * away:.0f} mm off where the given model has it on {name}"
+            allowed = f"rest points may have moved by {1000 * FARTHEST_MOVED:g} mm"
+            fail(where, found, allowed, "settle it as it was, or train anew")
 
 
 def _frames(motions: Sequence[Motion]) -> dict[str, list[tuple[float, int, float]]]:

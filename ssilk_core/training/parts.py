@@ -20,6 +20,7 @@ from ..network.parameters import on_moved_garment, seeing_more
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
+from ..physics.energy.graded import GradedRest
 from ..physics.intersections.cloth import ClothIntersections
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
@@ -54,7 +55,9 @@ class TrainingParts:
         bank: the motions to train on.
         body: the part of the body that the garment can touch, with `reached` vertices; None for nothing.
         inner: garments beneath; None where there are none that the garment can touch.
+        energy: that steps are done with, and `validator` measures with its own.
         shape: gives `body` the shape of any body of a family; None for one body.
+        graded: gives `energy` the rest shape there; None where it is one for all bodies.
     """
 
     model: GarmentModel
@@ -68,6 +71,7 @@ class TrainingParts:
     smoothing: ShapeSmoothing | None = None
     inner: InnerGarments | None = None
     shape: FamilyBody | None = None
+    graded: GradedRest | None = None
 
     @cached_property
     def buried(self) -> Tensor | None:
@@ -98,6 +102,8 @@ class TrainingParts:
         group, own = self.group, self.group.local_config(config)
         generator = torch.Generator(self.device).manual_seed(group.seed(seed))
         drawer, family = None, self.model.family
+        if self.graded and family:  # a run that restarts leaves it on some body, and weights count from the first
+            self.graded.wear(torch.zeros(family.bodies.size, device=self.device))
         if self.model.proximity and own.collider_fraction:
             hub = place_of_hub(self.model.scene.character.skeleton, self.model.joints)
             known = family.bodies if family else None
@@ -115,7 +121,7 @@ class TrainingParts:
         bodies = None
         if family:
             assert isinstance(self.bank, FamilyBank)
-            known_to = (self.model, self.bank, objective, self.shape, drawer)
+            known_to = (self.model, self.bank, objective, self.shape, self.graded, drawer)
             wearers: list[BodyWearer] = [each for each in known_to if each]
             bodies = DrawnBodies(family.bodies, wearers, seed, self.device)
         return Stepper(self.model, objective, sampler, own, average, self.smoothing, bodies)
@@ -163,7 +169,7 @@ def build_parts(
     else:
         bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
     held = build_bank(job.held_out, skeleton, joints, fps, device, kind=kind)
-    energy = GarmentEnergy(scene.garment.sewn_mesh, job.fabric, scene.classes, device=device)
+    energy = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
     body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None
     if len(vertices):
         touched = CollisionBody(body, skeleton.joint_count, vertices=vertices, limbs=limbs, device=device)
@@ -187,12 +193,19 @@ def build_parts(
             count = f"{job.loosened} pinned vertices lie over cloth that moves"
             report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
     members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner, members)
+    graded, measured = None, energy
+    if job.family and scene.garment.graded:
+        # Steps move its rest shape about, and what is validated on the first body needs that body's.
+        measured = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
+        graded = GradedRest(energy, scene.garment.rest_mesh, job.family.cloth_moves)
+    validator = Validator(held, measured, whole, scene, rest, fps, frames, group, spans, contours, inner, members)
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
     reached = len(vertices)
-    return TrainingParts(model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape)
+    return TrainingParts(
+        model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape, graded
+    )
 
 
 def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
@@ -233,6 +246,8 @@ def _validated_members(
         rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32, device=device)
         part = max(1, frames // len(chosen))
         place = torch.tensor(coordinates, dtype=torch.float32, device=device)
+        if scene.garment.graded:
+            energy = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
         validator = Validator(bank, energy, body, scene, rest, job.model.fps, part, group)
         found.append(ValidatedBody(bodies.names[row], place, validator))
     return found

@@ -69,6 +69,7 @@ class RunFiles:
                 "iteration": state.iteration,
                 "planned": state.planned,
                 "lowered": [asdict(item) for item in state.lowered],
+                **({"bodies": self.job.family.bodies.names} if self.job.family else {}),
                 "seed": self.job.train.seed,
                 "ssilk": __version__,
                 "torch": torch.__version__,

@@ -301,8 +301,9 @@ def scene_digest(scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def family_digest(family: DressedFamily) -> str:
-    """Return a hash of the bodies that a garment is trained for, and of where it lies on them.
+def family_digest(family: DressedFamily, graded: bool) -> str:
+    """Return a hash of the bodies that a garment is trained for, and of where it lies on them, and after it whether
+    it is graded to them.
 
     What linear algebra leaves of rounding, which depends on threads, is none of it.
     """
@@ -310,7 +311,7 @@ def family_digest(family: DressedFamily) -> str:
     moves = (bodies.joint_moves, bodies.point_moves, bodies.taller, family.cloth_moves, family.proxy_moves)
     for array in (bodies.members, bodies.joints, bodies.points, *moves):
         digest.update((np.round(array, SAME_DIGITS) + 0.0).tobytes())
-    return digest.hexdigest()
+    return digest.hexdigest() + (" graded" if graded else "")
 
 
 def json_round_trip(value: Any) -> Any:

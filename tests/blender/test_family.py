@@ -64,6 +64,16 @@ save_model(f"{folder}/family.safetensors", replace(file, bodies=SeenBodies(dress
 """
 
 
+GRADED = """
+import sys
+from dataclasses import replace
+from ssilk_core.network.checkpoint import load_model, save_model
+file = load_model(sys.argv[1])
+garment = replace(file.scene.garment, graded=True)
+save_model(sys.argv[2], replace(file, scene=replace(file.scene, garment=garment)))
+"""
+
+
 @pytest.fixture
 def wearing(trained: Any, folder: Path, ssilk_python: str) -> Any:
     """The trained skirt, with a model of a family of three bodies in a folder of its own."""
@@ -126,7 +136,7 @@ def test_live_play_and_bakes_dress_the_body_that_is_there(ready, wearing, folder
     assert np.abs(played - wanted).max() < EXACT
     from blender_addon.panels.playback import live_line
 
-    assert "a body of the model's family, at (" in live_line(wearing)
+    assert "a body of the model's family, that of member_" in live_line(wearing)
     other = decoded_on(ssilk_python, folder, "../" + str(model_of_training(wearing)))
     assert np.abs(played - other).max() > 0.01
 
@@ -189,6 +199,41 @@ def test_another_body_is_taken_up_while_it_plays(ready, wearing):
     ready.data.objects["Pillar"].data.shape_keys.key_blocks["Heavy"].value = 0.0
     ready.ops.ssilk.refresh_live()
     np.testing.assert_allclose(shown(ready, wearing, FRAMES), slim, atol=1e-6)
+
+
+@pytest.mark.parametrize("graded", [False, True], ids=["same", "graded"])
+def test_stretch_counts_from_the_rest_shape_that_the_model_trained(ready, wearing, ssilk_python, graded):
+    """One garment for all bodies is stretched over a heavy one; one that is graded to it is not."""
+    from blender_addon.arrays import heat
+    from blender_addon.playback.models import sewing_of
+    from blender_addon.quality.heat import STRETCH, measuring
+    from blender_addon.scene.meshes import triangles_of
+    from blender_addon.scene.modifiers import cage_points
+
+    model = Path(wearing.ssilk.model)
+    if graded:
+        model = model.with_name("graded.safetensors")
+        subprocess.run([ssilk_python, "-c", GRADED, wearing.ssilk.model, str(model)], check=True)
+        wearing.ssilk.model = str(model)
+    make_heavier(ready)
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    graph = ready.context.evaluated_depsgraph_get()
+    steps = measuring(wearing, STRETCH, graph)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            found = end.value.values
+            break
+    sewing = sewing_of(model)
+    assert sewing.graded is graded
+    laid = wearing.data.shape_keys.key_blocks["SSILK body"]
+    lies = np.array([tuple(point.co) for point in laid.data])
+    made = np.array([tuple(point.co) for point in laid.relative_key.data])
+    points, triangles = cage_points(wearing, graph), triangles_of(wearing.data)
+    wanted, other = (heat.elongations(rest, points, triangles) for rest in ((lies, made) if graded else (made, lies)))
+    np.testing.assert_allclose(found, wanted, atol=2e-4)
+    assert np.abs(found - other).max() > 0.02
 
 
 def with_one_more_point(bpy: Any) -> None:

@@ -5,10 +5,12 @@ import json
 import shlex
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.reading.character import read_character
 
@@ -132,6 +134,27 @@ def test_a_family_is_learned_and_the_model_file_holds_it(world):
     assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
 
 
+def test_a_garment_is_graded_where_it_is_asked_for(world, toy, capsys):
+    names = ("taller.usda", "heavier.usda")
+    train = f"{TRAIN} --family {' '.join(names)} --graded -o graded.safetensors"
+    assert run(train, *toy.training) in (EXIT_OK, EXIT_WORSE)
+    told = capsys.readouterr()
+    assert "along 2 directions, and graded to each" in told.out + told.err
+    file, same = load_model("graded.safetensors"), load_model("family.safetensors")
+    assert file.scene.garment.graded and not same.scene.garment.graded
+    assert set(names) <= file.provenance["inputs"].keys()
+    assert [name.partition(":")[0] for name in file.provenance["bodies"]] == ["rigged.usda", *names]
+    assert run("bake graded.safetensors --motion clip.usda --stage heavier.usda --refine 2 -o heavy.usda") == 0
+    assert run("verify heavy.usda") == 0
+    assert run(f"{TRAIN} --graded -o new.safetensors", *toy.training) == 2
+    assert "--graded: no --family" in capsys.readouterr().err
+    onward = f"{TRAIN} --family {' '.join(names)} --start-from graded.safetensors -o onward.safetensors"
+    steps = [word.replace("static_fraction=0.5", "static_fraction=0") for word in toy.training]
+    assert run(onward, *steps) in (EXIT_OK, EXIT_WORSE)
+    told = capsys.readouterr()
+    assert "it was trained as graded to each, and goes on as one garment for all bodies" in told.out + told.err
+
+
 def test_a_training_tells_the_figures_of_each_body_and_the_worst(world, toy, capsys):
     run(f"{TRAIN} --family taller.usda heavier.usda -o new.safetensors", *toy.training)
     told = capsys.readouterr()
@@ -225,13 +248,24 @@ def member_clip(path: str, ratio: float) -> None:
 def test_a_member_is_baked_as_plain_usdskel_with_its_own_body_and_garment(world, capsys):
     assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
     told = capsys.readouterr()
-    assert "a body of the model's family" in told.out + told.err
+    assert "heavier.usda:/Hero: a body of the model's family, that of heavier.usda:/Hero" in told.out + told.err
     assert run(f"{BAKE} --stage rigged.usda -o base.usda") == 0
     own, its = shown("base.usda", 0), shown("heavy.usda", 0)
     np.testing.assert_allclose(its["Body"], heavier(own["Body"]), atol=1e-4)
     assert run("verify heavy.usda") == 0
     away = np.linalg.norm(its["Skirt"] - own["Skirt"], axis=1)
     assert 0.005 < away.mean() < 0.3
+
+
+def test_a_look_that_no_member_has_is_told_with_what_brings_it(world, capsys):
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o bare.usda") == 0
+    told = capsys.readouterr()
+    assert "'ssilk rig STAGE --onto heavier.usda' writes a stage that has it" in told.out + told.err
+    assert run("rig rigged.usda --onto heavier.usda -o heavier_skirt.usda") == 0
+    capsys.readouterr()
+    assert run("bake family.safetensors --motion clip.usda --stage heavier_skirt.usda -o dressed.usda") == 0
+    told = capsys.readouterr()
+    assert "loses its look" not in told.out + told.err and "that of heavier.usda:/Hero" in told.out + told.err
 
 
 def test_a_taller_body_has_its_garment_higher(world):
@@ -242,9 +276,18 @@ def test_a_taller_body_has_its_garment_higher(world):
     assert its["Skirt"][:, 1].max() == pytest.approx(1.15 * own["Skirt"][:, 1].max(), rel=0.02)
 
 
+def points_of(path: str) -> np.ndarray:
+    stage = Usd.Stage.Open(path)
+    return np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get())
+
+
 def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(world, capsys):
-    write_member(world / "between.usda", lambda points: points * [1.15, 1.05, 1.15])
+    write_member(world / "between.usda", lambda points: points * [1.2, 1.05, 1.2])
+    capsys.readouterr()
     assert run(f"{BAKE} --stage between.usda -o between_shot.usda") == 0
+    told, member = capsys.readouterr(), points_of("heavier.usda")
+    away = 1000 * np.linalg.norm(points_of("between.usda") - member, axis=1).mean()
+    assert f"nearest to heavier.usda:/Hero, whose skin is {away:.0f} mm away on average" in told.out + told.err
     write_member(world / "large.usda", lambda points: points * [1.36, 1, 1.36])
     capsys.readouterr()
     assert run(f"{BAKE} --stage large.usda -o large_shot.usda") == 0
@@ -252,7 +295,8 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
     assert "beyond the bodies of the training" in told.out + told.err
     write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
     assert run(f"{BAKE} --stage huge.usda -o huge_shot.usda") == 2
-    assert "beyond the bodies that the model was trained for" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "beyond the bodies that the model was trained for, nearest to heavier.usda:/Hero" in told
     write_member(world / "bent.usda", lambda points: points + [0.2, 0, 0] * np.sin(4 * points[:, 1:2]))
     assert run(f"{BAKE} --stage bent.usda -o bent_shot.usda") == 2
     assert "from all that the model's family of bodies adds up to" in capsys.readouterr().err
@@ -311,6 +355,68 @@ def test_what_there_is_to_say_of_a_body_is_said_by_all_that_measure_it(world, ca
     run(f"{command} --stage large.usda")
     told = capsys.readouterr()
     assert "beyond the bodies of the training" in told.out + told.err
+
+
+def test_a_stress_on_several_bodies_has_cases_of_each_and_says_which_they_are(world, capsys):
+    stages = "--stage rigged.usda --stage heavier.usda"
+    assert run(f"stress family.safetensors {stages} --quick --only 'rate: 60' 'motion: NaN' -o out.json") == 0
+    told = capsys.readouterr()
+    told = told.out + told.err
+    assert "rigged.usda:/Hero: the first body of the model's family" in told
+    assert "heavier.usda:/Hero: a body of the model's family, that of heavier.usda:/Hero" in told
+    found = json.loads(Path("out.json").read_text())["outcomes"]
+    labels = [f"{each['group']}: {each['name'][:3]}" for each in found]
+    assert labels == ["rigged/rate: 60 ", "rigged/motion: NaN", "heavier/rate: 60 ", "heavier/motion: NaN"]
+    extents = [each["measured"]["extent"] for each in found if each["measured"]["extent"]]
+    assert extents[0] != extents[1]
+    assert run(f"stress family.safetensors {stages} --quick --only 'rate: 60' 'motion: NaN' -o out.json") == 0
+    assert "4 rows were measured before" in capsys.readouterr().err
+    shutil.copytree(".", "more", ignore=shutil.ignore_patterns("more"))
+    assert run("stress family.safetensors --stage heavier.usda --stage more/heavier.usda --quick") == 2
+    assert "a second body 'heavier'" in capsys.readouterr().err
+
+
+def save_graded(model: str, output: str) -> None:
+    """Write a model whose garment is graded to bodies, with the same networks."""
+    file = load_model(model)
+    garment = replace(file.scene.garment, graded=True)
+    save_model(output, replace(file, scene=replace(file.scene, garment=garment)))
+
+
+def stretch_in(page: str) -> float:
+    """The mean of the energy of stretch on a page."""
+    row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
+    return float(row.partition(">")[2].partition("<")[0])
+
+
+def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_trained(world, capsys):
+    from ssilk_core.physics.energy import GarmentEnergy
+
+    assert run("bake family.safetensors --motion clip.usda --stage heavier.usda -o heavy.usda") == 0
+    assert run("report heavy.usda -o heavy.html") == 0
+    said = Path("heavy.html").read_text()
+    assert "stretch counts from its shape on the first of them" in said
+    file, found = load_model("family.safetensors"), []
+    energy = GarmentEnergy(file.scene.garment.mesh, file.fabric)
+    for frame in range(10):
+        points = shown("heavy.usda", frame)["Skirt"]
+        found.append(float(energy.stretch(torch.tensor(points[:, :, None], dtype=torch.float32))))
+    assert stretch_in("heavy.html") == pytest.approx(np.mean(found), rel=0.02)
+    Path("family.safetensors").rename("elsewhere.safetensors")
+    assert run("report heavy.usda -o other.html") == 0
+    assert "its model is not where it was baked from" in capsys.readouterr().err
+    assert abs(stretch_in("other.html") - stretch_in("heavy.html")) > 0.1 * stretch_in("heavy.html")
+    Path("elsewhere.safetensors").rename("family.safetensors")
+    save_graded("family.safetensors", "graded.safetensors")
+    assert run("bake graded.safetensors --motion clip.usda --stage heavier.usda -o graded.usda") == 0
+    assert run("report graded.usda -o graded.html") == 0
+    assert "graded to this body" in Path("graded.html").read_text()
+    assert stretch_in("graded.html") == pytest.approx(stretch_in("other.html"), rel=1e-3)
+    model = "report family.safetensors --stage heavier.usda --motion clip.usda -o model.html"
+    assert run(model) == 0
+    assert stretch_in("model.html") == pytest.approx(stretch_in("heavy.html"), rel=1e-3)
+    page = Path("model.html").read_text()
+    assert "The garment is one for all bodies." in page and "<td>taller.usda:/Hero</td>" in page
 
 
 def test_which_body_a_network_is_exported_for_is_told(world, capsys):
@@ -520,6 +626,30 @@ def test_an_evaluation_on_several_bodies_has_rows_of_each_and_tells_the_worst(wo
     assert run(f"evaluate family.safetensors --stage rigged.usda --stage ./rigged.usda {asked}") == 2
     assert "a second body 'rigged'" in capsys.readouterr().err
     assert run(f"evaluate model.safetensors {stages} {asked}") == 2
+
+
+def test_two_ways_to_meet_a_body_are_each_compared_with_what_is_sewn_alike(world, toy, capsys):
+    (world / "clips").mkdir()
+    toy.write_clip(world / "clips" / "brief.usda", frames=6)
+    save_graded("family.safetensors", "graded.safetensors")
+    asked = "--stage rigged.usda --stage heavier.usda --motions clips --no-probes"
+    assert run(f"evaluate family.safetensors graded.safetensors {asked} -o both.json") == EXIT_OK
+    told = capsys.readouterr()
+    found = json.loads(Path("both.json").read_text())["figures"]
+    rows = [(row["garment"], row["method"]) for row in found]
+    ways = [("heavier/Skirt", f"ssilk ({name})") for name in ("family", "graded")]
+    assert rows[-4:] == [("heavier/Skirt", "LBS"), ways[0], ("heavier/Skirt", "LBS"), ways[1]]
+    totals = [row["figures"]["total"] for row in found[-4:]]
+    assert totals[0] > 2 * totals[2] > 0  # linear blend skinning is stretched, too
+    on_base = [row["figures"]["total"] for row in found[:-4]]
+    for own, lbs, name, base in zip(totals[1::2], totals[::2], ("family", "graded"), on_base[1:]):
+        body, total, below = min(
+            (("rigged", base, on_base[0]), ("heavier", own, lbs)), key=lambda each: 1 - each[1] / each[2]
+        )
+        assert f"worst body, Skirt, ssilk ({name}), all: {body}, {total:.4g} J, " in told.out + told.err
+        side = "below" if total <= below else "above"
+        words = f"{abs(1 - total / below):.1%} {side} linear blend skinning"
+        assert words in told.out + told.err
 
 
 def test_clips_that_were_made_for_a_body_are_played_as_they_are(world, toy, capsys):

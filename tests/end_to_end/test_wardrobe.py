@@ -122,6 +122,8 @@ WRONG = {
         '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
         "key 'over': a, b are worn over one another",
     ),
+    "graded": ('[cape]\ngraded = "yes"', "key 'graded': 'yes'; true or false is needed"),
+    "family": ("[cape]\nfamily = 3", "key 'family': 3; a path or a list of paths is needed"),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
 
@@ -131,6 +133,13 @@ def test_bad_entries_are_told_in_one_sentence(tmp_path, text, says):
     with pytest.raises(SsilkError) as error:
         listed(tmp_path, text)
     assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_bodies_of_a_garment_are_words_of_its_training_and_inputs_of_it(tmp_path):
+    text = '[defaults]\nstage = "a"\nmotions = "b"\nfamily = ["tall.usd", "/far/wide.usd"]\n'
+    own, same = listed(tmp_path, text + "[own]\ngraded = true\n[same]\ngraded = false\n")
+    assert own.words[-4:] == ("--family", "tall.usd", "/far/wide.usd", "--graded") and "--graded" not in same.words
+    assert own.located(Path("/lists"))["family"] == ["/lists/tall.usd", "/far/wide.usd"]
 
 
 def test_inner_garments_come_first(tmp_path):
@@ -145,6 +154,8 @@ BAD = {
     "setting": ("[cape]\nset = { speed = 3 }", "table 'cape': --set speed=3: no such setting; it is one of latent"),
     "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it must lie between 1 and"),
     "file": ('[cape]\nmotions = "none.usda"', "there is no such file or folder; motions are"),
+    "body": ('[cape]\nfamily = ["none.usda"]', "there is no file"),
+    "one body": ("[cape]\ngraded = true", "table 'cape': --graded: no --family"),
     "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),
 }
 

@@ -4,15 +4,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import fail
 from ...events import Event, Message
+from ...files import split_location
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
-from ...scene.family import BodyPlace, has_bones, names_of
+from ...scene.family import BodyFamily, BodyPlace, has_bones, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
 
 if TYPE_CHECKING:
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
 
 TRAINED, FARTHEST = 0.1, 0.5  # how far beyond the members bodies were trained on, and may be
 NEAR, UNLIKE = 0.005, 0.03  # [m] from the family's space, from which on it is told, and refused
+SAME = 1e-4  # [m] on average, within which a body is a member
 DIGITS = 7  # of what tells bodies apart
 BETTER = f"{TODO}, or with it among --family"
 
@@ -76,7 +79,7 @@ def worn_by(file: ModelFile, character: Character, known: Character) -> WornMode
         return WornModel(file, replace(file.scene, character=in_order_of(base, character)))
     own, bodies = in_order_of(base, character, moved=True), file.bodies.family.bodies
     place = bodies.place_of(own if known is character else in_order_of(base, known, moved=True))
-    _need_like(place, character.path)
+    _need_like(bodies, place, character.path)
     away = np.linalg.norm(own.skeleton.bind_transforms[:, :3, 3] - base.bind_transforms[:, :3, 3], axis=1)
     if not place.coordinates.any() and away.max() < BIND_TOLERANCE:
         one = file.on_body(place.coordinates)
@@ -88,7 +91,7 @@ def worn_by(file: ModelFile, character: Character, known: Character) -> WornMode
     one = file.on_body(place.coordinates, seen)
     bare = replace(own, bodies=(), stand_ins=())  # as model files have it
     one = replace(one, scene=replace(one.scene, character=bare))
-    told = tuple(_told(place, own))
+    told = tuple(_told(bodies, place, own))
     return WornModel(one, replace(one.scene, character=own), told, _identity(place, own))
 
 
@@ -106,13 +109,14 @@ def other_bones(path: str, motion: Motion, character: Character, first: Skeleton
     return (Message(text, "warning"),)
 
 
-def _need_like(place: BodyPlace, path: str) -> None:
+def _need_like(bodies: BodyFamily, place: BodyPlace, path: str) -> None:
     off = max(place.joints_off, place.points_off)
     if off > UNLIKE:
         found = f"its shape is {1000 * off:.0f} mm from all that the model's family of bodies adds up to"
         fail(path, found, f"{1000 * UNLIKE:.0f} mm are allowed", BETTER)
     if place.beyond > FARTHEST:
         found = f"its body is {place.beyond:.0%} beyond the bodies that the model was trained for"
+        found = f"{found}, {_nearest(bodies, place)}"
         fail(path, found, f"{FARTHEST:.0%} are allowed", BETTER)
 
 
@@ -122,13 +126,19 @@ def _identity(place: BodyPlace, own: Character) -> tuple[float, ...]:
     return tuple((np.round(numbers, DIGITS) + 0.0).tolist())
 
 
-def _words(place: BodyPlace) -> str:
-    return ", ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in place.coordinates)
+def _nearest(bodies: BodyFamily, place: BodyPlace) -> str:
+    """Say which body of the training is nearest, and by how much."""
+    name, away = bodies.nearest_member(place.coordinates)
+    file, prim = split_location(name)
+    name = f"{PurePath(file).name}:{prim}" if prim else PurePath(file).name
+    if away < SAME:
+        return f"that of {name}"
+    return f"nearest to {name}, whose skin is {1000 * away:.{0 if away >= 0.01 else 1}f} mm away on average"
 
 
-def _told(place: BodyPlace, character: Character) -> list[Event]:
+def _told(bodies: BodyFamily, place: BodyPlace, character: Character) -> list[Event]:
     path = character.path
-    text = f"{path}: a body of the model's family, at ({_words(place)})"
+    text = f"{path}: a body of the model's family, {_nearest(bodies, place)}"
     told: list[Event] = [Message(text), *_unlike(place, character)]
     if place.beyond > TRAINED:
         text = f"it is {place.beyond:.0%} beyond the bodies of the training, which went to {TRAINED:.0%}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sections of a page from the JSON that other commands write: learning curves, extremes, trades, evaluations."""
+"""Sections of a page from what other commands write: learning curves, extremes, trades, evaluations, bodies."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import SsilkError, fail
+from ...network.checkpoint import ModelFile
 from ...physics.intersections.figures import SelfIntersections
 from ...physics.skin.figures import ShownSkin
 from ...quality.charts import ChartPanel, svg_chart
@@ -18,9 +19,10 @@ from ...quality.trade.plot import trade_panels
 from ...quality.trade.point import TradePoint
 from ...scene.plain import from_plain
 from ...training.step_errors import StepErrors
-from .page import Section, facts, flattened, table
+from .page import Section, facts, flattened, table, worded
 from .terms import BARE, SHARE, SHOWN
 
+NOT_MEASURED = "–"
 MISSED = "energy that steps miss"
 
 MAX_COLUMNS = 12  # of a table of records; a page is not wider
@@ -114,10 +116,39 @@ def records(found: Sequence[Mapping[str, Any]]) -> str:
     return table(names, [[record.get(name, "") for name in names] for record in flat])
 
 
+def judged(validation: Mapping[str, Any]) -> float:
+    """Return the energy by which the best validation is chosen, as `training.validation.Score.judged` is [J]."""
+    totals = [validation["total"], *(body["total"] for body in validation.get("bodies", ()))]
+    return float(sum(totals) / len(totals))
+
+
+def bodies_of(file: ModelFile) -> list[Section]:
+    """Return the section of the bodies that a model dresses: who they are, and what its training measured on them.
+
+    There is none for a model of one body.
+    """
+    if file.bodies is None:
+        return []
+    names, validation = file.bodies.family.bodies.names, file.provenance.get("validation", {})
+    lbs, others = file.provenance.get("lbs", {}), {each["name"]: each for each in validation.get("bodies", ())}
+    first = {"total": validation["total"], "lbs": lbs["total"], "collisions": validation["collisions"]} if lbs else {}
+    rows = []
+    for name in names:
+        found = first if name == names[0] else others.get(name, {})
+        figures = [worded(found[key]) if found else NOT_MEASURED for key in ("total", "lbs")]
+        rows.append([name, *figures, f"{found['collisions']:.2%}" if found else NOT_MEASURED])
+    graded = file.scene.garment.graded
+    how = "graded to each body: its rest shape is where it lies there" if graded else "one for all bodies"
+    words = f"The garment is {how}. Validations measured the first body and those farthest apart."
+    header = ("body", "energy [J]", "linear blend skinning [J]", "inside the body")
+    return [Section("Bodies", table(header, rows) + f'<p class="note">{words}</p>')]
+
+
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the section of the learning curve that a training writes beside its model."""
     points, lbs = document["points"], document["lbs"]
-    best = min(range(len(points)), key=lambda number: points[number]["validation"]["total"])
+    bodies = [point["validation"].get("bodies", []) for point in points]  # of a family, its first one left out
+    best = min(range(len(points)), key=lambda number: judged(points[number]["validation"]))
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
     shown = {"total at validation": ("J", totals), SHARE: ("%", [100 * share for share in inside])}
@@ -133,6 +164,11 @@ def learning(document: Mapping[str, Any]) -> Section:
                     marks={"best": (times[best], values[best])})]
         for title, (unit, values) in shown.items()
     ]  # fmt: skip
+    if all(bodies):
+        names = [each["name"] for each in bodies[best]]
+        curves = {name: (times, [found[row]["total"] for found in bodies]) for row, name in enumerate(names)}
+        panel = ChartPanel(title="total on other bodies", x="training time [s]", y="J", curves=curves)
+        rows.insert(1, [panel])
     words = (
         f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "
         f"Linear blend skinning: {lbs['total']:.4g} J, {lbs['collisions']:.2%} inside the body."

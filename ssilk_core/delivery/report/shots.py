@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from html import escape
 
 import numpy as np
 
@@ -34,11 +35,21 @@ LOST = "All covered skin counts as shown in them, and all triangles (100 %) as i
 
 @dataclass(frozen=True, eq=False)
 class ShotGarment:
-    """A garment of a shot: its index among the player's meshes, its mesh at rest, and its fabric."""
+    """A garment of a shot.
+
+    Attributes:
+        index: among the player's meshes.
+        mesh: where it lies at rest.
+        fabric: what it is made of.
+        sewn: the mesh in the rest shape of its energies; where it lies by default.
+        note: what there is to say of that, in a sentence, or nothing.
+    """
 
     index: int
     mesh: Mesh
     fabric: Fabric
+    sewn: Mesh | None = None
+    note: str = ""
 
 
 def shot_sections(
@@ -60,7 +71,7 @@ def shot_sections(
         props: these colliders.
     """
     whole = joined(list(bodies.values()))
-    meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps) for each in garments]
+    meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps, each.sewn) for each in garments]
     named = {each.index: (player.meshes[each.index].name, each.mesh) for each in garments}
     layers = LayersMeter(named, whole)
     told = Countdown(len(player.frame_times), report)
@@ -130,6 +141,7 @@ def _sections(
     )
     found = meter.shown_skin(name)
     charts += table(("", "mean", "median", "95 %", "most"), rows)
+    charts += f'<p class="note">{escape(garment.note)}</p>' if garment.note else ""
     lost = [time for time, finite in zip(player.frame_times, meter.finite) if not finite]
     if lost:
         said = f"The garment is not finite in {len(lost)} of {len(times)} frames, first in frame {lost[0]:g}."

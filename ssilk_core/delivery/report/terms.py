@@ -39,9 +39,10 @@ class TermsMeter:
     tethered. In training tight cloth collides only with the patch under it.
 
     Attributes:
-        garment: the mesh at rest.
+        garment: the mesh where it lies at rest.
         body: all body meshes at rest as one, or None.
         fps: frames per second.
+        sewn: the mesh in the rest shape of its energies; where it lies by default.
         values: by name, one for each frame: energies [J], the shares of the covered skin that shows and that is
             bare, the share of triangles that intersect others, as it was in the last of every `EVERY` frames, the
             larger principal stretch that 99 triangles in 100 do not exceed, less one, and the share of
@@ -53,11 +54,13 @@ class TermsMeter:
     body: Mesh | None
     fabric: Fabric
     fps: float
+    sewn: Mesh | None = None
     values: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in UNITS})
 
     def __post_init__(self) -> None:
-        self.energy = GarmentEnergy(self.garment, self.fabric)
-        self.columns = deformation_gradient_operator(self.garment, self.energy.mass.device, self.energy.mass.dtype)
+        rest = self.sewn or self.garment
+        self.energy = GarmentEnergy(rest, self.fabric)
+        self.columns = deformation_gradient_operator(rest, self.energy.mass.device, self.energy.mass.dtype)
         self.finite: list[bool] = []
         self.counts: list[ShownCounts] = []
         self.cloth = ClothIntersections(self.garment)

@@ -32,12 +32,14 @@ class ContactSamples:
         corners: vertices of each sample's triangle; three times the same one for a vertex, shape (S, 3).
         weights: barycentric coordinates, shape (S, 3).
         area: what the sample stands for at rest [m2]; 1 for the paper's energy, which counts vertices, shape (S,).
+        faces: the triangle of each sample that is no vertex, shape (S - V,); None for the paper's energy.
     """
 
     vertex_count: int
     corners: Ints
     weights: Floats
     area: Floats
+    faces: Ints | None = None
 
     def points(self, vertices: Floats) -> Floats:
         """Return the samples' positions (S, 3) on a mesh of `vertices` (V, 3)."""
@@ -72,14 +74,17 @@ def contact_samples(mesh: Mesh, fabric: Fabric) -> ContactSamples:
     # The middles of equal triangles are apart by 1 / sqrt(3) of their edge.
     divisions = np.ceil(longest / np.sqrt(3) / MAX_SPACING).clip(1, MAX_DIVISIONS).astype(int)
     at_corners = area / (1 + 3 * divisions**2)
-    corners, weights = [vertices.corners], [vertices.weights]
+    corners, weights, of = [vertices.corners], [vertices.weights], [np.zeros(0, dtype=np.int64)]
     areas = [np.bincount(faces.reshape(-1), np.repeat(at_corners / 3, 3), mesh.vertex_count)]
     for n in np.unique(divisions):
         own, middles = divisions == n, topology.subdivision_middles(n)
         corners.append(np.repeat(faces[own], len(middles), axis=0))
         weights.append(np.tile(middles, (own.sum(), 1)))
+        of.append(np.repeat(np.flatnonzero(own), len(middles)))
         areas.append(np.repeat((area - at_corners)[own] / len(middles), len(middles)))
-    return ContactSamples(mesh.vertex_count, np.concatenate(corners), np.concatenate(weights), np.concatenate(areas))
+    return ContactSamples(
+        mesh.vertex_count, np.concatenate(corners), np.concatenate(weights), np.concatenate(areas), np.concatenate(of)
+    )
 
 
 class SampledCloth:
@@ -88,16 +93,14 @@ class SampledCloth:
     Attributes:
         samples: as they were given.
         area: of each sample, times the share of the full stiffness of contact that it has, shape (S, 1).
-
-    Args:
-        stiffness: that share, shape (S,); one by default.
+        stiffness: that share, shape (S,); None for one everywhere.
     """
 
     def __init__(
         self, samples: ContactSamples, device: torch.device, dtype: torch.dtype, stiffness: Floats | None = None
     ) -> None:
         count = len(samples.area)
-        self.samples = samples
+        self.samples, self.stiffness = samples, stiffness
         area = samples.area if stiffness is None else samples.area * stiffness
         self.area = torch.as_tensor(area, dtype=dtype, device=device)[:, None]
         rows = np.repeat(np.arange(count), 3)

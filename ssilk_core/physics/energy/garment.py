@@ -39,6 +39,11 @@ class GarmentEnergy:
         tethered: indices of the vertices that a tether holds, shape (T,).
         tether_stiffness: of each of these [N/m], shape (T,).
         stitching: what holds islands on one another, or None.
+        area: of the triangles, as their stretch counts [m2], shape (F, 1).
+        bending_stiffness: of the hinges [J], shape (H, 1).
+        rest_angle: of these [rad], shape (H, 1).
+        gradient_operator, hinge_operator: from positions to deformation gradients, and to the edges of hinges.
+        tables: of the rest shape, for fused energies.
 
     Args:
         classes: of the vertices, shape (V,). Without them contact has its full stiffness and there are no tethers.
@@ -76,22 +81,24 @@ class GarmentEnergy:
         self.law = ContactLaw.of(fabric)
         shares = _stiffness_shares(samples, fabric, self.law, classes)
         self.cloth = SampledCloth(samples, device, dtype, shares)
-        self._gradient = deformation_gradient_operator(mesh, device, dtype)
+        self.gradient_operator = deformation_gradient_operator(mesh, device, dtype)
         heads = hinges[:, [1, 2, 3]].T.reshape(-1)
-        self._hinge = difference_operator(heads, np.tile(hinges[:, 0], 3), mesh.vertex_count, device, dtype)
+        self.hinge_operator = difference_operator(heads, np.tile(hinges[:, 0], 3), mesh.vertex_count, device, dtype)
         self.bending_stiffness = tensor(fabric.bending * _hinge_shapes(mesh, hinges))[:, None]
         rest = tensor(mesh.points)[:, :, None]
-        self.rest_angle = dihedral_angles(*self._hinge(rest).chunk(3)) if len(hinges) else rest.new_zeros(0, 1)
+        self.rest_angle = (
+            dihedral_angles(*self.hinge_operator(rest).chunk(3)) if len(hinges) else rest.new_zeros(0, 1)
+        )
         numbers = torch.hstack([self.bending_stiffness, self.rest_angle])
-        self._tables = elastic_tables(mesh.vertex_count, mesh.faces, column_weights(mesh), areas, hinges, numbers)
+        self.tables = elastic_tables(mesh.vertex_count, mesh.faces, column_weights(mesh), areas, hinges, numbers)
 
     def stretch(self, x: Tensor) -> Tensor:
-        return (self.area * stretch_density(self._gradient(x), self.fabric)).sum(0)
+        return (self.area * stretch_density(self.gradient_operator(x), self.fabric)).sum(0)
 
     def bending(self, x: Tensor) -> Tensor:
         if len(self.rest_angle) == 0:
             return x.new_zeros(x.shape[-1])
-        angle = dihedral_angles(*self._hinge(x).chunk(3))
+        angle = dihedral_angles(*self.hinge_operator(x).chunk(3))
         return bending_energy(angle, self.rest_angle, self.bending_stiffness).sum(0)
 
     def gravity(self, x: Tensor, gravity: Tensor) -> Tensor:
@@ -129,11 +136,11 @@ class GarmentEnergy:
         if kernels.supports(x):
             from ..kernels.elastic import elastic_kernel
 
-            return elastic_kernel(x, self._tables, self.fabric)
+            return elastic_kernel(x, self.tables, self.fabric)
         if loops.supports(x):
             from ..loops.elastic import elastic_loop
 
-            return elastic_loop(x, self._tables, self.fabric)
+            return elastic_loop(x, self.tables, self.fabric)
         return self.stretch(x), self.bending(x)
 
     def gravity_and_collision(

@@ -12,6 +12,9 @@ face. A spring of the rest distance alone would let parts swing aside by it, and
 
 from __future__ import annotations
 
+from functools import cached_property
+from math import sqrt
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -20,7 +23,7 @@ from ...scene.assets import PINNED, Floats, Ints, Mesh
 from ...scene.fabrics import Fabric
 from ...scene.mesh.stitches import NONE, Stitches, find_stitches
 from .. import kernels
-from ..operators import SparseOperator
+from ..operators import Entries, SparseOperator
 from .bending import cross
 
 FADING = 1e-3  # of the rest normal's length
@@ -62,17 +65,46 @@ class Stitching:
         self._floor = tensor(FADING**2 * squared)[:, None, None]
         # Rows: what lies between each vertex and its place on the plane, then two edges of the face.
         count = len(stitches)
-        edges = np.tile([1.0, -1, 1, -1], (count, 1))
-        values = np.column_stack([np.ones(count), -stitches.weights, edges])
+        values = _entries(torch.as_tensor(stitches.weights)).numpy()
+        shape = (3 * count, mesh.vertex_count)
+        self._operator = SparseOperator(*self._places(), values, shape, device, dtype)
+
+    def _places(self) -> tuple[Ints, Ints]:
+        """Return the rows and columns of the entries of the operator."""
+        count = len(self)
         columns = self.corners[:, [0, 1, 2, 3, 2, 1, 3, 1]]
         rows = np.arange(count)[:, None] + count * np.array([0, 0, 0, 0, 1, 1, 2, 2])
-        shape = (3 * count, mesh.vertex_count)
-        self._operator = SparseOperator(
-            rows.reshape(-1), columns.reshape(-1), values.reshape(-1), shape, device, dtype
-        )
+        return rows.reshape(-1), columns.reshape(-1)
+
+    @cached_property
+    def _at(self) -> Tensor:
+        return torch.as_tensor(self.corners, device=self.weights.device)
+
+    @cached_property
+    def _filling(self) -> Entries:
+        return Entries(*self._places(), self.weights.device)
 
     def __len__(self) -> int:
         return len(self.corners)
+
+    def take(self, points: Tensor, stiffness: Tensor) -> None:
+        """Take another rest shape in place: points (V, 3) [m], and the stiffness of springs at all vertices (V,)."""
+        at = self._at
+        own, first, second, third = points[at].unbind(1)
+        offset, sides = own - first, (second - first, third - first)
+        normal = torch.linalg.cross(*sides, dim=1)
+        squared = (normal * normal).sum(1)
+        shares = [
+            (torch.linalg.cross(*pair, dim=1) * normal).sum(1) / squared
+            for pair in ((offset, sides[1]), (sides[0], offset))
+        ]
+        weights = torch.stack([1 - shares[0] - shares[1], *shares], dim=1)
+        self.weights.copy_(weights[:, :, None])
+        self.stiffness.copy_(stiffness[at[:, 0]][:, None])
+        height = (offset * normal).sum(1) / squared.sqrt()
+        self.height.copy_((sqrt(1 + FADING**2) * height)[:, None, None])
+        self._floor.copy_((FADING**2 * squared)[:, None, None])
+        self._filling.fill(self._operator, _entries(weights))
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy [J], shape (N,)."""
@@ -97,3 +129,9 @@ class Stitching:
         across = cross(first, second)
         length = ((across * across).sum(1, keepdim=True) + self._floor).sqrt()
         return across / length, length
+
+
+def _entries(weights: Tensor) -> Tensor:
+    """Return the entries of the operator, from barycentric coordinates (S, 3), shape (8 S,)."""
+    edges = weights.new_tensor([1.0, -1, 1, -1]).expand(len(weights), 4)
+    return torch.cat([torch.ones_like(weights[:, :1]), -weights, edges], dim=1).reshape(-1)

@@ -91,13 +91,17 @@ def deformation_gradient_operator(mesh: Mesh, device: torch.device, dtype: torch
     """Return the operator from positions to both columns of F (3x2): rows w_u of all triangles, then w_v."""
     count = len(mesh.faces)
     return SparseOperator(
-        np.repeat(np.arange(2 * count), 3),
-        np.tile(mesh.faces.reshape(-1), 2),
+        *gradient_places(mesh),
         column_weights(mesh).transpose(2, 0, 1).reshape(-1),
         (2 * count, mesh.vertex_count),
         device,
         dtype,
     )
+
+
+def gradient_places(mesh: Mesh) -> tuple[Ints, Ints]:
+    """Return the rows and columns of that operator's entries: for w_u, then for w_v, of each triangle's corners."""
+    return np.repeat(np.arange(2 * len(mesh.faces)), 3), np.tile(mesh.faces.reshape(-1), 2)
 
 
 def stvk_density(gradient: Tensor, mu: float, lame_lambda: float) -> Tensor:

@@ -28,6 +28,7 @@ class ElasticTables:
         faces, face_numbers: the first corner of every triangle, shapes (F, 6) and (F, 8).
         hinges: vertices as in `topology.hinges`, shape (H, 4).
         hinge_numbers: stiffness [J] and rest angle [rad], shape (H, 2).
+        order: the corners of all triangles, first ones first, in the order of `corners`, shape (3 F,).
     """
 
     starts: Tensor
@@ -37,6 +38,14 @@ class ElasticTables:
     face_numbers: Tensor
     hinges: Tensor
     hinge_numbers: Tensor
+    order: Tensor
+
+    def take(self, weights: Tensor, areas: Tensor, hinge_numbers: Tensor) -> None:
+        """Take another rest shape in place; arguments are those of `elastic_tables`, as tensors."""
+        turns = [torch.cat([weights[:, (1 + t) % 3], weights[:, (2 + t) % 3], areas[:, None]], 1) for t in range(3)]
+        self.face_numbers[:, :5] = turns[0]
+        self.corner_numbers[:, :5] = torch.cat(turns)[self.order]
+        self.hinge_numbers.copy_(hinge_numbers)
 
 
 def elastic_tables(
@@ -70,6 +79,7 @@ def elastic_tables(
         tensor(numbers[0], torch.float32),
         tensor(hinges, torch.int32),
         hinge_numbers.float().contiguous(),
+        tensor(order, torch.int64),
     )
 
 

@@ -147,7 +147,7 @@ def _owners(points: Floats, groups: Ints, chosen: Floats, chosen_groups: Ints) -
 
 def sampled_potential(whole: IncrementalPotential, scene: Scene, cubature: Cubature) -> IncrementalPotential:
     """Return the potential of a scene's garment on the elements of a cubature; positions are (V', 3, N)."""
-    mesh, device, dtype = scene.garment.sewn_mesh, whole.mass.device, whole.dtype
+    mesh, device, dtype = scene.garment.rest_mesh, whole.mass.device, whole.dtype
     vertices, place = cubature.vertices, cubature.place(mesh.vertex_count)
     free = np.isin(np.arange(mesh.vertex_count), whole.free.cpu().numpy())
     owners = torch.as_tensor(cubature.owners, device=device)

@@ -68,7 +68,7 @@ class Hessian:
     @classmethod
     def of(cls, scene: Scene, energy: GarmentEnergy) -> Hessian:
         """Return that of a scene's garment, over the vertices that are not pinned and have mass."""
-        mesh, device = scene.garment.sewn_mesh, energy.mass.device
+        mesh, device = scene.garment.rest_mesh, energy.mass.device
         corners = topology.hinges(mesh.faces) if energy.fabric.bending else NO_CORNERS
         membrane = Membrane(mesh, energy.fabric, device, energy.mass.dtype)
         bending = energy.bending_stiffness, energy.rest_angle

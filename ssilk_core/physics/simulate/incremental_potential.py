@@ -104,7 +104,7 @@ class IncrementalPotential:
         self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
     ) -> None:
         mesh = scene.garment.mesh
-        energy = GarmentEnergy(scene.garment.sewn_mesh, fabric, scene.classes, device=device, dtype=dtype)
+        energy = GarmentEnergy(scene.garment.rest_mesh, fabric, scene.classes, device=device, dtype=dtype)
         self.fabric, self.dtype = fabric, dtype
         self.mass: Tensor = energy.mass[:, None]
         self.tether = torch.zeros_like(self.mass)

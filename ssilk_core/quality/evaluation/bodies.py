@@ -64,10 +64,17 @@ class WorstBody:
 
 
 def worst_bodies(rows: Sequence[ResultRow]) -> list[WorstBody]:
-    """Return the worst body of each garment, method and split; none where rows are of one body."""
-    lbs = {(row.garment, row.split): row.figures.total for row in rows if row.method == LBS}
+    """Return the worst body of each garment, method and split; none where rows are of one body.
+
+    Args:
+        rows: in which linear blend skinning comes before the methods that it is compared with: garments of one name
+            may be of several rest shapes.
+    """
+    lbs = dict[tuple[str, str], float]()
     found: dict[tuple[str, str, str], WorstBody] = {}
     for row in rows:
+        if row.method == LBS:
+            lbs[row.garment, row.split] = row.figures.total
         body, _, garment = row.garment.rpartition("/")
         if not body or row.method in (LBS, SIMULATOR):
             continue

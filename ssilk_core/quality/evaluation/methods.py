@@ -93,9 +93,9 @@ class EvaluationScene:
         mesh = scene.garment.mesh
         self.character = character
         self.scene, self.fabric, self.fps, self.device, self.exact = scene, fabric, fps, device, exact
-        sewn = scene.garment.sewn_mesh
-        self.energy = GarmentEnergy(sewn, fabric, scene.classes, device=device)
-        self.columns = deformation_gradient_operator(sewn, device, torch.float32)
+        rest = scene.garment.rest_mesh
+        self.energy = GarmentEnergy(rest, fabric, scene.classes, device=device)
+        self.columns = deformation_gradient_operator(rest, device, torch.float32)
         body, joints = scene.character.merged_body(), scene.character.skeleton.joint_count
         self.body = CollisionBody(body, joints, limbs=limb_axes(scene), device=device)
         self.contacts = Contacts(scene, self.energy.cloth.samples, device=device)

@@ -46,17 +46,24 @@ class Case:
         group, name: its labels in the table.
         measure: runs the case; it raises `SsilkError` if the product refuses the input.
         allowed: verdicts that are acceptable.
+        body: name of the body of a family that it runs on, where there are several.
     """
 
     group: str
     name: str
     measure: Measure
     allowed: tuple[Verdict, ...] = ("works",)
+    body: str = ""
 
     @property
     def label(self) -> str:
         """What messages and `ssilk stress --only` call the case."""
-        return f"{self.group}: {self.name}"
+        return f"{self._placed}: {self.name}"
+
+    @property
+    def _placed(self) -> str:
+        """The group, with the body in front where there are several: "heavy/rate"."""
+        return f"{self.body}/{self.group}" if self.body else self.group
 
     def matches(self, words: Sequence[str]) -> bool:
         """Return whether the case's name contains one of `words`; True if there are none."""
@@ -66,7 +73,7 @@ class Case:
         """Run the case and return its outcome."""
         began = time.perf_counter()
         verdict, said, measured = self._tried(subject)
-        return CaseOutcome(self.name, self.group, verdict, said, measured, time.perf_counter() - began)
+        return CaseOutcome(self.name, self._placed, verdict, said, measured, time.perf_counter() - began)
 
     def _tried(self, subject: StressSubject) -> tuple[Verdict, str, CaseMeasurement]:
         try:

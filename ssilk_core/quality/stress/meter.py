@@ -74,7 +74,7 @@ class ExtentMeter:
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, spans: Sequence[range] = ()) -> None:
         self.scene, self.fps, self.spans = scene, fps, [span[::ENERGY_EVERY] for span in spans]
-        self.energy = GarmentEnergy(scene.garment.sewn_mesh, fabric, dtype=torch.float64)
+        self.energy = GarmentEnergy(scene.garment.rest_mesh, fabric, dtype=torch.float64)
         self.skin = Skinning(scene.lbs_skin).double()
         self.rest = torch.tensor(scene.garment.mesh.points)
         self.speed, self.distance, self.finite = 0.0, 0.0, True

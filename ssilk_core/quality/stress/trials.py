@@ -102,6 +102,6 @@ def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:
 
 def _force(scene: Scene, fabric: Fabric, x: Tensor) -> Tensor:
     x = x.detach().requires_grad_(True)
-    energy = GarmentEnergy(scene.garment.sewn_mesh, fabric, dtype=x.dtype)
+    energy = GarmentEnergy(scene.garment.rest_mesh, fabric, dtype=x.dtype)
     (force,) = torch.autograd.grad((energy.stretch(x) + energy.bending(x)).sum(), x)
     return force

@@ -34,15 +34,17 @@ class Garment:
     """A garment mesh fitted to the character's bind pose.
 
     Attributes:
-        mesh: the garment at rest, which is also the rest shape of the energies but where `sewn` is another.
+        mesh: the garment at rest.
         skin: weights over the character's joints for linear blend skinning, or None if not authored.
         classes: PINNED, TIGHT or LOOSE for each vertex, shape (V,), or None if not authored.
         pins: 1 for each vertex that is to be pinned when classes are found, 0 for others, shape (V,), or None.
         levels: the least tightness at which each vertex is tight, as `classes_at` takes it, shape (V,), or None.
         surface: the physics material that its stage states, or None.
         colour: (red, green, blue) of linear light to show it in, each from 0 to 1, or None if not authored.
-        sewn: its points on the body that it was made for, where it lies on another [m], shape (V, 3), or None. They
-            are the rest shape of the energies, and those by which networks choose vertices to look at.
+        sewn: its points on the body that it was made for, where it lies on another [m], shape (V, 3), or None.
+            Networks choose vertices to look at by them.
+        graded: whether the rest shape of the energies is where it lies on each body, as a pattern is graded by
+            sizes. Otherwise one garment is worn by all, and its rest shape is that on the body that it was made for.
     """
 
     mesh: Mesh
@@ -53,6 +55,7 @@ class Garment:
     surface: SurfaceMaterial | None = None
     colour: tuple[float, float, float] | None = None
     sewn: Floats | None = None
+    graded: bool = False
 
     def __post_init__(self) -> None:
         count = self.mesh.vertex_count
@@ -96,3 +99,8 @@ class Garment:
     def sewn_mesh(self) -> Mesh:
         """The mesh as it was made: at `sewn`, where it lies on another body."""
         return self.mesh if self.sewn is None else replace(self.mesh, points=self.sewn)
+
+    @property
+    def rest_mesh(self) -> Mesh:
+        """The mesh in the rest shape of the energies."""
+        return self.mesh if self.graded else self.sewn_mesh

@@ -75,6 +75,8 @@ KEYS = {
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
+    "family": Key("--family", _is_texts, "a path or a list of paths"),
+    "graded": Key("--graded", lambda value: isinstance(value, bool), "true or false"),
     "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["a"],'),
 }
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
@@ -142,7 +144,7 @@ def _relocated(key: str, value: Any, move: Callable[[str], str]) -> Any:
         file, prim = split_location(value)
         own = file.endswith(USD_SUFFIXES)
         return (f"{move(file)}:{prim}" if prim else move(file)) if own else value
-    if key in ("motions", "valid"):
+    if key in ("motions", "valid", "family"):
         return [move(each) for each in ([value] if isinstance(value, str) else value)]
     return [move(each) if each.endswith(MODEL) else each for each in value] if key == "over" else value
 
@@ -219,6 +221,8 @@ def _words(path: Path, name: str, table: dict[str, Any]) -> tuple[str, ...]:
 
 def _option(option: str, value: Any) -> list[str]:
     """Return an option and its value as command-line arguments."""
+    if isinstance(value, bool):
+        return [option] if value else []
     if isinstance(value, dict):
         return [word for name, item in value.items() for word in (option, f"{name}={_text(item)}")]
     return [*filter(None, [option]), *(value if isinstance(value, list) else [str(value)])]

@@ -195,3 +195,19 @@ def test_weights_that_differ_are_told(scene, members):
     other = replace(members[1], bodies=(replace(body, skin=replace(body.skin, weights=body.skin.weights[:, ::-1])),))
     codes = [finding.code for finding in family_findings([scene.character, other])]
     assert codes == ["other-weights", "family"]
+
+
+@pytest.mark.parametrize("signs", [[-1, 1], [1, -1], [-1, -1]])
+def test_directions_go_the_same_way_whichever_way_linear_algebra_has_them(members, monkeypatch, signs):
+    found, svd = BodyFamily.of(members), np.linalg.svd
+
+    def mirrored(matrix, **options):
+        left, values, axes = svd(matrix, **options)
+        axes[:2] *= np.array(signs)[:, None]
+        return left, values, axes
+
+    monkeypatch.setattr(np.linalg, "svd", mirrored)
+    again = BodyFamily.of(members)
+    for name in ("members", "joint_moves", "point_moves", "taller"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+    assert (found.members.max(axis=0) == 1).all()

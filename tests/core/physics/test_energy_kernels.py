@@ -14,6 +14,7 @@ import torch
 from ssilk_core.physics import kernels, loops
 from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.physics.energy.graded import GradedRest
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 
@@ -192,3 +193,34 @@ def test_a_second_call_gives_the_same_bits_but_for_a_frame_that_is_not_a_number(
         assert np.flatnonzero(np.isnan(value)).tolist() == [2]
         assert np.array_equal(np.delete(value, 2), np.delete(expected, 2))
         assert np.array_equal(np.delete(gradient, 2, axis=2), np.delete(slope, 2, axis=2))
+
+
+@pytest.mark.parametrize("fabric", [STVK, WOVEN], ids=["stvk", "woven"])
+def test_a_rest_shape_that_moves_is_read_where_it_was_by_what_was_captured_before(sheet, fabric):
+    """On a GPU energies are replayed by a graph, which was captured on another body."""
+    points = sheet.points * [1.04, 1.02, 1.1] + 3e-4 * np.random.default_rng(3).normal(size=(7, 3))
+    energy, own = (GarmentEnergy(mesh, fabric, device=DEVICE) for mesh in (sheet, replace(sheet, points=points)))
+    rest = GradedRest(energy, sheet, (points - sheet.points)[None])
+    x = torch.tensor(crumpled(points), dtype=torch.float32, device=DEVICE)
+    last, before, shift = x[..., :MOVING] + 0.01, x[..., :MOVING] - 0.01, torch.ones(3, MOVING, device=DEVICE)
+
+    def terms(of: GarmentEnergy) -> torch.Tensor:
+        inertia, drag = of.inertia_and_drag(x, last, before, shift, 1 / 30)
+        return torch.cat([*of.elastic(x), inertia, drag])
+
+    replayed = terms(energy)
+    if DEVICE == "cuda":
+        side, graph = torch.cuda.Stream(), torch.cuda.CUDAGraph()
+        side.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(side):
+            terms(energy)
+        torch.cuda.current_stream().wait_stream(side)
+        with torch.cuda.graph(graph):
+            replayed = terms(energy)
+    for share in (0.5, 1.0):
+        rest.wear(torch.full((1,), share, device=DEVICE))
+    if DEVICE == "cuda":
+        graph.replay()
+    else:
+        replayed = terms(energy)
+    torch.testing.assert_close(replayed, terms(own), rtol=1e-5, atol=1e-9)

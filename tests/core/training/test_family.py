@@ -346,6 +346,42 @@ def test_what_a_family_cannot_go_on_from_is_refused(scene, members, family, mode
         family_job(scene, replace(family, bodies=fewer), motion, path, base=file, whole=True)
 
 
+def test_a_family_of_a_file_whose_directions_go_the_other_way_is_the_same(
+    scene, members, family, model, toy_motion, tmp_path
+):
+    """Earlier versions left their signs to linear algebra."""
+    motion, path, signs = toy_motion(scene, 24), tmp_path / "m.safetensors", np.array([1.0, -1.0])
+    file, bodies = model_file(model, Fabric("toy"), {}), family.bodies
+    moves = {name: getattr(family, name) * signs[:, None, None] for name in ("cloth_moves", "proxy_moves")}
+    other = replace(family, bodies=bodies.mirrored(signs), **moves)
+    columns = {name: values * signs for name, values in file.bodies.columns.items()}
+    mirrored = replace(file, bodies=replace(file.bodies, family=other, columns=columns))
+    save_model(path, mirrored)
+    job = family_job(scene, family, motion, path, base=load_model(path), whole=True)
+    onward = model_file(build_parts(job, CPU).model, Fabric("toy"), {})
+    for member, coordinates in zip(members, bodies.members):
+        at = onward.bodies.family.bodies.place_of(member).coordinates
+        np.testing.assert_allclose(at, coordinates * signs, atol=1e-6)
+        one, two = onward.on_body(coordinates * signs), file.on_body(coordinates)
+        np.testing.assert_allclose(one.scene.garment.mesh.points, two.scene.garment.mesh.points, atol=1e-6)
+        for name, value in two.parameters.items():
+            np.testing.assert_allclose(one.parameters[name], value, atol=1e-6)
+
+
+def test_a_garment_that_was_settled_otherwise_goes_on_where_it_lies_on_each_body(
+    scene, members, family, model, toy_motion, tmp_path
+):
+    motion, path = toy_motion(scene, 24), tmp_path / "m.safetensors"
+    base = model_file(model, Fabric("toy"), {})
+    moved = np.array(family.cloth_moves)
+    moved[1, :, 2] -= 0.02
+    settled = replace(family, cloth_moves=moved)
+    assert family_job(scene, settled, motion, path, base=base, whole=True).family is not None
+    moved[1, 7, 2] -= 0.5
+    with pytest.raises(SsilkError, match=r"mm off where the given model has it on /(taller|heavier)"):
+        family_job(scene, replace(family, cloth_moves=moved), motion, path, base=base, whole=True)
+
+
 SEEING_COLLIDERS = TrainConfig(batch=64, window=4, static_batch=2, static_fraction=0, collider_fraction=1.0)
 
 

@@ -150,7 +150,9 @@ def copy_looks(
     found = [(mesh, path, look_source(mesh, opened)) for mesh, path in meshes]
     for mesh, _, look in found:
         if look is None:
-            left.add(mesh.path.rpartition("/")[2], f"its look, if it had any: {source} has no mesh of its polygons")
+            text = f"its look, if it had any: {source} has no mesh of its polygons"
+            todo = f"'ssilk rig STAGE --onto {source}' writes a stage that has it"
+            left.add(mesh.path.rpartition("/")[2], f"{text}; {todo}")
         elif twin := _twin(mesh, look, opened):
             text = f"its look, unless it is that of {look.prim.GetPath()}: {twin.GetPath()} has the same polygons"
             left.add(mesh.path.rpartition("/")[2], text)
