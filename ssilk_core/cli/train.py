@@ -21,6 +21,7 @@ from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, TextReporter, silent
 from ..network.settings import ModelConfig, apply_overrides, setting_names
+from ..scene.fabric_range import FACTORS, FabricRange
 from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
@@ -92,6 +93,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
              "done on bodies drawn among these, and the garment's rest shape stays",
     )  # fmt: skip
     shared.add_fabric(verb)
+    verb.add_argument(
+        "--fabrics", nargs="*", metavar="PRESET|FACTOR",
+        help="train for a range of fabrics, in any of which the model then bakes: from 1/FACTOR to FACTOR times each "
+             f"of {', '.join(FACTORS)} of the own fabric, and all that presets have (default: 4)",
+    )  # fmt: skip
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
     verb.add_argument(
@@ -131,6 +137,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report = report if group.is_first else silent
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
+    of = " or ".join([*(["body"] if job.family or not job.fabrics else []), *(["fabric"] if job.fabrics else [])])
     share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
     missed, worst = trained.score.step_errors, worst_body(trained.score)
     worse = is_worse(trained.score, trained.lbs)
@@ -153,7 +160,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
                 **({f"{body.name} [J]": round(body.total, 5) for body in trained.score.bodies}),
-                **({"worst body": f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
+                **({f"worst {of}": f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
                 **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
@@ -209,6 +216,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         if options.stepper_of and train.collider_fraction and not base.config.proximity_points:
             text = "it sees no colliders, and the first pose of --stepper-of stays as it is: obstacles are left out"
             report(Message(f"{trained}: {text}; --start-from trains all of it, and lets it see them", "warning"))
+    fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
+    if fabrics:
+        report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
@@ -230,6 +240,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         whole=options.start_from is not None,
         over=over,
         family=family,
+        fabrics=fabrics,
     )
 
 

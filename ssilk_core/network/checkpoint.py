@@ -86,7 +86,9 @@ class ModelFile:
         if self.fabrics is None:
             fail(self.scene.garment.mesh.path, f"fabric '{fabric.name}' for a model of one fabric", *ONE_FABRIC)
         factors = factors_of(self.fabric, fabric)
-        biases = self.fabrics.biases(self.parameters, self.fabrics.range.seen(factors)) if (factors != 1).any() else {}
+        biases = (
+            self.fabrics.biases(self.parameters, self.fabrics.range.seen(factors)) if (factors != 1).any() else {}
+        )
         fabric = fabric_with(self.fabric, factors, fabric.name)
         return replace(self, fabric=fabric, parameters={**self.parameters, **biases}, fabrics=None)
 

@@ -44,7 +44,9 @@ class SeenFabrics:
                 allowed = f"(H, {len(FACTORS)}) is needed"
                 fail("range of fabrics", f"weights '{name}' of shape {values.shape}", allowed, "train again")
             if not np.isfinite(values).all():
-                fail("range of fabrics", f"weights '{name}' hold NaN or infinity", "all must be finite", "train again")
+                fail(
+                    "range of fabrics", f"weights '{name}' hold NaN or infinity", "all must be finite", "train again"
+                )
 
     def tensors(self) -> dict[str, Any]:
         """Return the tensors of a file, by name."""

@@ -64,7 +64,7 @@ def fabric_with(own: Fabric, factors: Floats, name: str | None = None) -> Fabric
     stretch, shear, *others = (float(factor) for factor in factors)
     scales = dict(zip(properties(own), (stretch, stretch * shear, *others)))
     values = {key: getattr(own, key) * scale for key, scale in scales.items() if scale != 1}
-    return replace(own, name=own.name if name is None else name, **values)  # type: ignore[arg-type]
+    return replace(own, name=own.name if name is None else name, **values)
 
 
 def inputs_of(factors: Floats) -> Floats:

@@ -174,15 +174,11 @@ class Objective:
         factors = None if fabric is None else FabricFactors.of(fabric)
         return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles, factors)
 
-    def _near(
-        self, frames: Tensor, down: Tensor, obstacles: Obstacles | None, fabric: Tensor | None
-    ) -> Near | None:
+    def _near(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None, fabric: Tensor | None) -> Near | None:
         """Return what is near in frames (N,) under gravity and wind (N, 3) [g]; None without obstacles."""
         return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames, down, fabric)
 
-    def _static_descriptor(
-        self, frames: Tensor, down: Tensor, near: Near | None, fabric: Tensor | None
-    ) -> Tensor:
+    def _static_descriptor(self, frames: Tensor, down: Tensor, near: Near | None, fabric: Tensor | None) -> Tensor:
         """Return static descriptors (N, S) of frames (N,), with fabrics and the proximity of obstacles, if any."""
         parts = [self.bank.static_descriptor(frames, down)]
         if near is not None and self.drawer is not None:

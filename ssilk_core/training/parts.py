@@ -200,7 +200,9 @@ def build_parts(
             report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
     members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
     fabrics = _validated_fabrics(job, held, whole, frames, device, group) if job.fabrics else []
-    validator = Validator(held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner, [*members, *fabrics])
+    validator = Validator(
+        held, energy, whole, scene, rest, fps, frames, group, spans, contours, inner, [*members, *fabrics]
+    )
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned

@@ -23,6 +23,7 @@ from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
 from .direction import Direction
+from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
 from .request import ALLOWED_FPS, BakeRequest
@@ -72,6 +73,7 @@ class LoadedGarment:
         model_held, stage_held: what model and stage held while they were read.
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
+        played: likewise with the fabric that it plays; None for that of its training.
         info: of the garment as an asset.
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
@@ -94,6 +96,7 @@ class LoadedGarment:
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
+    played: GarmentRecord | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -134,6 +137,7 @@ class LoadedGarment:
             inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
             record=self.record,
+            played=self.played,
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
@@ -297,7 +301,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
-    first, file, scene = file, on.file, on.scene
+    first, own, file, scene = file, on.file, on.file, on.scene
+    file, in_words = in_fabric(own, request.model, request.fabric, request.material)
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -314,10 +319,11 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
             "training": file.provenance.get("ssilk", ""),
             **({"trained_over": dict(over)} if (over := file.provenance.get("over")) else {}),
         },
-        record=_record(file, model_held.digest),
+        record=_record(own, model_held.digest),
+        played=_record(file, model_held.digest) if in_words else None,
         info=_info(request, model_held.digest),
         riders=riders,
-        told=told,
+        told=(*told, *in_words),
         body=on.body,
         first=first.scene.character.skeleton if on.body else None,
     )

@@ -14,6 +14,7 @@ from ...events import Countdown, Event, Message, Reporter, silent
 from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.assets.reshaped import reshaped
+from ...scene.fabric_range import properties
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import (
     deform,
@@ -108,6 +109,7 @@ class BakeRollout:
         inputs: what the request's inputs held while they were read.
         provenance: where all of this comes from, as a shot stores it.
         record: how the garment's model was made.
+        played: likewise with the fabric that it plays; None for that of its training.
         info: of the garment as an asset.
         names: the joints as the shot's target finds them.
         sight: what the network knows of the world around the character.
@@ -150,6 +152,7 @@ class BakeRollout:
     told: tuple[Event, ...] = ()
     direction: Direction | None = None
     loop: Loop | None = None
+    played: GarmentRecord | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
 
@@ -157,6 +160,12 @@ class BakeRollout:
     def start(self) -> float:
         """Time code of the first frame."""
         return self.motion.start / self.request.samples_per_frame
+
+    @property
+    def fabric_words(self) -> str:
+        """The fabric that it plays, in words."""
+        values = {name: f"{getattr(self.fabric, name):.4g}" for name in properties(self.fabric)}
+        return f"{self.fabric.name} ({', '.join(f'{name} {value}' for name, value in values.items())})"
 
     @property
     def influences(self) -> int:

@@ -103,7 +103,7 @@ def _length(square):
 @triton.jit
 def _modulus(values, n, inside, mixed: tl.constexpr):
     """A modulus of all frames, or where they are mixed, that of each."""
-    if mixed:
+    if mixed:  # noqa: SIM108  # Triton compiles one branch of a statement alone
         modulus = tl.load(values + n, mask=inside, other=0.0)
     else:
         modulus = values

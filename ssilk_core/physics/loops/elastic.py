@@ -30,9 +30,7 @@ HALF_PI, PI, TWO_PI = np.float32(np.pi / 2), np.float32(np.pi), np.float32(2 * n
 Moduli = tuple[Tensor, Tensor] | None
 
 
-def elastic_loop(
-    x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: Moduli = None
-) -> tuple[Tensor, Tensor]:
+def elastic_loop(x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: Moduli = None) -> tuple[Tensor, Tensor]:
     """Return stretch and bending [J] of positions x (V, 3, N), both (N,).
 
     Args:

@@ -67,7 +67,12 @@ def fabrics_job(scene, motion, output, **given):
 def test_a_preset_is_a_point_that_its_factors_give_back(kind, name):
     own, preset = replace(FABRICS["default"], stretch_model=kind), replace(FABRICS[name], stretch_model=kind)
     found = fabric_with(own, factors_of(own, preset), name)
-    for key in ("density", "bending", "drag", *(("lame_mu", "lame_lambda") if kind == "stvk" else ("stretch", "shear"))):
+    for key in (
+        "density",
+        "bending",
+        "drag",
+        *(("lame_mu", "lame_lambda") if kind == "stvk" else ("stretch", "shear")),
+    ):
         assert getattr(found, key) == pytest.approx(getattr(preset, key))
     assert found.thickness == own.thickness and found.name == name
     assert fabric_with(own, np.ones(5)) == own and not inputs_of(factors_of(own, own)).any()
@@ -81,7 +86,9 @@ def test_a_range_spans_all_that_it_names():
         assert not wide.beyond(factors_of(own, FABRICS[name]))
     assert wide.high[FACTORS.index("bending")] == pytest.approx(40) and wide.high[FACTORS.index("drag")] == 2
     assert wide.beyond(np.array([1, 1, 50, 1, 1])) == "bending 50 (trained from 0.3 to 40)"
-    np.testing.assert_allclose(wide.seen(np.array([1, 1, 400, 0, 1])), [0, 0, np.log(40) / UNIT, wide.bounds[0][3], 0])
+    np.testing.assert_allclose(
+        wide.seen(np.array([1, 1, 400, 0, 1])), [0, 0, np.log(40) / UNIT, wide.bounds[0][3], 0]
+    )
     assert [fabric.name for fabric in ends(own, wide)] == ["leather", "silk"]
     soft, stiff = ends(own, usual)
     assert stiff.bending == 16 * soft.bending and stiff.lame_lambda == pytest.approx(16 * soft.lame_lambda)
@@ -123,7 +130,10 @@ def test_energies_of_a_mixed_batch_are_those_of_each_fabric_alone(scene, kind):
     x.requires_grad_()
     down, root, shift = (torch.tensor(rng.normal(size=(3, 7))) for _ in range(3))
     energy = GarmentEnergy(mesh, own, scene.classes, dtype=torch.float64)
-    planes = torch.ones(len(energy.cloth.samples.area), 3, 7, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    planes = (
+        torch.ones(len(energy.cloth.samples.area), 3, 7, dtype=torch.float64),
+        torch.zeros(1, dtype=torch.float64),
+    )
 
     def terms(of, factors, rows):
         sampled = of.cloth.positions(x[..., rows])
@@ -187,7 +197,9 @@ def test_a_model_put_on_a_fabric_is_what_it_is_when_it_sees_that_fabric(scene, m
         torch.testing.assert_close(folded, unfolded, atol=1e-5, rtol=1e-4)
         assert (factors == 1).all() or (folded - own).abs().max() > 0.01
         start = Player(one).play(motion)
-        np.testing.assert_allclose(start.vertices(7) - start.vertices(7)[:1], folded[..., 7] - folded[:1, :, 7], atol=1e-4)
+        np.testing.assert_allclose(
+            start.vertices(7) - start.vertices(7)[:1], folded[..., 7] - folded[:1, :, 7], atol=1e-4
+        )
         model.fabric.copy_(seen)  # where descriptors have none, the model's own place counts
         torch.testing.assert_close(frames_of(model, motion, skeleton), unfolded)
         model.fabric.zero_()
@@ -273,7 +285,9 @@ def test_steps_teach_both_networks_fabrics_and_go_on_from_what_they_learned(scen
 
 
 def test_windows_keep_their_fabrics_while_they_go_on(scene, toy_motion, tmp_path):
-    job = fabrics_job(scene, toy_motion(scene, 200), tmp_path / "m.safetensors", train=TrainConfig(batch=200, window=4))
+    job = fabrics_job(
+        scene, toy_motion(scene, 200), tmp_path / "m.safetensors", train=TrainConfig(batch=200, window=4)
+    )
     sampler = build_parts(job, CPU).stepper(job.train, 0).sampler
     same = []
     for _ in range(4):
@@ -307,7 +321,10 @@ def test_what_a_range_cannot_go_on_from_is_refused(scene, model, toy_motion, tmp
     blind = model_file(GarmentModel(scene, CONFIG, np.arange(3)), OWN, {})
     for given, text in (
         ({"base": known, "whole": True, "fabrics": None}, "name the range with --fabrics"),
-        ({"base": replace(known, fabric=replace(OWN, drag=0.1)), "whole": True}, "training goes on with the model's own"),
+        (
+            {"base": replace(known, fabric=replace(OWN, drag=0.1)), "whole": True},
+            "training goes on with the model's own",
+        ),
         ({"base": blind}, "a stepper alone that learns and a range of fabrics"),
         ({"train": TrainConfig(newton_weight=1.0)}, "newton_weight=1 and a range of fabrics"),
     ):
