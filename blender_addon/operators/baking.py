@@ -57,6 +57,7 @@ from ..scene.look import left_behind, lost_looks
 from ..scene.objects import Pair, scene_rate
 from ..scene.riders import gather_riders, moving_riders, riders_of, with_parts
 from ..scene.weights import has_trained_weights
+from ..settings.played import played_options
 from ..settings.training import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator
@@ -253,6 +254,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             file = self.on.worn.file
         scene, self.sees = file.scene, file.config.proximity_points > 0
         self.trained = scene.garment.mesh
+        self.in_fabric = played_options(garment) if file.fabrics else []
         self.prim = split_location(scene.garment.mesh.path)[1]
         if self.on:
             return self.on.joints
@@ -336,7 +338,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
                 "--motion", str(inputs / MOTION), "-o", str(self.shot),
-                *loop, *level, *rate, *collider, *certify, "--json",
+                *loop, *level, *rate, *collider, *certify, *self.in_fabric, "--json",
             ]
         ]  # fmt: skip
 

@@ -342,6 +342,22 @@ WORDS = {
     "Meshes that the garment meets besides its bodies, with Collision physics or without": (
         "Netze, auf die das Kleidungsstück außer seinen Körpern trifft, mit der Physik Kollision oder ohne"
     ),
+    "As Trained": "Wie trainiert",
+    "The fabric of its training": "Der Stoff seines Trainings",
+    "Played Fabric": "Gespielter Stoff",
+    "What the garment is played and baked as": "Als welcher Stoff gespielt und gebacken wird",
+    "Cloth to play; sets all factors": "Stoff, der gespielt wird; setzt alle Faktoren",
+    "How much stiffer the cloth is than in its training": "Wie viel steifer der Stoff ist als in seinem Training",
+    "How much stiffer it is against shear, beside Stretch": "Wie viel steifer er gegen Scherung ist, neben Dehnung",
+    "How much stiffer folds are than in its training": "Wie viel steifer Falten sind als in seinem Training",
+    "How much heavier the cloth is than in its training": "Wie viel schwerer der Stoff ist als in seinem Training",
+    "How much more the air holds it than in its training": "Wie viel mehr die Luft ihn hält als in seinem Training",
+    "Range of Fabrics": "Viele Stoffe",
+    "Train for soft and stiff, light and heavy cloth at once, as all presets are, so that the fabric can be chosen "
+    "while the garment is played": (
+        "Zugleich für weichen und steifen, leichten und schweren Stoff trainieren, wie es alle Vorgaben sind, sodass "
+        "der Stoff beim Abspielen gewählt werden kann"
+    ),
     "Hold Frames": "Bilder halten",
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
