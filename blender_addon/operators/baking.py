@@ -35,6 +35,7 @@ from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.bodies import corrected, reshaped
+from ..playback.fabrics import played_options
 from ..playback.family import BodyModel, on_its_body
 from ..playback.followed import SampledKeys, followed_bodies
 from ..playback.models import (
@@ -57,7 +58,6 @@ from ..scene.look import left_behind, lost_looks
 from ..scene.objects import Pair, scene_rate
 from ..scene.riders import gather_riders, moving_riders, riders_of, with_parts
 from ..scene.weights import has_trained_weights
-from ..settings.played import played_options
 from ..settings.training import RELATIVE
 from . import tasks
 from .reporting import ReportingOperator

@@ -11,13 +11,13 @@ from ssilk_core.scene.fabric_range import FACTORS
 from ..motions.colliders import unmet, unseen
 from ..motions.keys import has_keys
 from ..playback import playing
+from ..playback.fabrics import played_factors
 from ..playback.live import Live
 from ..playback.models import fabrics_of, no_model, sees_colliders
 from ..playback.overrides import overriding
 from ..playback.solving import SOLVED
 from ..preferences import no_certificates
 from ..scene.garment import armature_of
-from ..settings.played import played_factors
 from .base import PlayableGarmentPanel, draw_text, saying_errors
 
 

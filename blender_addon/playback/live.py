@@ -45,7 +45,6 @@ from ..motions.world import signature, world_over
 from ..scene.armature import read_joints
 from ..scene.garment import armature_of
 from ..scene.objects import found_again, scene_rate, scene_step
-from ..settings.played import played_factors
 from .bake import (
     animated,
     apply_deformation,
@@ -56,6 +55,7 @@ from .bake import (
     shifts_from_rest,
     turns_from_rest,
 )
+from .fabrics import played_factors
 from .family import shape_of
 from .laying import Laid
 from .models import TrainedGarment

@@ -20,13 +20,13 @@ import numpy as np
 from ssilk_usd.shots.skinned import SkinnedGarment
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.network.checkpoint import ModelFile, load_model
+from ssilk_core.network.checkpoint import load_model
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.runtime.sight import collider_sight
 from ssilk_core.physics.world.felt import ColliderSight
 from ssilk_core.physics.world.surface import Search
 from ssilk_core.scene.assets import ShotWorld
-from ssilk_core.scene.fabric_range import FabricRange, fabric_with
+from ssilk_core.scene.fabric_range import FabricRange
 from ssilk_core.scene.fabrics import Fabric
 
 from ..arrays.joints import Joints, joint_order
@@ -35,8 +35,8 @@ from ..errors import SetupError
 from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, read_state, stamp
 from ..outside.wording import recall, reworded
 from ..scene.linked import absolute, home, origin
-from ..settings.played import played_factors
 from .bake import need_movable
+from .fabrics import in_fabric, played_factors
 from .family import on_its_body
 from .laying import Laid, lay
 
@@ -289,11 +289,6 @@ def sees_colliders(garment: bpy.types.Object) -> bool:
     return _sees[path][1]
 
 
-def _in_fabric(file: ModelFile, factors: np.ndarray) -> ModelFile:
-    """Return a model in a fabric of its range; as it is where it knows none."""
-    return file.on_fabric(fabric_with(file.fabric, factors)) if file.fabrics else file
-
-
 class TrainedGarment:
     """A model on an armature. One of a family of bodies is put on the body that the character has in this frame.
 
@@ -318,7 +313,7 @@ class TrainedGarment:
         self.on = on_its_body(file, garment, armature, joints, chosen_bones(garment)) if file.bodies else None
         self.file = self.on.worn.file if self.on else file
         self.factors = played_factors(garment)
-        self.player = Player(_in_fabric(self.file, self.factors))
+        self.player = Player(in_fabric(self.file, self.factors))
         scene = self.player.file.scene
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
         self.joints = joints = self.on.joints if self.on else joints_known_to(garment, armature, joints, trained)
@@ -329,7 +324,7 @@ class TrainedGarment:
         """Return this in the fabric that is chosen for the garment now."""
         other = copy(self)
         other.factors = played_factors(garment)
-        other.player = Player(_in_fabric(self.file, other.factors))
+        other.player = Player(in_fabric(self.file, other.factors))
         return other
 
     @property

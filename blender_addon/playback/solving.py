@@ -23,7 +23,7 @@ from ..preferences import interpreter, preferences, unready
 from ..scene.gather import gather
 from ..scene.handover import STAGE, hand_over
 from ..scene.objects import Pair
-from ..settings.played import played_options
+from .fabrics import played_options
 from .models import TrainedGarment
 
 ITERATIONS = ["--latent-iterations", str(QUALITIES["latent"].latent_iterations)]

@@ -11,7 +11,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.scene.fabric_range import FACTORS, factors_of
 from ssilk_core.scene.fabrics import FABRICS
 
-from .fabric import CHOICES, SAME
+from .fabric import CHOICES
 from .training import SHOTS
 
 OWN = "OWN"  # the fabric of the model's training
@@ -77,18 +77,6 @@ class PlayedFabric(bpy.types.PropertyGroup):
     bending: _factor("bending")
     density: _factor("density")
     drag: _factor("drag")
-
-
-def played_factors(garment: bpy.types.Object) -> np.ndarray:
-    """Return the factors that are chosen for a garment, shape (5,), in the order of `FACTORS`."""
-    return np.array([getattr(garment.ssilk.played, name) for name in FACTORS])
-
-
-def played_options(garment: bpy.types.Object) -> list[str]:
-    """Return the options by which `ssilk bake` and `ssilk live` take them."""
-    chosen = zip(FACTORS, played_factors(garment).tolist())
-    factors = [f"{name}={factor:.7g}x" for name, factor in chosen if abs(factor - 1) > SAME]
-    return [word for factor in factors for word in ("--material", factor)]
 
 
 CLASSES = (PlayedFabric,)

@@ -100,10 +100,7 @@ def deformation_gradient_operator(mesh: Mesh, device: torch.device, dtype: torch
     )
 
 
-Modulus = float | Tensor
-
-
-def stvk_density(gradient: Tensor, mu: Modulus, lame_lambda: Modulus) -> Tensor:
+def stvk_density(gradient: Tensor, mu: float | Tensor, lame_lambda: float | Tensor) -> Tensor:
     """Energy per rest area [J/m2], mu |G|^2 + lambda/2 tr(G)^2 with G = (F^T F - I)/2.
 
     Args:
@@ -120,7 +117,7 @@ def stvk_density(gradient: Tensor, mu: Modulus, lame_lambda: Modulus) -> Tensor:
     return mu * (g_uu**2 + g_vv**2 + 2 * g_uv**2) + 0.5 * lame_lambda * (g_uu + g_vv) ** 2
 
 
-def baraff_witkin_density(gradient: Tensor, stretch: Modulus, shear: Modulus) -> Tensor:
+def baraff_witkin_density(gradient: Tensor, stretch: float | Tensor, shear: float | Tensor) -> Tensor:
     """Energy per rest area [J/m2], k_s ((|w_u|-1)^2 + (|w_v|-1)^2) + k_sh (w_u . w_v)^2; arguments as above."""
     w_u, w_v = gradient.chunk(2)
     # The length has no gradient at zero; a floor far below any real length keeps it finite.

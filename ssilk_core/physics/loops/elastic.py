@@ -27,10 +27,9 @@ PART = 64  # elements that are added up before their sum is, so that rounding er
 HALF_PI, PI, TWO_PI = np.float32(np.pi / 2), np.float32(np.pi), np.float32(2 * np.pi)
 
 
-Moduli = tuple[Tensor, Tensor] | None
-
-
-def elastic_loop(x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: Moduli = None) -> tuple[Tensor, Tensor]:
+def elastic_loop(
+    x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Return stretch and bending [J] of positions x (V, 3, N), both (N,).
 
     Args:
@@ -46,7 +45,7 @@ def elastic_gradient_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> T
 
 
 def _run(
-    x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool, moduli: Moduli = None
+    x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool, moduli: tuple[Tensor, Tensor] | None = None
 ) -> tuple[Tensor, Tensor]:
     """Return both energies (2, N) and, where wanted, their gradients (2, V, 3, N)."""
     frames = x.shape[2]
