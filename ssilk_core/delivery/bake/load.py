@@ -29,6 +29,7 @@ from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, nee
 from .request import ALLOWED_FPS, BakeRequest
 from .riders import riders_of
 from .rollout import BakeRollout
+from .start import need_startable, read_start
 from .world import ShotSurroundings, Sight, asked_world
 
 if TYPE_CHECKING:
@@ -113,6 +114,11 @@ class LoadedGarment:
         read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
         around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
+        start = None
+        if request.start_cloth:
+            need_startable(request)
+            read = replace(read, whole=read.sampled, lead=0)  # nothing is rolled out before it
+            start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
@@ -138,6 +144,7 @@ class LoadedGarment:
             provenance=provenance,
             record=self.record,
             played=self.played,
+            start_cloth=start,
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,

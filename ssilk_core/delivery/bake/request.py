@@ -16,6 +16,7 @@ from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
 from .world import parse_world
 
+AT = "@"  # before the time code of a frame
 OF_WORDS = ("colliders", "material")  # fields that metadata stores as one text
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
@@ -65,6 +66,8 @@ class BakeRequest:
         fabric, material: that the garment is of, where its model was trained for a range of fabrics: a preset, and
             properties as text (`delivery.bake.fabrics`); the model's own by default.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
+        start_cloth: shot or cache with the cloth that the first frame begins with, "FILE[:/PRIM][@CODE]", at its last
+            frame or at a time code (`delivery.bake.start`); None to begin at rest.
         loop: whether the motion is a cycle whose last frame is to flow into its first; False for what the stage says.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
@@ -102,6 +105,7 @@ class BakeRequest:
     fabric: str | None = None
     material: tuple[str, ...] = ()
     hold: int = 0
+    start_cloth: str | None = None
     loop: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
@@ -190,7 +194,11 @@ class BakeRequest:
     def relocated(self, locate: Callable[[str], str]) -> BakeRequest:
         """Return the request with its input files elsewhere: `locate` gives the new path of each."""
         model, stage, motion = (locate(getattr(self, name)) for name in INPUTS)
-        return replace(self, model=model, stage=stage, motion=motion)
+        start = self.start_cloth
+        if start is not None:
+            place, code = split_start(start)
+            start = locate(place) + ("" if code is None else f"{AT}{code:.9g}")
+        return replace(self, model=model, stage=stage, motion=motion, start_cloth=start)
 
     def to_metadata(self) -> dict[str, object]:
         """Return what differs from the defaults, as a shot stores it."""
@@ -213,6 +221,17 @@ class BakeRequest:
             if isinstance(document, Mapping) and isinstance(document.get(name), str):
                 document = {**document, name: tuple(document[name].split())}
         return from_plain(cls, document)
+
+
+def split_start(text: str) -> tuple[str, float | None]:
+    """Return the file, with the prim that it names, and the time code of "FILE[:/PRIM][@CODE]"; None for the last."""
+    place, at, code = text.rpartition(AT)
+    if at and place:
+        try:
+            return place, float(code)
+        except ValueError:
+            pass  # a file of this name
+    return text, None
 
 
 def parse_range(text: str) -> tuple[float, float]:

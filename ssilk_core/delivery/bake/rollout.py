@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...errors import fail
 from ...events import Countdown, Event, Message, Reporter, silent
 from ...quality.levels import SizeReduction
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
@@ -20,6 +21,8 @@ from ...scene.kinematics import (
     deform,
     held_at_cuts,
     lbs_poses,
+    motion_transforms,
+    resample,
     sample_felt,
     sample_motion,
     slerp,
@@ -32,6 +35,7 @@ from .inputs import InputHashes
 from .looped import MOST_ROUNDS, Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
 from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
+from .start import FAR, StartCloth
 from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
@@ -42,6 +46,7 @@ if TYPE_CHECKING:
 
     from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
+    from ...network.start import GivenStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +126,7 @@ class BakeRollout:
         riders: what rides on the garment; `told` is what was found about them, to be reported.
         direction: where the garment is held; None where it moves freely throughout.
         loop: how the shot repeats; None where it need not.
+        start_cloth: that the first frame begins with; None to begin at rest.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
         held_off: RMS distance from linear blend skinning of frames that are held [m], likewise.
@@ -153,6 +159,7 @@ class BakeRollout:
     direction: Direction | None = None
     loop: Loop | None = None
     played: GarmentRecord | None = None
+    start_cloth: StartCloth | None = None
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
 
@@ -270,10 +277,52 @@ class BakeRollout:
                 lost.append(FrameSpan(max(begin - start, 0), end - start))
 
         driver, rate = self._driver(first, stop, step), self.motion.fps / step
-        for pose in garment_poses(self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller):
+        given = self._given if first == 0 and self.start_cloth else None
+        for pose in garment_poses(
+            self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller, given=given
+        ):
             part = pose.part(slice(0, max(count - pose.start, 0)))
             if part.frame_count:
                 yield part
+
+    @cached_property
+    def _given(self) -> GivenStart:
+        """The state that the first frame begins with."""
+        from ...network.start import fitted_start
+
+        assert self.model is not None and self.start_cloth is not None
+        fps, at = self.model.config.fps, self._source_frame(-self.lead)
+        first = resample(self._driver(0, self._end, 1), fps, cover=True).clip(0, 1)
+        earlier, points = at - self.source.fps / fps, self.start_cloth.points
+        if earlier < 0 or not self.start_cloth.moves:  # then it stands still: cloth and character go on together
+            return fitted_start(self.model, first, first, points[[1, 1]])
+        position = np.array([earlier])
+        poses, felt = sample_motion(self.source, position), sample_felt(self.source, position)
+        return fitted_start(self.model, Motion(self.source.path, fps, *poses, **felt), first, points)
+
+    def _tell_start(self, report: Reporter) -> None:
+        """Report how near the first frame is to the cloth that it begins with."""
+        if self.start_cloth is None:
+            return
+        free, scene = self.direction, self.deformer.scene
+        if free is not None and (free.hold > 1 or free.free[0] < 1):
+            found = "poses that are held" if free.hold > 1 else "ssilk:free below 1 in the first frame"
+            fail("--start-cloth", f"a start and {found}", "one of both", "leave --start-cloth out, or let it go")
+        root = motion_transforms(self.motion.clip(0, 1), scene.character.skeleton.parents)[0, :, :3, 3]
+        away = np.linalg.norm(self.start_cloth.points[1][:, None] - root[None], axis=2).min()
+        reach = scene.garment.mesh.diagonal
+        if away > reach:
+            found = f"its cloth is {away:.3g} m away from the character's first pose"
+            fail(
+                self.start_cloth.where, found, f"{reach:.3g} m are allowed", "name the frame before this shot's first"
+            )
+        rms, most = (1000 * value for value in self._given.left)
+        slow = "" if self.start_cloth.moves else "; nothing is known of how it moves there"
+        text = (
+            f"the cloth begins as in {self.start_cloth.where}, within {rms:.2g} mm (RMS), {most:.2g} mm at most{slow}"
+        )
+        far = self._given.left[0] > FAR
+        report(Message(f"{self.request.motion}: {text}", "warning" if far else "info"))
 
     def latent_roller(self, advanced: Callable[[], object] = lambda: None) -> LatentRoller:
         """Return what solves for the network's states in latents; `advanced` is called after each frame."""
@@ -371,6 +420,7 @@ class BakeRollout:
             report(Message(f"--target {self.request.target}: {self.names}", "warning"))
         for event in self.told:
             report(event)
+        self._tell_start(report)
         if self.frames is None:
             return
         name = self.request.motion
