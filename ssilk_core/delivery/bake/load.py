@@ -155,7 +155,7 @@ class LoadedGarment:
             told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
             direction=None if request.lbs else self._directed(request, read),
             loop=loop,
-        )
+        ).begun()
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
         from ssilk_usd.reading.body_shapes import with_body_shapes
@@ -372,7 +372,7 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     """Return a rollout of another model of the same garment."""
     assert rollout.model is not None
     model, deformer = _network_like(rollout.model, file, rollout.request)
-    return replace(rollout, model=model, deformer=deformer)
+    return replace(rollout, model=model, deformer=deformer, is_fading=False).begun()
 
 
 def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> tuple[GarmentModel, Deformer]:

@@ -139,8 +139,8 @@ def read_origin(
                 "it is looked for as seen from the shot",
             )
         start = f"{there}" if code is None else f"{there}{AT}{code:.9g}"
-    there_now = {name: found[name] for name in ("model", "stage", "motion")}
-    return ShotOrigin(replace(stored, **there_now, start_cloth=start), hashes)
+    moved = replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"], start_cloth=start)
+    return ShotOrigin(moved, hashes)
 
 
 def _existing(shot: Path, near: str, held: object) -> Path | None:

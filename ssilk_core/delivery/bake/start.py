@@ -13,6 +13,8 @@ from .request import BakeRequest, split_start
 
 SLACK = 1e-6  # of a time code
 FAR = 0.01  # [m] RMS, from which on latents do not reach the cloth: it is warned of
+SEEN = 1e-4  # [m] that latents may miss at most without a blendshape that makes up for it
+BLEND = 0.5  # [s] after which that weighs nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,12 @@ def read_start(text: str, garment: Garment, fps: float) -> StartCloth:
     if not np.isfinite(points).all():
         fail(place, "points that are not finite", "all must be finite", "write it again")
     return StartCloth(points, moves, f"{place} at {code:.9g}")
+
+
+def fading(frames: range, fps: float) -> Floats:
+    """Return the weights (F,) of what latents miss, in frames that are counted from the first, at a rate [1/s]."""
+    done: Floats = np.clip(np.array(frames, np.float64) / (fps * BLEND), 0, 1)
+    return np.asarray(1 - done**2 * (3 - 2 * done), np.float64)
 
 
 def need_startable(request: BakeRequest) -> None:
