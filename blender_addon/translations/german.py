@@ -448,6 +448,12 @@ WORDS = {
     "Shot to write; named like the garment, beside the blend file, when empty": (
         "Shot, der geschrieben wird; leer: wie das Kleidungsstück benannt, neben der Blend-Datei"
     ),
+    "Start From Previous Bake": "Vom vorigen Backen weiter",
+    "Begin with the cloth as the bake before this one shows it in the first frame, in place of cloth at rest; the "
+    "frames before must have been baked": (
+        "Mit dem Stoff beginnen, wie ihn das Backen davor im ersten Bild zeigt, statt mit Stoff in Ruhe; die Bilder "
+        "davor müssen gebacken sein"
+    ),
     "Pre-Roll": "Vorlauf",
     "How long the garment settles in the first pose before the first frame": (
         "Wie lange das Kleidungsstück sich in der ersten Pose setzt, vor dem ersten Bild"

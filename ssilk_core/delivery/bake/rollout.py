@@ -294,11 +294,13 @@ class BakeRollout:
         from ...network.start import fitted_start
 
         assert self.model is not None and self.start_cloth is not None
-        fps, at = self.model.config.fps, self._source_frame(-self.lead)
-        first = resample(self._driver(0, self._end, 1), fps, cover=True).clip(0, 1)
-        earlier, points = at - self.source.fps / fps, self.start_cloth.points
-        if earlier < 0 or not self.start_cloth.moves:  # then it stands still: cloth and character go on together
-            return fitted_start(self.model, first, first, points[[1, 1]])
+        fps, points = self.model.config.fps, self.start_cloth.points
+        whole = resample(self._driver(0, self._end, 1), fps, cover=True)
+        first, earlier = whole.clip(0, 1), self._source_frame(-self.lead) - self.source.fps / fps
+        if not self.start_cloth.moves:  # then it stands still: cloth and character go on together
+            return fitted_start(self.model, first, first, points)
+        if earlier < 0:  # as it goes on
+            return fitted_start(self.model, _step_before(whole), first, points)
         position = np.array([earlier])
         poses, felt = sample_motion(self.source, position), sample_felt(self.source, position)
         return fitted_start(self.model, Motion(self.source.path, fps, *poses, **felt), first, points)
@@ -511,6 +513,13 @@ class BakeRollout:
             report(Message(f"{self.request.motion}: {words}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
+
+
+def _step_before(motion: Motion) -> Motion:
+    """Return the frame before a motion, from which it came as evenly as it goes on."""
+    first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
+    turned = slerp(first.rotations, second.rotations, np.full((1, 1), -1.0))
+    return replace(first, rotations=turned, translations=2 * first.translations - second.translations)
 
 
 def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:
