@@ -30,6 +30,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ..scene.assets import Scene
     from ..scene.family import DressedFamily
+    from ..training.job import TrainJob
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -137,7 +138,6 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report = report if group.is_first else silent
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
-    of = " or ".join([*(["body"] if job.family or not job.fabrics else []), *(["fabric"] if job.fabrics else [])])
     share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
     missed, worst = trained.score.step_errors, worst_body(trained.score)
     worse = is_worse(trained.score, trained.lbs)
@@ -160,7 +160,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
                 **({f"{body.name} [J]": round(body.total, 5) for body in trained.score.bodies}),
-                **({f"worst {of}": f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
+                **({_worst_of(job): f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
                 **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
@@ -174,6 +174,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if lacking and job.is_trainable and group.size == 1:  # several processes take no minutes
         report(lacking)
     return EXIT_OK if trained.moves and not worse else EXIT_WORSE
+
+
+def _worst_of(job: TrainJob) -> str:
+    """Return what the worst of several is one of, in words."""
+    return " or ".join([*(["worst body"] if job.family else []), *(["worst fabric"] if job.fabrics else [])])
 
 
 def _compared(total: float, lbs: float) -> str:
