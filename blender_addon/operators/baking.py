@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,7 @@ from ..motions.freedom import freedom, is_held
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.shapes import tell_changing_shapes
+from ..motions.simulated import sample_vertices
 from ..motions.sources import TIMELINE, Source
 from ..motions.world import world_over
 from ..outside.wording import recall, reworded, with_bones
@@ -35,6 +37,7 @@ from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.bodies import corrected, reshaped
+from ..playback.fabrics import played_options
 from ..playback.family import BodyModel, on_its_body
 from ..playback.followed import SampledKeys, followed_bodies
 from ..playback.models import (
@@ -75,6 +78,7 @@ QUALITY_ITEMS = [
 ]
 INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's inputs beside the model; files
 SHAPED = "shaped.usdc"  # the character with shape keys that change
+START = "start.usdc"  # the cloth that a bake goes on from
 RIDDEN = "ridden.usdc"  # the character with what rides on the garment
 
 
@@ -162,6 +166,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         unit="TIME_ABSOLUTE",
     )
 
+    go_on: BoolProperty(
+        name="Start From Previous Bake",
+        description="Begin with the cloth as the bake before this one shows it in the first frame, in place of cloth "
+        "at rest; the frames before must have been baked",
+    )
+
     @classmethod
     def refusal(cls, context: bpy.types.Context) -> str:
         return tasks.busy() or unplayable_here(context) or unready(context) or no_model(context.object)
@@ -173,9 +183,9 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
     def draw(self, _: bpy.types.Context) -> None:
         """Draw the options; a file is asked for only where one is written."""
         self.layout.use_property_split, self.layout.use_property_decorate = True, False
-        for name in ("to_timeline", "to_usd", "filepath", "quality", "pre_roll"):
+        for name in ("to_timeline", "to_usd", "filepath", "quality", "go_on", "pre_roll"):
             row = self.layout.row()
-            row.enabled = name != "filepath" or self.to_usd
+            row.enabled = (name != "filepath" or self.to_usd) and (name != "pre_roll" or not self.go_on)
             row.prop(self, name)
 
     def prepare(self, context: bpy.types.Context) -> Work:
@@ -191,6 +201,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if solves and garment.ssilk.loop:
             raise SetupError("A solver does not come back to its start: switch Loop off, or choose another quality.")
         joints = self.known_joints(garment, armature)
+        self.need_start(garment)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))
         if self.to_timeline and (solves or is_held(garment)):
@@ -252,7 +263,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             self.on = on_its_body(file, garment, armature, joints, chosen_bones(garment))
             file = self.on.worn.file
         scene, self.sees = file.scene, file.config.proximity_points > 0
-        self.trained = scene.garment.mesh
+        self.trained, self.model_rate = scene.garment.mesh, file.config.fps
+        self.in_fabric = played_options(garment) if file.fabrics else []
         self.prim = split_location(scene.garment.mesh.path)[1]
         if self.on:
             return self.on.joints
@@ -260,6 +272,21 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         joints = joints_known_to(garment, armature, joints, trained)
         joint_order(joints, scene.joint_names, fewer_proxies=True)
         return joints
+
+    def need_start(self, garment: bpy.types.Object) -> None:
+        """Raise `SetupError` where a bake that is to go on from another cannot."""
+        if not self.go_on:
+            return
+        latent = self.quality != WHOLE and QUALITIES[self.quality].latent_iterations
+        for reason, there in (
+            (f"nothing was baked for '{garment.name}'", not has_keys(garment)),
+            ("its model is of a family of bodies", self.on is not None),
+            ("Loop is on", garment.ssilk.loop),
+            ("a solver in latents starts by itself", latent),
+            ("its poses are held (Free, Hold Frames)", is_held(garment)),
+        ):
+            if there:
+                raise SetupError(f"No bake can go on from the previous one: {reason}.")
 
     def rephrase(self, sentence: str) -> str:
         """Return a sentence with names of objects in place of files that were made for the bake."""
@@ -284,6 +311,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         yield from self.keys.sample()
         world = world_over(bpy.context.scene, self.take.frames, motion.fps, met)
         write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
+        if self.go_on:
+            yield from self.write_start()
         garment, _ = self.pair.objects()
         free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
         if hold > 1 or (free < 1).any():
@@ -296,6 +325,16 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             self.reshaped = reshaped(garment, self.character, stage, followed)
         if self.on is None and self.to_usd and stage.exists():
             self.reshaped += corrected(garment, self.character, stage)
+
+    def write_start(self) -> Iterator[float]:
+        """Write the cloth that the previous bake shows in the first frame, and a step of the model before."""
+        from ssilk_usd.writing.files import write_cache
+
+        first, rate = self.take.frames.start, scene_rate()
+        frames = range(first - max(1, math.ceil(rate / self.model_rate)), first + 1)
+        points: list[np.ndarray] = []
+        yield from sample_vertices(self.pair.objects()[0], frames, points)
+        write_cache(self.inputs / START, self.trained, points, rate, frames.start)
 
     @property
     def meets_colliders(self) -> bool:
@@ -331,12 +370,15 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         level = [] if self.quality == WHOLE else ["--quality", self.quality]
         certify = ["--certify"] if garment.ssilk.certify else []
         loop = ["--loop"] if garment.ssilk.loop else ["--pre-roll", f"{self.pre_roll:g}"]  # rounds are its run-up
+        if self.go_on:
+            self.words[f"{inputs.name}/{START}"] = "the previous bake"
+            loop = ["--start-cloth", str(inputs / START)]
         rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
         return [
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
                 "--motion", str(inputs / MOTION), "-o", str(self.shot),
-                *loop, *level, *rate, *collider, *certify, "--json",
+                *loop, *level, *rate, *collider, *certify, *self.in_fabric, "--json",
             ]
         ]  # fmt: skip
 

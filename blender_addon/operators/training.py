@@ -35,6 +35,7 @@ from ..scene.gather import GatheredScene, gather
 from ..scene.handover import MOTIONS, STAGE, hand_over
 from ..scene.objects import Pair
 from ..settings.fabric import fabric_options
+from ..settings.played import RANGED
 from . import tasks
 from .reporting import ReportingOperator
 
@@ -359,9 +360,10 @@ def train_command(
     budget = ["--set", f"iterations={settings.iterations}"] if settings.iterations else []
     budget += ["--minutes", f"{settings.minutes:g}"] if settings.minutes else []
     beneath_it = [word for model in over for word in ("--over", model)]
+    fabrics = ["--fabrics", "4", *RANGED] if settings.fabrics else []
     return [
         "-m", "ssilk_core", "train", STAGE, "--garment", prim, "--motions", *motions, "-o", jobs.MODEL,
-        *beneath_it, "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), "--json",
+        *beneath_it, "--preset", settings.preset, *budget, *fabric_options(garment.ssilk.fabric), *fabrics, "--json",
     ]  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from .classes import ClassesPanel
 from .garment import FabricPanel, GarmentPanel
-from .playback import BakingPanel, PlaybackPanel
+from .playback import BakingPanel, PlaybackPanel, PlayedFabricPanel
 from .preflight import FindingList, PreflightPanel
 from .quality import QualityPanel
 from .rig import RigPanel
@@ -26,5 +26,6 @@ CLASSES = (
     EnergiesPanel,
     BakingPanel,
     PlaybackPanel,
+    PlayedFabricPanel,
     QualityPanel,
 )  # in the order of the sidebar

@@ -6,12 +6,14 @@ from __future__ import annotations
 import bpy
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene.fabric_range import FACTORS
 
 from ..motions.colliders import unmet, unseen
 from ..motions.keys import has_keys
 from ..playback import playing
+from ..playback.fabrics import played_factors
 from ..playback.live import Live
-from ..playback.models import no_model, sees_colliders
+from ..playback.models import fabrics_of, no_model, sees_colliders
 from ..playback.overrides import overriding
 from ..playback.solving import SOLVED
 from ..preferences import no_certificates
@@ -44,7 +46,8 @@ def live_line(garment: bpy.types.Object) -> str:
     if played is None:
         return playing.reason(garment)
     if played.done is not None:
-        return f"{'Taking up a better model' if played.model_only else 'Reading the motion'}: {played.done:.0%}"
+        what = "Taking up a better model" if played.model_only else "Reading the motion"
+        return f"{'Changing the fabric' if played.fabric_only else what}: {played.done:.0%}"
     if played.behind:
         return "The frames, Free, Hold Frames, a body or what surrounds it changed since the motion was read"
     if played.unkeyed:
@@ -93,6 +96,38 @@ class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
             draw_text(layout, unsolved, icon="INFO")
         if line:
             draw_text(layout, line)
+
+
+def fabric_line(garment: bpy.types.Object) -> str:
+    """Return what a garment's model does not know of the fabric that is chosen; empty where it knows it."""
+    factors = played_factors(garment)
+    known = fabrics_of(garment)
+    if known is None:
+        return "The model knows one fabric: train it with Range of Fabrics"
+    beyond = known[1].beyond(factors)
+    return f"The network sees the nearest fabric of its training: {beyond} is beyond" if beyond else ""
+
+
+class PlayedFabricPanel(PlayableGarmentPanel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_played_fabric"
+    bl_label = "Fabric"
+    section = "7-look"
+    bl_parent_id = "SSILK_PT_playback"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @saying_errors
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, garment = self.layout, context.object
+        layout.use_property_split, layout.use_property_decorate = True, False  # a shot is of one fabric
+        if line := no_model(garment):
+            draw_text(layout, line)
+            return
+        column = layout.column()
+        column.active = fabrics_of(garment) is not None
+        for name in ("preset", *FACTORS):
+            column.prop(garment.ssilk.played, name)
+        if line := fabric_line(garment):
+            draw_text(layout, line, icon="INFO")
 
 
 def model_line(garment: bpy.types.Object) -> str:

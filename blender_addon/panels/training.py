@@ -125,6 +125,7 @@ class TrainingPanel(UsableGarmentPanel, bpy.types.Panel):
         column = layout.column(align=True)
         column.prop(settings, "iterations")
         column.prop(settings, "minutes")
+        layout.prop(settings, "fabrics")
         layout.operator("ssilk.train", icon="PLAY")
         if training and training.state:
             draw_training(layout, training, moves=has_proxies(garment))

@@ -55,6 +55,7 @@ from .bake import (
     shifts_from_rest,
     turns_from_rest,
 )
+from .fabrics import played_factors
 from .family import shape_of
 from .laying import Laid
 from .models import TrainedGarment
@@ -79,7 +80,8 @@ class Live:
         hold: frames that each pose is held.
         world: gravity, wind and colliders that were read; None for the usual gravity and nothing else.
         colliders: that were read; None where the model sees none.
-        model_only: whether a newer model is read, for the motion that was read before.
+        model_only, fabric_only: whether a newer model, or the model in another fabric, is rolled out for the motion
+            that was read before.
         level: of quality, as `GarmentSettings.live_quality` names it.
         solving: what solves for frames; None where the network alone is played.
         unsolved: why nothing does though the level asks for it; empty otherwise.
@@ -104,10 +106,10 @@ class Live:
         self._near: np.ndarray | None = None  # how near colliders are, (F, M, 5); None where there are none
         self._frames = range(0)
         self.done: float | None = None
-        self.stale = self.model_only = False
+        self.stale = self.model_only = self.fabric_only = False
         self.unkeyed = self.unsolved = ""
         self.solving: Solving | None = None
-        self._solved_with = 0.0  # when the model was written that the solver has
+        self._solved_with: tuple[float, ...] = ()  # when the model was written that the solver has, and its fabric
         self._keyed = 0  # solved frames that keys show
         self._noticed: float | None = None  # when a pose differed that the solver does not know yet
         self.refresh()
@@ -117,14 +119,27 @@ class Live:
         _, armature = self.objects()
         (take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
         self._steps, self.times = self._reading(take), self._asked()
-        self.done, self.stale, self.model_only = 0.0, False, False
+        self.done, self.stale, self.model_only, self.fabric_only = 0.0, False, False, False
 
     def take_up(self) -> None:
         """Read the model again, for the motion that was read; the old one is played until the new one can be."""
         if self.playback is None or self.stale:
             self.refresh()
         else:
-            self._steps, self.done, self.model_only = self._taking_up(), 0.0, True
+            self._steps, self.done, self.model_only, self.fabric_only = self._taking_up(), 0.0, True, False
+
+    def change_fabric(self) -> None:
+        """Roll out what was read in the fabric that is chosen; the old one is played until that is done."""
+        if self.playback is None or self.stale:
+            self.refresh()
+        else:
+            self._steps, self.done, self.model_only, self.fabric_only = self._changing(), 0.0, False, True
+
+    @property
+    def in_other_fabric(self) -> bool:
+        """Whether another fabric is chosen by now than is played."""
+        garment, _ = self.objects()
+        return self.trained is not None and bool((self.trained.factors != played_factors(garment)).any())
 
     @property
     def renewed(self) -> bool:
@@ -227,6 +242,8 @@ class Live:
             SetupError: the model cannot be read, or is of another garment or other bones.
         """
         self.done = next(self._steps, None)
+        if self.done is None and self.in_other_fabric:  # a slider is turned meanwhile
+            self.change_fabric()
         return self.done is not None
 
     def objects(self) -> tuple[bpy.types.Object, bpy.types.Object]:
@@ -331,10 +348,11 @@ class Live:
 
     def _prepare_solver(self) -> None:
         """Prepare what solves for frames with the model that was read last, where the level asks for it."""
-        if self.solving and self._solved_with == self._written:
+        asked = self._written, *self.trained.factors.tolist()
+        if self.solving and self._solved_with == asked:
             return
         self.close()
-        self.unsolved, self._solved_with = "", self._written
+        self.unsolved, self._solved_with = "", asked
         if self.level not in SOLVED:
             return
         try:
@@ -372,7 +390,9 @@ class Live:
         """Read the motion, then roll over it, so that scrubbing waits for nothing; yield the part that is done."""
         if self.trained is None or self.renewed or self._has_another_body():
             yield from self._dressing()
-        _, armature = self.objects()
+        garment, armature = self.objects()
+        if self.in_other_fabric:
+            self.trained = self.trained.in_fabric(garment)
         yield from (READING * done for done in sample(armature, self.joints.character, [take]))
         garment, armature = self.objects()
         need_company(garment, armature, take)
@@ -469,15 +489,41 @@ class Live:
         if not self.ready():  # the artist edits it; the model is still a new one afterwards
             return
         self.joints = self._joints_now()
-        moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
-        if len(moved):
-            near = self._near_again(trained, near, moved, sight)
-            playback = playback.with_motion(self._motion(trained, self.placed, near), int(moved[0]))
+        near, playback = self._moved_since(trained, placed, near, sight, playback)
         laid = trained.lay(garment, armature, self.joints, skinned)
         self.shapes = apply_deformation(garment, armature, self.joints, skinned, trained.order, laid)
         self._laid, self._shape = laid, shape_of(garment, armature) if trained.on else None
-        self.trained, self.playback, self._written = trained, playback, written
-        self._near, self._sight = near, sight
+        self._written = written
+        self._play(trained, playback, near, sight, poses)
+
+    def _changing(self) -> Iterator[float]:
+        """Roll the motion out in another fabric, then play that at once; shapes and weights are the same."""
+        garment, _ = self.objects()
+        trained, placed = self.trained.in_fabric(garment), self.placed.copy()
+        yield 0.0
+        sight = self._surround(trained, self._frames)
+        near = yield from self._looking(trained, placed, sight)
+        playback, poses = yield from self._rolling(trained, placed, near, 0.0)
+        near, playback = self._moved_since(trained, placed, near, sight, playback)
+        self._play(trained, playback, near, sight, poses)
+
+    def _moved_since(
+        self, trained: TrainedGarment, placed: np.ndarray, near: np.ndarray | None, sight: ColliderSight | None,
+        playback: Playback,
+    ) -> tuple[np.ndarray | None, Playback]:  # fmt: skip
+        """Return proximity and what plays, where the artist has moved the armature since it was `placed`."""
+        moved = np.flatnonzero((placed != self.placed).any(axis=(1, 2, 3)))
+        if not len(moved):
+            return near, playback
+        near = self._near_again(trained, near, moved, sight)
+        return near, playback.with_motion(self._motion(trained, self.placed, near), int(moved[0]))
+
+    def _play(
+        self, trained: TrainedGarment, playback: Playback, near: np.ndarray | None, sight: ColliderSight | None,
+        poses: list[GarmentPose],
+    ) -> None:  # fmt: skip
+        """Play what was rolled out from now on."""
+        self.trained, self.playback, self._near, self._sight = trained, playback, near, sight
         self._prepare_solver()
         self._follow()
         self._key(poses, self.first)

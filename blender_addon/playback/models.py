@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ from ssilk_core.network.runtime.sight import collider_sight
 from ssilk_core.physics.world.felt import ColliderSight
 from ssilk_core.physics.world.surface import Search
 from ssilk_core.scene.assets import ShotWorld
+from ssilk_core.scene.fabric_range import FabricRange
+from ssilk_core.scene.fabrics import Fabric
 
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, growth, known_as, renames
@@ -33,6 +36,7 @@ from ..outside.jobs import MODEL, JobState, OwnedJob, owned, owner, read_curve, 
 from ..outside.wording import recall, reworded
 from ..scene.linked import absolute, home, origin
 from .bake import need_movable
+from .fabrics import in_fabric, played_factors
 from .family import on_its_body
 from .laying import Laid, lay
 
@@ -170,6 +174,7 @@ class TrainingProgress:
 
 _sewn: dict[Path, tuple[float, Sewing | None]] = {}  # likewise, and how the garment is sewn
 _sees: dict[Path, tuple[float, bool]] = {}  # when a model was written that was read, and whether it sees colliders
+_fabrics: dict[Path, tuple[float, tuple[Fabric, FabricRange] | None]] = {}  # likewise, and what `fabrics_of` returns
 _known: dict[int, tuple[Question, TrainingProgress | None]] = {}
 
 
@@ -258,6 +263,20 @@ def told_renames(joints: Joints) -> str:
     return f" ({count} called otherwise than in the training and matched, as '{name}', which was '{found[name]}')"
 
 
+def fabrics_of(garment: bpy.types.Object) -> tuple[Fabric, FabricRange] | None:
+    """Return the fabric that a garment's model was trained with, and the range of others; None where it knows none.
+
+    Raises:
+        SsilkError: there is no model, or it cannot be read.
+    """
+    path = model_of(garment)
+    written = path.stat().st_mtime
+    if _fabrics.get(path, (0.0, None))[0] != written:
+        file = load_model(path)
+        _fabrics[path] = written, (file.fabric, file.fabrics.range) if file.fabrics else None
+    return _fabrics[path][1]
+
+
 def sees_colliders(garment: bpy.types.Object) -> bool:
     """Return whether a garment's model was trained to see colliders; the file is read where it is another by now.
 
@@ -298,6 +317,8 @@ class TrainedGarment:
     """A model on an armature. One of a family of bodies is put on the body that the character has in this frame.
 
     Attributes:
+        file: the model, on that body.
+        factors: of its training's fabric, as which it plays, shape (5,).
         player: plays it.
         on: the model of a family on that body; None for one of one body.
         joints: of the armature, under the names that the model knows.
@@ -314,12 +335,21 @@ class TrainedGarment:
         except SsilkError as error:
             raise SetupError(reworded(str(error), path.parent, recall(path.parent))) from error
         self.on = on_its_body(file, garment, armature, joints, chosen_bones(garment)) if file.bodies else None
-        self.player = Player(self.on.worn.file if self.on else file)
+        self.file = self.on.worn.file if self.on else file
+        self.factors = played_factors(garment)
+        self.player = Player(in_fabric(self.file, self.factors))
         scene = self.player.file.scene
         trained = TrainedJoints(scene.joint_names, scene.bind_transforms)
         self.joints = joints = self.on.joints if self.on else joints_known_to(garment, armature, joints, trained)
         self.order = joint_order(joints, scene.joint_names)
         self.own = np.argsort(self.order[: joints.character_count])
+
+    def in_fabric(self, garment: bpy.types.Object) -> TrainedGarment:
+        """Return this in the fabric that is chosen for the garment now."""
+        other = copy(self)
+        other.factors = played_factors(garment)
+        other.player = Player(in_fabric(self.file, other.factors))
+        return other
 
     @property
     def sees_colliders(self) -> bool:

@@ -75,6 +75,14 @@ def play_otherwise(garment: bpy.types.Object) -> None:
         _read_soon(0.0)
 
 
+def change_fabric(garment: bpy.types.Object) -> None:
+    """Play a garment in the fabric that was chosen for it, where it is played."""
+    played = live(garment)
+    if played and played.done is None and _attempt(garment.session_uid, lambda: played.in_other_fabric):
+        _attempt(garment.session_uid, played.change_fabric)
+        _read_soon(0.0)
+
+
 def refresh(garment: bpy.types.Object) -> None:
     """Read the motion of a garment before it is played again."""
     _outdated.discard(garment.session_uid)
@@ -299,6 +307,8 @@ def _undone(*_: object) -> None:
             _attempt(uid, played.dress_again)
         elif played.level != found[0].ssilk.live_quality:
             _attempt(uid, played.choose, found[0].ssilk.live_quality)
+        elif played.in_other_fabric:
+            _attempt(uid, played.change_fabric)
         elif played.solved:
             _attempt(uid, played.key_again)
     _read_soon(PATIENCE)

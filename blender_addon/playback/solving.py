@@ -23,6 +23,7 @@ from ..preferences import interpreter, preferences, unready
 from ..scene.gather import gather
 from ..scene.handover import STAGE, hand_over
 from ..scene.objects import Pair
+from .fabrics import played_options
 from .models import TrainedGarment
 
 ITERATIONS = ["--latent-iterations", str(QUALITIES["latent"].latent_iterations)]
@@ -75,7 +76,7 @@ class Solving:
             stage, self._words = given.stage, given.words
         self._command = [
             interpreter(preferences(bpy.context)), "-m", "ssilk_core", "live", str(model), "--stage", str(stage),
-            "--pre-roll", f"{pre_roll:g}", *SOLVED[level],
+            "--pre-roll", f"{pre_roll:g}", *SOLVED[level], *(played_options(garment) if trained.file.fabrics else []),
         ]  # fmt: skip
         self._talk: Conversation | None = None
         self._asked: Motion | None = None

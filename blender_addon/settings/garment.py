@@ -18,8 +18,9 @@ from ssilk_core.scene.assets import SOFTEST, STIFFEST
 from ssilk_core.scene.kinematics import MAX_HOLD
 
 from ..scene.classes import tighten
-from . import fabric, training
+from . import fabric, played, training
 from .fabric import FabricSettings
+from .played import PlayedFabric
 from .training import RELATIVE, SHOTS, TrainingSettings
 
 LIVE_QUALITIES = [
@@ -85,6 +86,9 @@ class GarmentSettings(bpy.types.PropertyGroup):
         default=0, min=0, options={"HIDDEN"}, override=SHOTS,
     )  # fmt: skip
     fabric: PointerProperty(type=FabricSettings, name="Fabric", description="What the garment is made of")
+    played: PointerProperty(
+        type=PlayedFabric, name="Played Fabric", description="What the garment is played and baked as", override=SHOTS
+    )
     tightness: FloatProperty(
         name="Tightness",
         description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, "
@@ -172,7 +176,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (*training.CLASSES, *fabric.CLASSES, BoneMatch, GarmentSettings)
+CLASSES = (*training.CLASSES, *fabric.CLASSES, *played.CLASSES, BoneMatch, GarmentSettings)
 
 
 def attach() -> None:

@@ -68,6 +68,11 @@ class TrainingSettings(bpy.types.PropertyGroup):
         soft_max=600.0,
         precision=1,
     )
+    fabrics: BoolProperty(
+        name="Range of Fabrics",
+        description="Train for soft and stiff, light and heavy cloth at once, as all presets are, so that the fabric "
+        "can be chosen while the garment is played",
+    )
     folder: StringProperty(
         name="Folder",
         subtype="DIR_PATH",

@@ -342,6 +342,22 @@ WORDS = {
     "Meshes that the garment meets besides its bodies, with Collision physics or without": (
         "Netze, auf die das Kleidungsstück außer seinen Körpern trifft, mit der Physik Kollision oder ohne"
     ),
+    "As Trained": "Wie trainiert",
+    "The fabric of its training": "Der Stoff seines Trainings",
+    "Played Fabric": "Gespielter Stoff",
+    "What the garment is played and baked as": "Als welcher Stoff gespielt und gebacken wird",
+    "Cloth to play; sets all factors": "Stoff, der gespielt wird; setzt alle Faktoren",
+    "How much stiffer the cloth is than in its training": "Wie viel steifer der Stoff ist als in seinem Training",
+    "How much stiffer it is against shear, beside Stretch": "Wie viel steifer er gegen Scherung ist, neben Dehnung",
+    "How much stiffer folds are than in its training": "Wie viel steifer Falten sind als in seinem Training",
+    "How much heavier the cloth is than in its training": "Wie viel schwerer der Stoff ist als in seinem Training",
+    "How much more the air holds it than in its training": "Wie viel mehr die Luft ihn hält als in seinem Training",
+    "Range of Fabrics": "Viele Stoffe",
+    "Train for soft and stiff, light and heavy cloth at once, as all presets are, so that the fabric can be chosen "
+    "while the garment is played": (
+        "Zugleich für weichen und steifen, leichten und schweren Stoff trainieren, wie es alle Vorgaben sind, sodass "
+        "der Stoff beim Abspielen gewählt werden kann"
+    ),
     "Hold Frames": "Bilder halten",
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"
@@ -431,6 +447,12 @@ WORDS = {
     "USD File": "USD-Datei",
     "Shot to write; named like the garment, beside the blend file, when empty": (
         "Shot, der geschrieben wird; leer: wie das Kleidungsstück benannt, neben der Blend-Datei"
+    ),
+    "Start From Previous Bake": "Vom vorigen Backen weiter",
+    "Begin with the cloth as the bake before this one shows it in the first frame, in place of cloth at rest; the "
+    "frames before must have been baked": (
+        "Mit dem Stoff beginnen, wie ihn das Backen davor im ersten Bild zeigt, statt mit Stoff in Ruhe; die Bilder "
+        "davor müssen gebacken sein"
     ),
     "Pre-Roll": "Vorlauf",
     "How long the garment settles in the first pose before the first frame": (

@@ -56,6 +56,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
     verb.add_argument("--reference", type=Path, metavar="FOLDER",
                       help="shots of 'ssilk simulate --points' to compare with")  # fmt: skip
+    shared.add_known_fabric(verb)
     verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without probes")
     verb.add_argument("--solver", action="store_true",
                       help="simulate from the garment's own states, and single steps (long on a CPU)")  # fmt: skip
@@ -130,17 +131,18 @@ def open_model(
     """
     from ssilk_usd.opening.stage import open_stage
 
-    from ..delivery.bake import worn
+    from ..delivery.bake import in_fabric, worn
     from ..network.checkpoint import load_model, network
     from ..quality.evaluation.bodies import base_of
     from ..quality.evaluation.methods import Network
 
     whole = load_model(path)
     on = worn(whole, open_stage(stage), options.root)
-    for event in on.told:
+    file, told = in_fabric(on.file, str(path), options.fabric, options.material)
+    for event in (*on.told, *told):
         report(event)
-    build = partial(Network, network(on.file).to(device))
-    return OpenedModel(path, on.file, "ssilk", build, base_of(whole, on.body))
+    build = partial(Network, network(file).to(device))
+    return OpenedModel(path, file, "ssilk", build, base_of(whole, on.body))
 
 
 def evaluated(
@@ -324,6 +326,8 @@ def _results(
         for name in garments
     }
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}
+    if options.fabric or options.material:
+        settings |= {"fabric": options.fabric, "material": options.material}
     return EvaluationResults(
         options.output,
         {

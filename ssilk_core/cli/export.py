@@ -38,10 +38,12 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="USD file with the body to export it for (default: the first of its family)",
     )
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    shared.add_known_fabric(verb)
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Write the network; report its inputs and outputs."""
+    from ..delivery.bake import in_fabric
     from ..network.checkpoint import load_model, network
     from ..network.model.export import FrameNetwork, export_onnx
     from ..network.parameters import descriptor_sizes
@@ -59,7 +61,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     elif file.bodies:
         text = "a model of a family of bodies: it is exported for the first of them; --stage names another one"
         report(Message(f"{options.model}: {text}"))
-    file = file.on_base()
+    file, told = in_fabric(file.on_base(), str(options.model), options.fabric, options.material)
+    for event in told:
+        report(event)
+    if file.fabrics:
+        text = "a model of a range of fabrics: it is exported for that of its training; --fabric names another one"
+        report(Message(f"{options.model}: {text}"))
     model = network(file)
     export_onnx(model, output)
     static, rates = descriptor_sizes(file.scene, file.joints, file.config)

@@ -17,7 +17,7 @@ from ..delivery.bake.request import ALL_ELEMENTS, LATENT_ELEMENTS, MAX_PRE_ROLL,
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
 from ..quality.levels import QUALITIES
-from .options import NumberRange
+from .options import NumberRange, add_known_fabric
 
 OVER_PIPE = "-"  # in place of the motion's file
 
@@ -35,6 +35,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--latent-elements", choices=LATENT_ELEMENTS, default=ALL_ELEMENTS,
                       help="sum the energy over the whole garment (default), or over few of its elements, which are "
                            "chosen for the first motion")  # fmt: skip
+    add_known_fabric(verb)
     verb.add_argument("--device", default="cpu", help="where it is solved (default cpu)")
 
 
@@ -52,7 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         request = BakeRequest(
             model=options.model, stage=options.stage, motion=OVER_PIPE, root=options.root, pre_roll=options.pre_roll,
             latent_iterations=options.latent_iterations, latent_elements=options.latent_elements,
-            device=options.device,
+            device=options.device, fabric=options.fabric, material=tuple(options.material),
         )  # fmt: skip
         serve(load_garment(request), incoming, outgoing)
     return EXIT_OK

@@ -30,6 +30,7 @@ from ..files import need_not_input, need_writable, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
+from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 
@@ -77,6 +78,24 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help=f"change a property of the fabric (repeatable): {', '.join(setting_names(Fabric))}",
+    )
+
+
+def add_known_fabric(verb: argparse.ArgumentParser) -> None:
+    """Add the options of the fabric that a trained garment is of."""
+    verb.add_argument(
+        "--fabric",
+        choices=FABRICS,
+        help="preset that the garment is of, where its model was trained with --fabrics (default: the fabric of its "
+        "training)",
+    )
+    verb.add_argument(
+        "--material",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="change a property of that fabric (repeatable): density=0.3 in its unit, or bending=2x for twice that "
+        f"of the training's fabric; factors are {', '.join(FACTORS)}",
     )
 
 
@@ -194,12 +213,16 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
+    verb.add_argument("--start-cloth", metavar="FILE[:/PRIM][@CODE]",
+                      help="shot or point cache that this one goes on from: its cloth in the last frame, or at a "
+                           "time code, is what the first frame begins with (default: it is at rest)")  # fmt: skip
     verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
                       help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
                            "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip
     verb.add_argument("--loop", action="store_true",
                       help="the motion is a cycle: play it until the garment repeats, and write one round whose last "
                            "frame flows into its first (default: ssilk:loop of the garment in the shot)")  # fmt: skip
+    add_known_fabric(verb)
     add_world(verb, "with --refine and --quality hero; the network alone feels wind and gravity, and sees colliders "
                     "where it was trained with some")  # fmt: skip
     _add_names(verb)
@@ -339,10 +362,13 @@ def requests_of(options: argparse.Namespace) -> list[BakeRequest]:
             hide_covered=options.hide_covered,
             hold=options.hold or 0,
             loop=options.loop,
+            start_cloth=options.start_cloth,
             colliders=tuple(options.collider),
             wind=options.wind,
             gusts=options.gusts,
             gravity=options.gravity,
+            fabric=options.fabric,
+            material=tuple(options.material),
             device=options.device,
             garment=garment,
             shot=name,

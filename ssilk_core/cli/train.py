@@ -22,6 +22,7 @@ from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, TextReporter, silent
 from ..network.settings import ModelConfig, apply_overrides, setting_names
+from ..scene.fabric_range import FACTORS, FabricRange
 from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
@@ -30,6 +31,7 @@ from . import options as shared
 if TYPE_CHECKING:
     from ..scene.assets import Scene
     from ..scene.family import DressedFamily
+    from ..training.job import TrainJob
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -98,6 +100,11 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
              "where it lies there (default: one garment for all, tight on a heavy body and loose on a slight one)",
     )  # fmt: skip
     shared.add_fabric(verb)
+    verb.add_argument(
+        "--fabrics", nargs="*", metavar="PRESET|FACTOR",
+        help="train for a range of fabrics, in any of which the model then bakes: from 1/FACTOR to FACTOR times each "
+             f"of {', '.join(FACTORS)} of the own fabric, and all that presets have (default: 4)",
+    )  # fmt: skip
     verb.add_argument("--device", default="auto", help="auto, cpu, cuda, cuda:1, ... (default auto)")
     verb.add_argument("--resume", action="store_true", help="continue from the state beside the model")
     verb.add_argument(
@@ -159,7 +166,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
                 **(shown.summary() if shown else {}),
                 **(missed.summary() if missed else {}),
                 **({f"{body.name} [J]": round(body.total, 5) for body in trained.score.bodies}),
-                **({"worst body": f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
+                **({_worst_of(job): f"{worst.name}, {_compared(worst.total, worst.lbs)}"} if worst else {}),
                 **{name: value for part in trained.score.layers for name, value in part.summary().items()},
                 **{f"{k} [J]": round(v, 5) for k, v in trained.score.terms.items()},
             },
@@ -173,6 +180,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if lacking and job.is_trainable and group.size == 1:  # several processes take no minutes
         report(lacking)
     return EXIT_OK if trained.moves and not worse else EXIT_WORSE
+
+
+def _worst_of(job: TrainJob) -> str:
+    """Return what the worst of several is one of, in words."""
+    return " or ".join([*(["worst body"] if job.family else []), *(["worst fabric"] if job.fabrics else [])])
 
 
 def _compared(total: float, lbs: float) -> str:
@@ -221,6 +233,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         if not options.graded:
             was, now = now, was
         report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
+    fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
+    if fabrics:
+        report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
@@ -242,6 +257,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         whole=options.start_from is not None,
         over=over,
         family=family,
+        fabrics=fabrics,
     )
 
 

@@ -19,12 +19,12 @@ LIST is a TOML file with a table for each garment, and [defaults] for all; its p
     [tights]
     garment = "tights.usdc"
 
-Other keys are valid, fabric, material, family and graded. Garments named by 'over' are trained first, and worn
-beneath; a name that ends in .safetensors is a model file. 'ssilk inspect LIST' tells where garments start inside each
-other. FOLDER gets NAME.safetensors and NAME.log for each garment, and a copy of LIST, which 'ssilk bake' takes for
-all of them. The same command, given again, skips what is finished and resumes what was interrupted; a garment whose
-entry or inputs have changed is trained again. Ctrl-C stops all trainings after their current step, a second Ctrl-C
-at once. A garment that fails does not stop the others.
+Other keys are valid, fabric, material, fabrics, family and graded. Garments named by 'over' are trained first, and
+worn beneath; a name that ends in .safetensors is a model file. 'ssilk inspect LIST' tells where garments start inside
+each other. FOLDER gets NAME.safetensors and NAME.log for each garment, and a copy of LIST, which 'ssilk bake' takes
+for all of them. The same command, given again, skips what is finished and resumes what was interrupted; a garment
+whose entry or inputs have changed is trained again. Ctrl-C stops all trainings after their current step, a second
+Ctrl-C at once. A garment that fails does not stop the others.
 """
 
 from __future__ import annotations

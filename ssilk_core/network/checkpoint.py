@@ -21,11 +21,15 @@ from .. import __version__
 from ..errors import SsilkError, fail
 from ..files import is_usd, replacing
 from ..scene.assets import Character, Floats, Garment, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
+from ..scene.fabric_range import FabricRange, fabric_with, factors_of
 from ..scene.fabrics import Fabric
 from ..scene.family import BodyFamily
+from . import fabrics as of_fabrics
 from .bodies import SeenBodies, parted
+from .fabrics import SeenFabrics
 from .packing import dequantize, narrowest, quantize
 from .parameters import Shapes, parameter_shapes
+from .schemes import SCHEMES
 from .settings import ModelConfig
 from .tensors import pack_tensors, read_tensors
 
@@ -37,9 +41,13 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
-    "family": (), "body_meshes": (), "graded": False,
+    "family": (), "body_meshes": (), "graded": False, "fabrics": {},
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
+ONE_FABRIC = (  # what is allowed, and what to do, where another fabric is asked of a model that knows none
+    "it was trained for one fabric",
+    "train it on with 'ssilk train --start-from MODEL --fabrics', or leave the fabric out",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +57,12 @@ class ModelFile:
     Attributes:
         scene: garment, rig and skeleton (no body meshes).
         config: sizes of the network.
-        fabric: material that the network was trained with.
+        fabric: material that the network was trained with, or that it was put on (`on_fabric`).
         joints: character joints in the descriptors, shape (J',).
         parameters: the network's tensors by name.
         provenance: seed, schedule, versions, hashes of the inputs and validation results.
         bodies: the family of bodies that it dresses, whose base the scene's is; None for that body alone.
+        fabrics: what it knows of other fabrics than its own, as which it plays; None for that one alone.
     """
 
     scene: Scene
@@ -63,6 +72,25 @@ class ModelFile:
     parameters: dict[str, np.ndarray]
     provenance: dict[str, Any] = field(default_factory=dict)
     bodies: SeenBodies | None = None
+    fabrics: SeenFabrics | None = None
+
+    def on_fabric(self, fabric: Fabric) -> ModelFile:
+        """Return the model for a fabric of its range (`network.fabrics`), which its energies are then of as well.
+
+        The network sees factors of its own fabric's properties, none beyond its range. Properties that it does not
+        see stay those of its own fabric.
+
+        Raises:
+            SsilkError: it knows its own fabric alone, or none of this stretch model.
+        """
+        if self.fabrics is None:
+            fail(self.scene.garment.mesh.path, f"fabric '{fabric.name}' for a model of one fabric", *ONE_FABRIC)
+        factors = factors_of(self.fabric, fabric)
+        biases = (
+            self.fabrics.biases(self.parameters, self.fabrics.range.seen(factors)) if (factors != 1).any() else {}
+        )
+        fabric = fabric_with(self.fabric, factors, fabric.name)
+        return replace(self, fabric=fabric, parameters={**self.parameters, **biases}, fabrics=None)
 
     def on_body(self, coordinates: Floats, seen: Floats | None = None) -> ModelFile:
         """Return the model for one body of its family, at coordinates (K,) (`network.bodies`).
@@ -143,6 +171,7 @@ def _tensors(model: ModelFile) -> dict[str, Any]:
         **({} if (sewn := scene.garment.sewn) is None else {"scene.mesh.sewn": sewn}),
         **{f"model.{name}": value for name, value in model.parameters.items()},
         **({} if model.bodies is None else model.bodies.stored().tensors()),
+        **({} if model.fabrics is None else model.fabrics.tensors()),
     }
 
 
@@ -162,6 +191,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         **({"graded": True} if model.scene.garment.graded else {}),
         **({"hub": skeleton.hub} if skeleton.hub else {}),
         **({} if model.bodies is None else _names(model.bodies.family.bodies)),
+        **({} if model.fabrics is None else {"fabrics": model.fabrics.document()}),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
     }
 
@@ -249,6 +279,7 @@ def _need_header(document: dict[str, Any]) -> None:
     members, meshes = (document.get(name, []) for name in ("family", "body_meshes"))
     for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members, meshes):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
+    _need_types(document.get("fabrics", {}), {"low": (), "high": (), "presets": ()})
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
         raise TypeError(f"the seed {str(seed)[:40]!r} is not a whole number of 64 bits")
@@ -283,6 +314,9 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
     if "family" in document:
         bodies = SeenBodies.of(tensors, tuple(document["family"]), tuple(document["body_meshes"]))
         bodies.need_fit(skeleton, scene.garment.mesh.vertex_count, scene.rig.proxy_count, parameters)
+    fabrics = SeenFabrics.of(tensors, document["fabrics"]) if "fabrics" in document else None
+    if fabrics:
+        fabrics.need_fit(parameters)
     return ModelFile(
         scene,
         ModelConfig(**document["config"]),
@@ -291,6 +325,7 @@ def _model_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Model
         parameters,
         document["provenance"],
         bodies,
+        fabrics,
     )
 
 
@@ -366,14 +401,24 @@ def _need_fit(model: ModelFile, expected: Shapes) -> None:
         )
 
 
-def model_file(model: GarmentModel, fabric: Fabric, provenance: dict[str, Any]) -> ModelFile:
-    """Return a network as the contents of a model file."""
-    values = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
-    if model.family is None:
-        return ModelFile(model.scene, model.config, fabric, model.joints, values, provenance)
-    parameters, columns = parted(values)
-    seen = SeenBodies(model.family, columns)
-    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance, seen)
+def model_file(
+    model: GarmentModel, fabric: Fabric, provenance: dict[str, Any], fabrics: FabricRange | None = None
+) -> ModelFile:
+    """Return a network as the contents of a model file; `fabrics` that it saw, where it saw any."""
+    parameters = {name: value.detach().cpu().numpy() for name, value in model.state_dict().items()}
+    bodies = seen = None
+    if model.family is not None:
+        parameters, columns = parted(parameters)
+        bodies = SeenBodies(model.family, columns)
+    if fabrics is not None:
+        parameters, columns = of_fabrics.parted(parameters, state_inputs(model.config))
+        seen = SeenFabrics(fabrics, columns)
+    return ModelFile(model.scene, model.config, fabric, model.joints, parameters, provenance, bodies, seen)
+
+
+def state_inputs(config: ModelConfig) -> int:
+    """Return how many inputs of S come before its features of the pose."""
+    return SCHEMES[config.scheme].states * config.latent
 
 
 def network(file: ModelFile, scene: Scene | None = None) -> GarmentModel:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
@@ -20,6 +20,7 @@ from .model.feedback import BodyFrames
 from .model.network import GarmentModel
 from .sampling import sample_pose
 from .settings import DIVERGENCE_BOUND, RECOVERY_FRAMES
+from .start import GivenStart
 
 CHUNK = 256  # frames decoded at once
 HISTORY = 2  # earlier frames that the descriptors of a chunk need
@@ -43,30 +44,43 @@ class RolloutBlock:
     recovered: Tensor
 
 
-def roll(model: GarmentModel, span: Motion, chunk: int = CHUNK, *, pre_roll: float = 0.0) -> Iterator[RolloutBlock]:
+def roll(
+    model: GarmentModel,
+    span: Motion,
+    chunk: int = CHUNK,
+    *,
+    pre_roll: float = 0.0,
+    given: GivenStart | None = None,
+) -> Iterator[RolloutBlock]:
     """Yield the garment's pose over a motion without cuts, at the model's rate, one chunk at a time.
 
-    The garment starts at rest in the first pose, or `pre_roll` seconds earlier, in the pose of `run_up`.
+    The garment starts at rest in the first pose, or `pre_roll` seconds earlier, in the pose of `run_up`; or as given.
 
     Raises:
         SsilkError: the motion is not at the model's rate.
     """
     starts = range(0, span.frame_count, chunk)
     blocks = (span.clip(start, start + chunk) for start in starts)
-    if not pre_roll:
+    if not pre_roll and given is None:
         return roll_blocks(model, blocks)
-    before = run_up(span, pre_roll)
-    steps = islice(roll_blocks(model, chain([before], blocks)), 1, None)
+    before = run_up(span, pre_roll) if given is None else given.before
+    start = () if given is None else tuple(given.states[:, None])
+    steps = islice(roll_blocks(model, chain([before], blocks), start), 1, None)
     return (replace(step, start=step.start - before.frame_count) for step in steps)
 
 
 @torch.no_grad()
-def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[RolloutBlock]:
+def roll_blocks(
+    model: GarmentModel, blocks: Iterable[Motion], given: Sequence[Tensor] = ()
+) -> Iterator[RolloutBlock]:
     """Yield the garment's pose over each of consecutive blocks of a motion without cuts, at the model's rate.
 
     A motion of any length needs the memory of one block. A block in which the character holds still and the garment
     is at rest needs the work of one frame. A diverged state is replaced by the quasi-static one for `RECOVERY_FRAMES`
     frames; the rollout then continues from there.
+
+    Args:
+        given: states of the first two frames, (1, latent) each; those at rest by default.
 
     Raises:
         SsilkError: a block is not at the model's rate.
@@ -83,7 +97,7 @@ def roll_blocks(model: GarmentModel, blocks: Iterable[Motion]) -> Iterator[Rollo
             parts = _decode(model, state[-1], torch.zeros(1, dtype=torch.bool, device=state[-1].device))
             yield RolloutBlock(start, *(part.expand(*part.shape[:-1], block.frame_count) for part in parts))
         else:
-            states, diverged = _advance(model, seen, block.frame_count, start, state)
+            states, diverged = _advance(model, seen, block.frame_count, start, state, given)
             yield RolloutBlock(start, *_decode(model, torch.cat(states[-block.frame_count :]), diverged))
         past, state = seen.clip(max(0, seen.frame_count - HISTORY), seen.frame_count), states[-HISTORY:]
         start += block.frame_count
@@ -97,7 +111,7 @@ def _is_at_rest(seen: Motion, state: list[Tensor]) -> bool:
 
 
 def _advance(
-    model: GarmentModel, seen: Motion, count: int, start: int, state: list[Tensor]
+    model: GarmentModel, seen: Motion, count: int, start: int, state: list[Tensor], given: Sequence[Tensor] = ()
 ) -> tuple[list[Tensor], Tensor]:
     """Return the states after those in `state`, each (1, latent), and which of the last `count` were diverged.
 
@@ -111,7 +125,8 @@ def _advance(
     rest, pose = rest.unsqueeze(1), dynamic.unsqueeze(1)
     starting = min(max(0, HISTORY - start), count)
     body = model.body_frames(seen, world)[max(0, seen.frame_count - count + starting - HISTORY) :]
-    return _roll_and_recover(model, [*state, *rest[:starting]], rest[starting:], pose[starting:], body, diverged)
+    begun = given[start : start + starting] or rest[:starting]
+    return _roll_and_recover(model, [*state, *begun], rest[starting:], pose[starting:], body, diverged)
 
 
 def _replace_diverged(states: Tensor) -> tuple[Tensor, Tensor]:
@@ -162,6 +177,7 @@ def garment_poses(
     *,
     pre_roll: float = 0.0,
     roller: Roller | None = None,
+    given: GivenStart | None = None,
 ) -> Iterator[GarmentPose]:
     """Yield what a shot stores, at `fps`, over a motion of any rate: the frames of `resample(motion, fps)`.
 
@@ -169,14 +185,16 @@ def garment_poses(
     lines between the two nearest steps. After a cut of the motion (a root that jumps) the garment restarts from
     the initialiser, `pre_roll` seconds before (see `roll`), and nothing is interpolated across it. `on_recovery` is
     told the shot's frames of which `roll_blocks` had to take the rest state. `roller` takes the place of `roll`, with
-    a run-up of its own: it yields blocks of a motion without cuts, at the model's rate.
+    a run-up of its own: it yields blocks of a motion without cuts, at the model's rate. `given` is the state that
+    the first of these goes on from.
     """
-    rolled = roller or (lambda span: roll(model, span, chunk, pre_roll=pre_roll))
     first = source_frame = 0
     for span in split_at_cuts(motion, model.scene.character.skeleton):
         stop = frames_at(source_frame + span.frame_count, motion.fps, fps)
         shift = (first / fps - source_frame / motion.fps) * model.config.fps
-        steps = rolled(resample(span, model.config.fps, cover=True))
+        seen = resample(span, model.config.fps, cover=True)
+        start = given if source_frame == 0 else None
+        steps = roller(seen) if roller else roll(model, seen, chunk, pre_roll=pre_roll, given=start)
         poses = _file_poses(model, steps, fps / model.config.fps, shift, range(first, stop), on_recovery)
         for pose in resample_poses(poses, model.config.fps, fps, shift=shift, count=stop - first):
             yield replace(pose, start=first + pose.start)

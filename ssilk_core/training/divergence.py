@@ -23,7 +23,7 @@ from .step import Stepper
 
 CHECK_INTERVAL = 20  # steps between two checks
 DIVERGENCE_WINDOW = 100  # steps
-STATIC_INPUTS = ("frames", "directions")  # inputs of a static step
+STATIC_INPUTS = ("frames", "directions", "fabrics")  # inputs of a static step
 MAX_SKIPPED_SHARE = 0.5  # of the steps in the window; with more, training has diverged
 
 

@@ -16,6 +16,7 @@ from ..network.checkpoint import ModelFile
 from ..network.settings import PROXIMITY_POINTS, ModelConfig
 from ..physics.energy.stretch import rest_frames
 from ..scene.assets import LOOSE, PINNED, TIGHT, Motion, Scene
+from ..scene.fabric_range import FabricRange
 from ..scene.fabrics import Fabric
 from ..scene.family import DressedFamily
 from ..scene.mesh.stitches import find_stitches
@@ -55,6 +56,8 @@ class TrainJob:
             moves becomes tight in `scene` (`inner_garments.loosened`).
         family: bodies to train for, the scene's as the base; None for that one alone. The garment in `scene` says
             whether it is graded to them.
+        family: bodies to train for, the scene's as the base; None for that one alone.
+        fabrics: range of fabrics to train for, as factors of `fabric`; None for that one alone.
         loosened: how many vertices become tight.
     """
 
@@ -73,6 +76,7 @@ class TrainJob:
     whole: bool = False
     over: Sequence[InnerModel] = ()
     family: DressedFamily | None = None
+    fabrics: FabricRange | None = None
     loosened: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
@@ -81,6 +85,7 @@ class TrainJob:
         elif self.scene.garment.graded:
             found = "a garment that is graded to bodies, and one body alone"
             fail(self.scene.garment.mesh.path, found, "a family has two or more", "name further bodies with --family")
+        self._need_fabrics()
         if self.base and self.base.bodies and not self.family:
             found = "training that goes on from a model of a family of bodies, without the family"
             fail(
@@ -136,6 +141,7 @@ class TrainJob:
                 perturbations=0,
             )
             object.__setattr__(self, "train", least)
+            object.__setattr__(self, "fabrics", None)  # pinned cloth is the same in all of them
 
     def _need_family(self) -> None:
         """Raise `SsilkError` where a family is asked for with what knows one body."""
@@ -152,6 +158,24 @@ class TrainJob:
             if self.scene.garment.graded:
                 mesh = self.family.scene_at(self.scene, coordinates).garment.rest_mesh
                 rest_frames(replace(mesh, path=f"{mesh.path} on {name}"))  # each triangle has an area on each body
+
+    def _need_fabrics(self) -> None:
+        """Raise `SsilkError` where a range of fabrics is asked for with what knows one, or a base knows more."""
+        where, known = self.scene.garment.mesh.path, self.base and self.base.fabrics
+        if self.base and known and not self.fabrics:
+            found = "training that goes on from a model of a range of fabrics, without the range"
+            fail(where, found, "a model of one fabric trains on", "name the range with --fabrics")
+        if self.base and known and replace(self.base.fabric, name="") != replace(self.fabric, name=""):
+            found = f"fabric '{self.fabric.name}' and a model whose range is of factors of '{self.base.fabric.name}'"
+            fail(where, found, "training goes on with the model's own fabric", "name that one")
+        if not self.fabrics:
+            return
+        for found, there in (
+            ("a stepper alone that learns", self.stepper_alone),
+            (f"newton_weight={self.train.newton_weight:g}", self.train.newton_weight > 0),
+        ):
+            if there:
+                fail(where, f"{found} and a range of fabrics", "one of both", "leave one out")
 
     @property
     def stepper_alone(self) -> bool:
@@ -200,6 +224,7 @@ class TrainJob:
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
                 **({"family": family_digest(self.family, self.scene.garment.graded)} if self.family else {}),
+                **({"fabrics": asdict(self.fabrics)} if self.fabrics else {}),
             }
         )
 

@@ -11,6 +11,7 @@ from ..physics.collision import CollisionBody, Contacts, signed_distance_to_plan
 from ..physics.collision.contacts import no_planes
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
+from ..physics.energy.factors import FabricFactors, joined_inputs
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.figures import INTERSECTION
 from ..physics.skinning import Skinning
@@ -28,6 +29,8 @@ REGULARIZATION = "latent regularization"  # a term of latents, which has no fram
 
 class Objective:
     """Computes energies of a model's decoded states; each term is [J] per frame, unreduced.
+
+    Those of a drawn fabric are divided by its factor of density: each fabric counts in units of its own weight.
 
     Attributes:
         scale: the garment's weight times the diagonal of its bounding box at rest [J].
@@ -96,6 +99,7 @@ class Objective:
         buried: Tensor | None = None,
         beneath: Beneath | None = None,
         obstacles: Obstacles | None = None,
+        factors: FabricFactors | None = None,
     ) -> Terms:
         """Return all terms but inertia and drag of positions x (V, 3, N) under gravity and wind (N, 3) [g].
 
@@ -103,12 +107,13 @@ class Objective:
             buried: limbs that do not count, where they are known (`LimbPoser.buried`).
             beneath: inner garments in these frames, where there are any.
             obstacles: likewise what else is there.
+            factors: of the fabric in these frames; the model's own by default.
         """
         energy, root = self.energy, character[self.hub, :, 3]  # heights over the root keep the value of gravity small
-        stretch, bending = energy.elastic(x)
+        stretch, bending = energy.elastic(x, factors)
         sampled = energy.cloth.positions(x)
         planes = self._planes(sampled.detach(), character, buried, beneath, obstacles)
-        gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * down.T, sampled, *planes)
+        gravity, collision = energy.gravity_and_collision(x, root, GRAVITY * down.T, sampled, *planes, factors)
         if self.newton:
             self.newton.planes = planes
         terms = {"stretch": stretch, "bending": bending, "gravity": gravity, "collision": collision}
@@ -116,7 +121,7 @@ class Objective:
             terms["tether"] = energy.tether(x, self.skin(self.tethered_rest, None, self.skin.weights, character))
         if energy.stitching:
             terms["stitch"] = energy.stitch(x)
-        return terms
+        return {name: value / factors.density for name, value in terms.items()} if factors else terms
 
     def _planes(
         self,
@@ -148,29 +153,39 @@ class Objective:
         return None if self.buried is None else self.buried[:, frames]
 
     def static(
-        self, frames: Tensor, down: Tensor, beneath: Beneath | None = None, obstacles: Obstacles | None = None
+        self,
+        frames: Tensor,
+        down: Tensor,
+        beneath: Beneath | None = None,
+        obstacles: Obstacles | None = None,
+        fabric: Tensor | None = None,
     ) -> Terms:
         """Return the terms of the initialiser's quasi-static states on single poses (Section 3.1).
 
         Args:
             beneath: inner garments in these poses, where there are any.
             obstacles: likewise what else is there.
+            fabric: features of the fabric in these poses (N, 5); the model's own by default.
         """
-        z = self.model.initial(self._static_descriptor(frames, down, self._near(frames, down, obstacles)))
+        near = self._near(frames, down, obstacles, fabric)
+        z = self.model.initial(self._static_descriptor(frames, down, near, fabric))
         character = self.bank.character(frames)
         x = self._vertices(z, character, 0)
-        return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles)
+        factors = None if fabric is None else FabricFactors.of(fabric)
+        return self.quasi_static_terms(x, down, character, self._buried(frames), beneath, obstacles, factors)
 
-    def _near(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None) -> Near | None:
+    def _near(self, frames: Tensor, down: Tensor, obstacles: Obstacles | None, fabric: Tensor | None) -> Near | None:
         """Return what is near in frames (N,) under gravity and wind (N, 3) [g]; None without obstacles."""
-        return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames, down)
+        return None if obstacles is None or self.drawer is None else self.drawer.near(obstacles, frames, down, fabric)
 
-    def _static_descriptor(self, frames: Tensor, down: Tensor, near: Near | None) -> Tensor:
-        """Return static descriptors (N, S) of frames (N,), with the proximity of obstacles where there are any."""
-        static = self.bank.static_descriptor(frames, down)
-        if near is None or self.drawer is None:
-            return static
-        return torch.cat([self.drawer.seen(near, frames), static], dim=1)
+    def _static_descriptor(self, frames: Tensor, down: Tensor, near: Near | None, fabric: Tensor | None) -> Tensor:
+        """Return static descriptors (N, S) of frames (N,), with fabrics and the proximity of obstacles, if any."""
+        parts = [self.bank.static_descriptor(frames, down)]
+        if near is not None and self.drawer is not None:
+            parts.insert(0, self.drawer.seen(near, frames))
+        if fabric is not None:
+            parts.insert(0, fabric)
+        return torch.cat(parts, dim=1) if len(parts) > 1 else parts[0]
 
     def _vertices(self, z: Tensor, character: Tensor, moving: int) -> Tensor:
         """Decode latents (N, latent), of which so many have inertia, to positions (V, 3, N)."""
@@ -184,6 +199,7 @@ class Objective:
         frames: Tensor,
         single_down: Tensor,
         single_obstacles: Obstacles | None = None,
+        single_fabric: Tensor | None = None,
     ) -> tuple[Terms, Terms, Tensor]:
         """Roll one window of every slot.
 
@@ -192,6 +208,7 @@ class Objective:
             noise: added to the first two latents, shape (2, batch, latent).
             frames, single_down: single poses for the initialiser (M,), and their gravity and wind (M, 3) [g].
             single_obstacles: around these, where there are any.
+            single_fabric: features of their fabrics (M, 5), where these are drawn.
 
         Returns:
             Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
@@ -201,8 +218,9 @@ class Objective:
         batch = len(sampler.first)
         times = sampler.frames().reshape(-1)
         down = sampler.gravity().flatten(0, 1)
-        near = self._near(times, down, sampler.obstacles and sampler.obstacles.repeated(length))
-        static = self._static_descriptor(times, down, near)
+        fabric = None if sampler.fabric is None else sampler.fabric.repeat(length, 1)
+        near = self._near(times, down, sampler.obstacles and sampler.obstacles.repeated(length), fabric)
+        static = self._static_descriptor(times, down, near, fabric)
         heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
         pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
         # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
@@ -222,8 +240,8 @@ class Objective:
             with torch.no_grad():
                 seen = model.seen_from(before, now, body.triples())
             rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        single_near = self._near(frames, single_down, single_obstacles)
-        quiet = model.initial(self._static_descriptor(frames, single_down, single_near))
+        single_near = self._near(frames, single_down, single_obstacles, single_fabric)
+        quiet = model.initial(self._static_descriptor(frames, single_down, single_near, single_fabric))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
@@ -235,7 +253,9 @@ class Objective:
         met = None
         if sampler.obstacles and single_obstacles:
             met = sampler.obstacles.repeated(length - 2).joined(single_obstacles)
-        terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath, met)
+        drawn_fabrics = joined_inputs(None if fabric is None else fabric[2 * batch :], single_fabric)
+        factors = None if drawn_fabrics is None else FabricFactors.of(drawn_fabrics)
+        terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath, met, factors)
         if self.contours:
             terms[INTERSECTION] = self.contours.energy(x)
         count = (length - 2) * batch
@@ -243,9 +263,13 @@ class Objective:
         single = {name: value[count:] for name, value in terms.items()}
         path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
         root = bank.root_at(times).T
-        dynamic["inertia"], dynamic["drag"] = self.energy.inertia_and_drag(
-            x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt
+        moving = factors.first(count) if factors else None
+        kinetic = self.energy.inertia_and_drag(
+            x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt, moving
         )
+        if moving:
+            kinetic = kinetic[0] / moving.density, kinetic[1] / moving.density
+        dynamic["inertia"], dynamic["drag"] = kinetic
         if weight := sampler.config.latent_regularization:
             drawn = torch.cat([rolled[-batch:], quiet])
             dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, LATENT_SCALE)

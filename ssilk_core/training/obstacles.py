@@ -185,13 +185,14 @@ class ObstacleDrawer:
         """Coordinates (K,) of the body that steps are done on; None for one body alone."""
         return self.bank.place if isinstance(self.bank, FamilyBank) else None
 
-    def near(self, obstacles: Obstacles, frames: Tensor, gravity: Tensor) -> Near:
+    def near(self, obstacles: Obstacles, frames: Tensor, gravity: Tensor, fabric: Tensor | None = None) -> Near:
         """Return how near obstacles are in frames (N,) to the points that see them.
 
         Args:
             gravity: and wind [g], shape (N, 3).
+            fabric: features of it (N, 5); the model's own by default.
         """
-        points = self._resting(frames, gravity)
+        points = self._resting(frames, gravity, fabric)
         return Near(points, *obstacles.nearest(points))
 
     def seen(self, near: Near, frames: Tensor) -> Tensor:
@@ -256,9 +257,11 @@ class ObstacleDrawer:
         self.bank.wear(place)
         self.wear(place)
 
-    def _resting(self, frames: Tensor, gravity: Tensor) -> Tensor:
+    def _resting(self, frames: Tensor, gravity: Tensor, fabric: Tensor | None = None) -> Tensor:
         """Return the points that see obstacles (M, 3, N), where they would rest without in frames (N,)."""
-        return self.model.resting(self.bank.static_descriptor(frames, gravity), self.bank.character(frames))
+        static = self.bank.static_descriptor(frames, gravity)
+        static = static if fabric is None else torch.cat([fabric, static], dim=1)
+        return self.model.resting(static, self.bank.character(frames))
 
     def _clearance(self, obstacles: Obstacles, frames: Tensor) -> Tensor:
         """Return how far the body is outside of each obstacle in its frames (T, N), at least, [m], shape (K, N)."""

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from ..events import Message, Reporter, format_count, silent
+from ..network import fabrics as of_fabrics
 from ..network.bodies import joined, unseen
-from ..network.checkpoint import ModelFile
+from ..network.checkpoint import ModelFile, state_inputs
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
 from ..network.parameters import on_moved_garment, seeing_more
@@ -25,9 +26,11 @@ from ..physics.intersections.cloth import ClothIntersections
 from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
 from ..scene.assets import Floats, Ints, Motion
+from ..scene.fabric_range import FACTORS, FabricRange, ends, factors_of, inputs_of
 from ..scene.family import motion_on, spread_points
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .bodies import BodyWearer, DrawnBodies, FamilyBody
+from .fabrics import FabricDrawer
 from .family_bank import FamilyBank, build_family_bank
 from .inner_garments import InnerGarments
 from .job import TrainJob
@@ -39,7 +42,7 @@ from .parallel import SINGLE_PROCESS, ProcessGroup
 from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
 from .step import Stepper
-from .validation import ValidatedBody, Validator
+from .validation import ValidatedBody, ValidatedFabric, Validator
 from .windows import WindowSampler
 
 FIRST_WEIGHT = "stepper.0.weight"
@@ -58,6 +61,7 @@ class TrainingParts:
         energy: that steps are done with, and `validator` measures with its own.
         shape: gives `body` the shape of any body of a family; None for one body.
         graded: gives `energy` the rest shape there; None where it is one for all bodies.
+        fabrics: range of those that are drawn; None for the energy's own alone.
     """
 
     model: GarmentModel
@@ -72,6 +76,7 @@ class TrainingParts:
     inner: InnerGarments | None = None
     shape: FamilyBody | None = None
     graded: GradedRest | None = None
+    fabrics: FabricRange | None = None
 
     @cached_property
     def buried(self) -> Tensor | None:
@@ -108,7 +113,10 @@ class TrainingParts:
             hub = place_of_hub(self.model.scene.character.skeleton, self.model.joints)
             known = family.bodies if family else None
             drawer = ObstacleDrawer(self.model, self.bank, hub, own.collider_fraction, generator, known)
-        sampler = WindowSampler(self.bank, own, self.model.config.latent, generator, drawer)
+        cloth = None
+        if self.fabrics:
+            cloth = FabricDrawer(self.fabrics, self.energy.fabric, generator, self.device)
+        sampler = WindowSampler(self.bank, own, self.model.config.latent, generator, drawer, cloth)
         surface = config.closest_point == "triangles"
         objective = Objective(
             self.model, self.energy, self.body, self.bank, surface, config.newton_weight, config.clearance,
@@ -146,7 +154,8 @@ def build_parts(
     vertices, moving = _reachable(job, every)
     joints = job.base.joints if job.base else model_joints(scene, moving)
     report(Message(f"the network and its inputs are built on {device}"))
-    model = GarmentModel(scene, job.model, joints, job.train.seed, job.family)
+    seen = len(FACTORS) if job.fabrics else 0
+    model = GarmentModel(scene, job.model, joints, job.train.seed, job.family, seen)
     if job.base and job.whole:
         known = on_moved_garment(job.base.parameters, job.base.scene, scene, job.base.config)
         known = seeing_more(known, scene, job.base.config, job.model)
@@ -154,6 +163,9 @@ def build_parts(
             # To a model of one body coordinates count nothing yet.
             own = job.base.bodies.columns if job.base.bodies else unseen(known, job.family.bodies.size)
             known = joined(known, own)
+        if job.fabrics:
+            learned = job.base.fabrics.columns if job.base.fabrics else of_fabrics.unseen(job.base.parameters)
+            known = of_fabrics.joined(known, learned, state_inputs(job.model))
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)
@@ -193,18 +205,21 @@ def build_parts(
             count = f"{job.loosened} pinned vertices lie over cloth that moves"
             report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
     members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
+    fabrics = _validated_fabrics(job, held, whole, frames, device, group) if job.fabrics else []
     graded, measured = None, energy
     if job.family and scene.garment.graded:
         # Steps move its rest shape about, and what is validated on the first body needs that body's.
         measured = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
         graded = GradedRest(energy, scene.garment.rest_mesh, job.family.cloth_moves)
-    validator = Validator(held, measured, whole, scene, rest, fps, frames, group, spans, contours, inner, members)
+    validator = Validator(
+        held, measured, whole, scene, rest, fps, frames, group, spans, contours, inner, [*members, *fabrics]
+    )
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
     reached = len(vertices)
     return TrainingParts(
-        model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape, graded
+        model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape, graded, job.fabrics
     )
 
 
@@ -250,6 +265,27 @@ def _validated_members(
             energy = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
         validator = Validator(bank, energy, body, scene, rest, job.model.fps, part, group)
         found.append(ValidatedBody(bodies.names[row], place, validator))
+    return found
+
+
+def _validated_fabrics(
+    job: TrainJob, held: MotionBank, body: CollisionBody, frames: int, device: torch.device, group: ProcessGroup
+) -> list[ValidatedFabric]:
+    """Return the fabrics at the ends of a range, which models are validated in as well.
+
+    Together they have as many frames as the model's own.
+    """
+    assert job.fabrics
+    scene, chosen, found = job.scene, ends(job.fabric, job.fabrics), []
+    rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32, device=device)
+    for fabric in chosen:
+        factors = factors_of(job.fabric, fabric)
+        energy = GarmentEnergy(scene.garment.rest_mesh, fabric, scene.classes, device=device)
+        part = max(1, frames // len(chosen))
+        validator = Validator(held, energy, body, scene, rest, job.model.fps, part, group)
+        seen = torch.tensor(inputs_of(factors), dtype=torch.float32, device=device)
+        density = float(factors[FACTORS.index("density")])
+        found.append(ValidatedFabric(f"fabric {fabric.name}", seen, validator, density))
     return found
 
 

@@ -54,7 +54,8 @@ class RunFiles:
     def save_model(self, model: GarmentModel, state: RunState, score: Score, lbs: Score) -> None:
         """Write a model with its provenance."""
         if self.group.is_first:
-            save_model(self.model, model_file(model, self.job.fabric, self.provenance(state, score, lbs)))
+            provenance = self.provenance(state, score, lbs)
+            save_model(self.model, model_file(model, self.job.fabric, provenance, self.job.fabrics))
 
     def save_fault(self, stepper: Stepper, found: str) -> None:
         """Write the inputs of the last skipped step."""

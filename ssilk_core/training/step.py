@@ -103,26 +103,30 @@ class Stepper:
         inner = self.objective.inner
         obstacles = self.sampler.obstacles_at(frames, direction)
         beneath = inner.poses(frames, pull, self.sampler.generator, obstacles) if inner else None
-        terms = self.objective.static(frames, pull, beneath, obstacles)
+        fabric = self.sampler.fabrics_of_poses(len(frames))
+        terms = self.objective.static(frames, pull, beneath, obstacles, fabric)
         means = {name: value.mean() for name, value in terms.items()}
-        self._descend(total(terms, self._half), means, {"frames": frames, "directions": pull})
+        drawn = {"frames": frames, "directions": pull, **({} if fabric is None else {"fabrics": fabric})}
+        self._descend(total(terms, self._half), means, drawn)
 
     def dynamic_step(self) -> None:
         """Do a step of dynamic training: all networks on one window of every slot, and P on single poses."""
         self.sampler.change_body()
         noise, poses = self.sampler.noise(), self.sampler.poses(self.config.static_batch)
+        fabric = self.sampler.fabrics_of_poses(self.config.static_batch)
         if self.config.initial_loss:
-            poses = self.sampler.with_initial(*poses)
+            poses, fabric = self.sampler.with_initial(*poses), self.sampler.fabrics_with_initial(fabric)
         frames, pull, direction = poses
         obstacles = self.sampler.obstacles_at(frames, direction)
         inner = {name: value.clone() for name, value in self.sampler.inner.items()}  # the window changes them
-        dynamic, static, latents = self.objective.window(self.sampler, noise, frames, pull, obstacles)
+        dynamic, static, latents = self.objective.window(self.sampler, noise, frames, pull, obstacles, fabric)
         moving, still = (next(iter(terms.values())).shape[0] for terms in (dynamic, static))
         # All frames have the same weight, those of the single poses included.
         loss = (total(dynamic, self._half) * moving + total(static, self._half) * still) / (moving + still)
         means = {name: value.mean() for name, value in dynamic.items()}
         beside = {f"static {name}": value.mean() for name, value in static.items()}
         drawn = {"noise": noise, "static frames": frames, "static directions": pull}
+        drawn |= {} if fabric is None else {"static fabrics": fabric}
         self._descend(loss, means, {**self.sampler.window(), **inner, **drawn}, beside)
         self.sampler.advance(latents)
 

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..files import split_location
+from ..network.model.network import GarmentModel
 from ..physics.collision import CollisionBody, Contacts
 from ..physics.energy import TERMS, GarmentEnergy
 from ..physics.energy.frames import FRAMES_PER_CHUNK, ContactDistances, energy_terms
@@ -45,10 +46,12 @@ Counts = TypeVar("Counts")
 
 @dataclass(frozen=True)
 class BodyScore:
-    """Means over some frames on one more body of a family.
+    """Means over some frames on one more body of a family, or of one more fabric.
+
+    Energies of a fabric are divided by its factor of density, as in training.
 
     Attributes:
-        name: of the body.
+        name: of the body or the fabric.
         total: sum of the energies but that of intersections [J]; gravity is relative to linear blend skinning.
         lbs: that of linear blend skinning there [J].
         collisions: share of garment vertices inside the body.
@@ -74,7 +77,8 @@ class Score:
             libigl.
         layers: how the garment lies over each inner one, in the same frames.
         step_errors: what `MEASURED_STEPS` single steps miss, spread likewise; None for linear blend skinning.
-        bodies: of a family beside its first one, which all else is of; none for linear blend skinning.
+        bodies: of a family beside its first one, which all else is of, and of fabrics beside the model's own; none
+            for linear blend skinning.
     """
 
     terms: dict[str, float]
@@ -107,7 +111,7 @@ class Score:
 
     @property
     def judged(self) -> float:
-        """Mean of the totals on all bodies [J], by which the best model is chosen; the total for one body."""
+        """Mean of the totals on all bodies and of all fabrics [J], by which the best model is chosen."""
         return (self.total + sum(body.total for body in self.bodies)) / (1 + len(self.bodies))
 
 
@@ -122,7 +126,44 @@ class ValidatedBody:
     @cached_property
     def lbs(self) -> float:
         """Energy of linear blend skinning [J]."""
-        return _total(self.validator.means(None))
+        return _total(self.validator.means(None)) / self.weight
+
+    @property
+    def weight(self) -> float:
+        """By which its energies are divided."""
+        return 1.0
+
+    def measured(self, model: LatentModel) -> BodyScore:
+        """Return the score of a model, which is on the first body before and after."""
+        wearer = cast(BodyWearer, model)
+        try:
+            wearer.wear(self.place)
+            means = self.validator.means(model)
+        finally:
+            wearer.wear(torch.zeros_like(self.place))
+        return BodyScore(self.name, _total(means) / self.weight, self.lbs, means["collisions"])
+
+
+@dataclass(frozen=True, eq=False)
+class ValidatedFabric(ValidatedBody):
+    """Likewise a fabric: its name, its features (5,), and who validates with its energies."""
+
+    density: float
+
+    @property
+    def weight(self) -> float:
+        """Its factor of density."""
+        return self.density
+
+    def measured(self, model: LatentModel) -> BodyScore:
+        """Return the score of a model, whose fabric is its own before and after."""
+        seen = cast(GarmentModel, model).fabric
+        try:
+            seen.copy_(self.place)
+            means = self.validator.means(model)
+        finally:
+            seen.zero_()
+        return BodyScore(self.name, _total(means) / self.weight, self.lbs, means["collisions"])
 
 
 class Validator:
@@ -133,7 +174,7 @@ class Validator:
         spans: the motions that the bank's clips were made of, which name them; numbers by default.
         contours: those of the garment, whose energy is a term where training has it.
         inner: garments beneath, all of which are worn; contact with them is part of that with the body.
-        members: bodies of a family whose energies are measured as well.
+        members: bodies of a family and fabrics whose energies are measured as well.
     """
 
     def __init__(
@@ -213,18 +254,8 @@ class Validator:
         return {name: float(torch.cat([score[name] for score in scores]).mean()) for name in scores[0]}
 
     def _bodies(self, model: LatentModel | None) -> tuple[BodyScore, ...]:
-        """Return the scores on the other bodies of a family; the model is on the first one before and after."""
-        if model is None or not self.members:
-            return ()
-        found, wearer = [], cast(BodyWearer, model)
-        try:
-            for member in self.members:
-                wearer.wear(member.place)
-                means = member.validator.means(model)
-                found.append(BodyScore(member.name, _total(means), member.lbs, means["collisions"]))
-        finally:
-            wearer.wear(torch.zeros_like(self.members[0].place))
-        return tuple(found)
+        """Return the scores on the other bodies of a family and of other fabrics."""
+        return () if model is None else tuple(member.measured(model) for member in self.members)
 
     def _shown(self, model: LatentModel | None, states: Sequence[Tensor | None]) -> ShownSkin | None:
         """Return how much of the covered skin shows; all processes of the group get the same."""

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..errors import fail
 from ..network.settings import STRONGEST_PULL
+from .fabrics import FabricDrawer
 from .motion_bank import MotionBank
 from .obstacles import ObstacleDrawer, Obstacles
 from .settings import TrainConfig
@@ -57,6 +58,7 @@ class WindowSampler:
         carried: which slots continue, shape (batch,).
         obstacles: around each slot's character; None where none are drawn.
         around: coordinates of the body of a family that they were drawn around, shape (K,); None for one body alone.
+        fabric: features of each slot's fabric (batch, 5); None where all are of the model's own.
         inner: what inner garments keep from window to window, by name (`InnerGarments.attach`); nothing by default.
     """
 
@@ -67,8 +69,10 @@ class WindowSampler:
         latent: int,
         generator: torch.Generator,
         drawer: ObstacleDrawer | None = None,
+        fabrics: FabricDrawer | None = None,
     ) -> None:
         self.bank, self.config, self.generator, self.drawer = bank, config, generator, drawer
+        self.fabrics = fabrics
         device = bank.static.device
         stops = bank.stops.repeat_interleave(bank.stops - bank.starts)
         frames = torch.arange(bank.frame_count, device=device)
@@ -90,6 +94,7 @@ class WindowSampler:
         self.carried = torch.zeros(config.batch, dtype=torch.bool, device=device)
         self.obstacles = drawer.draw(self.frames(), self.direction) if drawer else None
         self.around = None if drawer is None or drawer.worn is None else drawer.worn.clone()
+        self.fabric = fabrics.draw(config.batch) if fabrics else None
         self.inner: dict[str, Tensor] = {}
 
     def _fresh(self) -> Tensor:
@@ -125,11 +130,19 @@ class WindowSampler:
             gravity = direction + random_pulls(count, self.config.wind_fraction, self.generator, device)
         return frames, gravity, direction
 
+    def fabrics_of_poses(self, count: int) -> Tensor | None:
+        """Draw features of the fabrics of single poses, shape (count, 5); None where none are drawn."""
+        return self.fabrics.draw(count) if self.fabrics else None
+
     def with_initial(self, frames: Tensor, gravity: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return single poses (M,), (M, 3), (M, 3) followed by the first two of each window."""
         own = torch.cat([self.first, self.first + 1])
         pulled = torch.cat([gravity, self.gravity()[:2].flatten(0, 1)])
         return torch.cat([frames, own]), pulled, torch.cat([direction, self.direction.repeat(2, 1)])
+
+    def fabrics_with_initial(self, fabric: Tensor | None) -> Tensor | None:
+        """Return likewise features (M, 5) of fabrics followed by those of the windows."""
+        return None if fabric is None or self.fabric is None else torch.cat([fabric, self.fabric, self.fabric])
 
     def noise(self) -> Tensor:
         """Return noise for the first two latents of each window, shape (2, batch, latent).
@@ -164,6 +177,9 @@ class WindowSampler:
             self.pull.copy_(torch.stack([first, torch.where((go_on & ~gust)[:, None], self.pull[1], pull)]))
         if self.heading is not None:
             self.heading.copy_(torch.where(go_on[:, None], self.heading, random_headings(fresh, self.generator)))
+        if self.fabrics and self.fabric is not None:
+            other = ~go_on[:, None] | self.fabrics.changed(config.batch)
+            self.fabric.copy_(torch.where(other, self.fabrics.draw(config.batch), self.fabric))
         if self.drawer and self.obstacles:
             kept = self.drawer.drawn_back(self.obstacles, self.frames())
             # Those of a family's new windows are drawn around the body that the next step is done on.
@@ -189,7 +205,7 @@ class WindowSampler:
 
     def window(self) -> dict[str, Tensor]:
         """Return the current windows as tensors by name."""
-        names = ("first", "direction", "latents", "carried", "heading", "pull", "around")
+        names = ("first", "direction", "latents", "carried", "heading", "pull", "around", "fabric")
         found = {name: value for name in names if (value := getattr(self, name)) is not None}
         if self.obstacles:
             found |= {f"obstacles.{name}": value for name, value in vars(self.obstacles).items()}

@@ -534,3 +534,21 @@ def test_an_unsaved_file_can_bake_to_its_timeline_but_not_beside_itself(ready, t
 
     with pytest.raises(SetupError, match="no name for a shot"):
         usd_path(trained, "//x.abc")
+
+
+def test_a_bake_goes_on_from_the_previous_one(ready, trained):
+    """Of the last frames alone: at rest the cloth would begin elsewhere."""
+    scene = ready.context.scene
+    assert ready.ops.ssilk.bake() == {"FINISHED"}
+    whole = shown(ready, trained, range(25, 41))
+    scene.frame_start = 25
+    assert ready.ops.ssilk.bake(go_on=True) == {"FINISHED"}
+    second = shown(ready, trained, range(25, 41))
+    assert np.abs(second[0] - whole[0]).max() < 2e-4
+    assert ready.ops.ssilk.bake(pre_roll=0.0) == {"FINISHED"}
+    anew = shown(ready, trained, range(25, 41))
+    assert np.abs(anew[0] - whole[0]).max() > 5 * np.abs(second[0] - whole[0]).max()
+    assert np.abs(second - whole).max() < np.abs(anew - whole).max()
+    assert ready.ops.ssilk.remove_bake() == {"FINISHED"}
+    with pytest.raises(RuntimeError, match="No bake can go on from the previous one: nothing was baked for 'Skirt'"):
+        ready.ops.ssilk.bake(go_on=True)

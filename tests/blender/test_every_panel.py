@@ -142,7 +142,11 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
     yield "motions", motions
     yield "found", found
     yield "heat", shown_heat
-    yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=True)
+    yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=True, fabric_only=False)
+    yield (
+        "changes its fabric",
+        live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=False, fabric_only=True),
+    )
     for name, fields in (
         ("stale", {"stale": True}),
         ("behind", {"behind": True}),

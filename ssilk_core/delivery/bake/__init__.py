@@ -10,6 +10,7 @@ Work speaks through `ssilk_core.events`; bad input raises `SsilkError`, a file t
 """
 
 from .bodies import WornModel, worn, worn_by
+from .fabrics import in_fabric
 from .layers import LayerFolder, bake_layers
 from .load import LoadedGarment, load_garment, load_rollout, with_model
 from .outfit import bake_outfit, holds_several, verify_garments
@@ -26,7 +27,7 @@ from .write import bake
 __all__ = [
     "BakeRequest", "BakeResult", "BakeRollout", "BakeTask", "FrameSpan", "LatentSummary", "LayerFolder",
     "LoadedGarment", "RefinementSummary", "Verification", "WornModel", "bake", "bake_layers", "bake_outfit",
-    "cache_origin", "holds_several", "load_garment", "load_rollout", "motion_at", "plan_layers", "riders_of",
-    "rig_deformer", "shot_bytes", "skin_trajectories", "stored_bytes", "trained_deformer", "verify",
+    "cache_origin", "holds_several", "in_fabric", "load_garment", "load_rollout", "motion_at", "plan_layers",
+    "riders_of", "rig_deformer", "shot_bytes", "skin_trajectories", "stored_bytes", "trained_deformer", "verify",
     "verify_garments", "with_model", "worn", "worn_by",
 ]  # fmt: skip

@@ -364,6 +364,7 @@ def _write_layer(
                 provenance=shot_metadata(rollout, layout.animation),
                 path=unverified,
                 points=task.points,
+                record=rollout.played,
             )
             again = proven(rollout, unverified, report)
             if again is None:

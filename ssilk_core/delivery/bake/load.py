@@ -23,11 +23,13 @@ from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
 from .direction import Direction
+from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
 from .request import ALLOWED_FPS, BakeRequest
 from .riders import riders_of
 from .rollout import BakeRollout
+from .start import need_startable, read_start
 from .world import ShotSurroundings, Sight, asked_world
 
 if TYPE_CHECKING:
@@ -72,6 +74,7 @@ class LoadedGarment:
         model_held, stage_held: what model and stage held while they were read.
         provenance: where the model comes from, as a shot stores it.
         record: how the model was made, as its mesh stores it.
+        played: likewise with the fabric that it plays; None for that of its training.
         info: of the garment as an asset.
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
@@ -94,6 +97,7 @@ class LoadedGarment:
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
+    played: GarmentRecord | None = None
 
     @property
     def over_models(self) -> dict[str, str]:
@@ -110,6 +114,11 @@ class LoadedGarment:
         read, held = read_unchanged(partial(stage_contents, motion), partial(self._read, request))
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
         around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
+        start = None
+        if request.start_cloth:
+            need_startable(request)
+            read = replace(read, whole=read.sampled, lead=0)  # nothing is rolled out before it
+            start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
@@ -134,6 +143,8 @@ class LoadedGarment:
             inputs=InputHashes(model=self.model_held.digest, stage=self.stage_held.digest, motion=held.digest),
             provenance=provenance,
             record=self.record,
+            played=self.played,
+            start_cloth=start,
             info=self.info,
             names=self.names,
             fabric=self.file.fabric,
@@ -144,7 +155,7 @@ class LoadedGarment:
             told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
             direction=None if request.lbs else self._directed(request, read),
             loop=loop,
-        )
+        ).begun()
 
     def _read(self, request: BakeRequest) -> _ReadMotion:
         from ssilk_usd.reading.body_shapes import with_body_shapes
@@ -297,7 +308,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     (on, units, riders, told), stage_held = read_unchanged(
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
-    first, file, scene = file, on.file, on.scene
+    first, own, file, scene = file, on.file, on.file, on.scene
+    file, in_words = in_fabric(own, request.model, request.fabric, request.material)
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(
@@ -314,10 +326,11 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
             "training": file.provenance.get("ssilk", ""),
             **({"trained_over": dict(over)} if (over := file.provenance.get("over")) else {}),
         },
-        record=_record(file, model_held.digest),
+        record=_record(own, model_held.digest),
+        played=_record(file, model_held.digest) if in_words else None,
         info=_info(request, model_held.digest),
         riders=riders,
-        told=told,
+        told=(*told, *in_words),
         body=on.body,
         first=first.scene.character.skeleton if on.body else None,
     )
@@ -359,7 +372,7 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     """Return a rollout of another model of the same garment."""
     assert rollout.model is not None
     model, deformer = _network_like(rollout.model, file, rollout.request)
-    return replace(rollout, model=model, deformer=deformer)
+    return replace(rollout, model=model, deformer=deformer, is_fading=False).begun()
 
 
 def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> tuple[GarmentModel, Deformer]:

@@ -13,7 +13,7 @@ from ...files import relative_path, sha256, split_location
 from ...scene.assets import ShotWorld
 from .opened import provenance_of
 from .record import RECORD
-from .request import BakeRequest
+from .request import AT, BakeRequest, split_start
 from .rollout import BakeRollout
 
 COLLIDERS = "colliders"  # what a shot says of those that its cloth met, under this name
@@ -129,7 +129,18 @@ def read_origin(
             what = f"the {name} that it was baked from is not at {path}"
             fail(str(shot), what, f"--{name} gives its present path")
         found[name] = str(place)
-    return ShotOrigin(replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"]), hashes)
+    start = stored.start_cloth
+    if start is not None:
+        place, code = split_start(start)
+        if (there := _existing(shot, place, None)) is None:
+            fail(
+                str(shot),
+                f"the cloth that it begins with is not at {place}",
+                "it is looked for as seen from the shot",
+            )
+        start = f"{there}" if code is None else f"{there}{AT}{code:.9g}"
+    moved = replace(stored, model=found["model"], stage=found["stage"], motion=found["motion"], start_cloth=start)
+    return ShotOrigin(moved, hashes)
 
 
 def _existing(shot: Path, near: str, held: object) -> Path | None:

@@ -70,6 +70,13 @@ def task_key(task: BakeTask, contents: InputHashes) -> str:
         del options[name]
     for name in INPUTS:
         del options["request"][name]
+    for name in (
+        "fabric",
+        "material",
+        "start_cloth",
+    ):  # so that bakes in a model's own fabric stay as current as they were
+        if not options["request"][name]:
+            del options["request"][name]
     return request_key({"ssilk": __version__, "options": options}, [*asdict(contents).items()])
 
 

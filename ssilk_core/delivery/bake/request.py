@@ -16,6 +16,8 @@ from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
 from .world import parse_world
 
+AT = "@"  # before the time code of a frame
+OF_WORDS = ("colliders", "material")  # fields that metadata stores as one text
 INPUTS = ("model", "stage", "motion")  # the files that a shot is baked from
 REFINED_OUTPUTS = ("joints", "points")
 ALL_ELEMENTS, FEW_ELEMENTS = "all", "few"
@@ -61,7 +63,11 @@ class BakeRequest:
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
             numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
+        fabric, material: that the garment is of, where its model was trained for a range of fabrics: a preset, and
+            properties as text (`delivery.bake.fabrics`); the model's own by default.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
+        start_cloth: shot or cache with the cloth that the first frame begins with, "FILE[:/PRIM][@CODE]", at its last
+            frame or at a time code (`delivery.bake.start`); None to begin at rest.
         loop: whether the motion is a cycle whose last frame is to flow into its first; False for what the stage says.
         keep: what is kept of the model, cut to be best for this motion; None for all.
         device: where the network runs.
@@ -96,7 +102,10 @@ class BakeRequest:
     wind: str | None = None
     gusts: str | None = None
     gravity: str | None = None
+    fabric: str | None = None
+    material: tuple[str, ...] = ()
     hold: int = 0
+    start_cloth: str | None = None
     loop: bool = False
     keep: ModelSize | None = None
     device: str = "cpu"
@@ -132,6 +141,9 @@ class BakeRequest:
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")
+        if self.lbs and (self.fabric or self.material):
+            found = "linear blend skinning has no fabric"
+            fail("--lbs", found, "only the network and the solver have one", "leave --fabric and --material out")
         if self.latent_elements not in LATENT_ELEMENTS:
             fail_unknown("--latent-elements", f"'{self.latent_elements}'", self.latent_elements, LATENT_ELEMENTS)
         if self.feedback and not self.refine:
@@ -182,12 +194,17 @@ class BakeRequest:
     def relocated(self, locate: Callable[[str], str]) -> BakeRequest:
         """Return the request with its input files elsewhere: `locate` gives the new path of each."""
         model, stage, motion = (locate(getattr(self, name)) for name in INPUTS)
-        return replace(self, model=model, stage=stage, motion=motion)
+        start = self.start_cloth
+        if start is not None:
+            place, code = split_start(start)
+            start = locate(place) + ("" if code is None else f"{AT}{code:.9g}")
+        return replace(self, model=model, stage=stage, motion=motion, start_cloth=start)
 
     def to_metadata(self) -> dict[str, object]:
         """Return what differs from the defaults, as a shot stores it."""
         changed = {name: value for name, value in vars(self).items() if value != getattr(BakeRequest, name, None)}
-        changed |= {"colliders": " ".join(self.colliders)} if self.colliders else {}
+        for name in OF_WORDS:
+            changed |= {name: " ".join(words)} if (words := getattr(self, name)) else {}
         return {**changed, "keep": str(self.keep)} if self.keep else changed
 
     @classmethod
@@ -200,9 +217,21 @@ class BakeRequest:
         """
         if isinstance(document, Mapping) and isinstance(document.get("keep"), str):
             document = {**document, "keep": vars(ModelSize.of(document["keep"]))}
-        if isinstance(document, Mapping) and isinstance(document.get("colliders"), str):
-            document = {**document, "colliders": tuple(document["colliders"].split())}
+        for name in OF_WORDS:
+            if isinstance(document, Mapping) and isinstance(document.get(name), str):
+                document = {**document, name: tuple(document[name].split())}
         return from_plain(cls, document)
+
+
+def split_start(text: str) -> tuple[str, float | None]:
+    """Return the file, with the prim that it names, and the time code of "FILE[:/PRIM][@CODE]"; None for the last."""
+    place, at, code = text.rpartition(AT)
+    if at and place:
+        try:
+            return place, float(code)
+        except ValueError:
+            pass  # a file of this name
+    return text, None
 
 
 def parse_range(text: str) -> tuple[float, float]:

@@ -10,15 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...errors import fail
 from ...events import Countdown, Event, Message, Reporter, silent
 from ...quality.levels import SizeReduction
-from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Skeleton
+from ...scene.assets import PINNED, Deformer, Floats, GarmentPose, Motion, Skeleton
 from ...scene.assets.reshaped import reshaped
+from ...scene.fabric_range import properties
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import (
     deform,
     held_at_cuts,
     lbs_poses,
+    motion_transforms,
+    resample,
     sample_felt,
     sample_motion,
     slerp,
@@ -31,6 +35,7 @@ from .inputs import InputHashes
 from .looped import MOST_ROUNDS, Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
 from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
+from .start import BLEND, FAR, SEEN, StartCloth, fading
 from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
@@ -41,6 +46,7 @@ if TYPE_CHECKING:
 
     from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
+    from ...network.start import GivenStart
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +114,7 @@ class BakeRollout:
         inputs: what the request's inputs held while they were read.
         provenance: where all of this comes from, as a shot stores it.
         record: how the garment's model was made.
+        played: likewise with the fabric that it plays; None for that of its training.
         info: of the garment as an asset.
         names: the joints as the shot's target finds them.
         sight: what the network knows of the world around the character.
@@ -119,6 +126,8 @@ class BakeRollout:
         riders: what rides on the garment; `told` is what was found about them, to be reported.
         direction: where the garment is held; None where it moves freely throughout.
         loop: how the shot repeats; None where it need not.
+        start_cloth: that the first frame begins with; None to begin at rest.
+        is_fading: whether the last blendshape is what the first frame lacks of that, and fades.
         recovered: frames at which the rollout was lost and the garment was put to rest; filled while `network_poses`
             yields.
         held_off: RMS distance from linear blend skinning of frames that are held [m], likewise.
@@ -150,6 +159,9 @@ class BakeRollout:
     told: tuple[Event, ...] = ()
     direction: Direction | None = None
     loop: Loop | None = None
+    played: GarmentRecord | None = None
+    start_cloth: StartCloth | None = None
+    is_fading: bool = False
     recovered: list[FrameSpan] = field(default_factory=list)
     held_off: list[float] = field(default_factory=list)
 
@@ -157,6 +169,12 @@ class BakeRollout:
     def start(self) -> float:
         """Time code of the first frame."""
         return self.motion.start / self.request.samples_per_frame
+
+    @property
+    def fabric_words(self) -> str:
+        """The fabric that it plays, in words."""
+        values = {name: f"{getattr(self.fabric, name):.4g}" for name in properties(self.fabric)}
+        return f"{self.fabric.name} ({', '.join(f'{name} {value}' for name, value in values.items())})"
 
     @property
     def influences(self) -> int:
@@ -194,7 +212,8 @@ class BakeRollout:
             yield self._looped.pose
             return
         self.recovered.clear()
-        yield from self._course(self.lead, self.lead + self.motion.frame_count, roller, self.recovered)
+        for pose in self._course(self.lead, self.lead + self.motion.frame_count, roller, self.recovered):
+            yield self._faded(pose) if self.is_fading else pose
 
     def _course(
         self, start: int, stop: int, roller: LatentRoller | None, lost: list[FrameSpan]
@@ -261,10 +280,89 @@ class BakeRollout:
                 lost.append(FrameSpan(max(begin - start, 0), end - start))
 
         driver, rate = self._driver(first, stop, step), self.motion.fps / step
-        for pose in garment_poses(self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller):
+        given = self._given if first == 0 and self.start_cloth else None
+        for pose in garment_poses(
+            self.model, driver, rate, CHUNK, note, pre_roll=pre_roll, roller=roller, given=given
+        ):
             part = pose.part(slice(0, max(count - pose.start, 0)))
             if part.frame_count:
                 yield part
+
+    @cached_property
+    def _given(self) -> GivenStart:
+        """The state that the first frame begins with."""
+        from ...network.start import fitted_start
+
+        assert self.model is not None and self.start_cloth is not None
+        fps, points = self.model.config.fps, self.start_cloth.points
+        whole = resample(self._driver(0, self._end, 1), fps, cover=True)
+        first, earlier = whole.clip(0, 1), self._source_frame(-self.lead) - self.source.fps / fps
+        if not self.start_cloth.moves:  # then it stands still: cloth and character go on together
+            return fitted_start(self.model, first, first, points)
+        if earlier < 0:  # as it goes on
+            return fitted_start(self.model, _step_before(whole), first, points)
+        position = np.array([earlier])
+        poses, felt = sample_motion(self.source, position), sample_felt(self.source, position)
+        return fitted_start(self.model, Motion(self.source.path, fps, *poses, **felt), first, points)
+
+    def begun(self) -> BakeRollout:
+        """Return the rollout with a blendshape for what latents miss of its first cloth, where that is seen."""
+        if self.start_cloth is None or self.model is None:
+            return self
+        from ...scene.decomposition.rest import rest_residuals
+
+        self._need_startable()
+        if self._given.left[1] <= SEEN:
+            return self
+        pose = next(self._course(0, self.motion.frame_count, None, [])).part(slice(0, 1))
+        points, first = [self.start_cloth.points[1]], self.motion.clip(0, 1)
+        ((_, offsets),) = rest_residuals(self.deformer, first, replace(pose, start=0), points)
+        own = np.where((self.deformer.scene.classes == PINNED)[:, None], 0, offsets[0])
+        shapes = np.concatenate([self.deformer.shapes, own[None]])
+        begun = replace(self, deformer=replace(self.deformer, shapes=shapes), is_fading=True)
+        begun.__dict__["_given"] = self._given
+        return begun
+
+    def _faded(self, pose: GarmentPose) -> GarmentPose:
+        """Return poses with the weight of what the first frame lacks."""
+        weights = fading(range(pose.start, pose.start + pose.frame_count), self.motion.fps)
+        return replace(pose, weights=np.concatenate([pose.weights, weights[:, None]], axis=1))
+
+    def _fading(self, pose: GarmentPose) -> Floats:
+        """Return the vertices of poses; those in which nothing is left of the first frame's are the network's own."""
+        found = self._network_decoded(pose)
+        for frame in np.flatnonzero(pose.weights[:, -1]):
+            part = pose.part(slice(frame, frame + 1))
+            found[frame] = deform(self.deformer, self.motion, part)[0]
+        return found
+
+    def _need_startable(self) -> None:
+        """Raise `SsilkError` where the first frame cannot begin with the cloth that is given."""
+        assert self.start_cloth is not None
+        direction, scene = self.direction, self.deformer.scene
+        if direction is not None and (direction.hold > 1 or direction.free[0] < 1):
+            found = "poses that are held" if direction.hold > 1 else "ssilk:free below 1 in the first frame"
+            fail("--start-cloth", f"a start and {found}", "one of both", "leave --start-cloth out, or let it go")
+        root = motion_transforms(self.motion.clip(0, 1), scene.character.skeleton.parents)[0, :, :3, 3]
+        away = np.linalg.norm(self.start_cloth.points[1][:, None] - root[None], axis=2).min()
+        reach = scene.garment.mesh.diagonal
+        if away > reach:
+            found = f"its cloth is {away:.3g} m away from the character's first pose"
+            fail(
+                self.start_cloth.where, found, f"{reach:.3g} m are allowed", "name the frame before this shot's first"
+            )
+
+    def _tell_start(self, report: Reporter) -> None:
+        """Report how near the first frame is to the cloth that it begins with."""
+        if self.start_cloth is None:
+            return
+        rms, most = (1000 * value for value in self._given.left)
+        slow = "" if self.start_cloth.moves else "; nothing is known of how it moves there"
+        near = f"{rms:.2g} mm (RMS), {most:.2g} mm at most"
+        rest = f"; a blendshape that fades in {BLEND:g} s makes up for the rest" if self.is_fading else ""
+        text = f"the cloth begins as in {self.start_cloth.where}; latents come within {near}{rest}{slow}"
+        far = self._given.left[0] > FAR
+        report(Message(f"{self.request.motion}: {text}", "warning" if far else "info"))
 
     def latent_roller(self, advanced: Callable[[], object] = lambda: None) -> LatentRoller:
         """Return what solves for the network's states in latents; `advanced` is called after each frame."""
@@ -338,7 +436,7 @@ class BakeRollout:
             return self._certified(self.certificate, pose)
         if self.refinement is not None and not self.request.writes_points:
             return deform(self.deformer, self.motion, pose)
-        return self._network_decoded(pose)
+        return self._fading(pose) if self.is_fading else self._network_decoded(pose)
 
     def _certified(self, certificate: Certificate, pose: GarmentPose) -> Floats:
         """Return the vertices of poses with a certificate; those of frames that were not moved are as without one."""
@@ -362,6 +460,7 @@ class BakeRollout:
             report(Message(f"--target {self.request.target}: {self.names}", "warning"))
         for event in self.told:
             report(event)
+        self._tell_start(report)
         if self.frames is None:
             return
         name = self.request.motion
@@ -414,6 +513,13 @@ class BakeRollout:
             report(Message(f"{self.request.motion}: {words}", "warning"))
         for span in self.recovered:
             report(Message(f"frames {span}: the rollout was lost, and the garment is put to rest", "warning"))
+
+
+def _step_before(motion: Motion) -> Motion:
+    """Return the frame before a motion, from which it came as evenly as it goes on."""
+    first, second = (motion.clip(frame, frame + 1) for frame in (0, min(1, motion.frame_count - 1)))
+    turned = slerp(first.rotations, second.rotations, np.full((1, 1), -1.0))
+    return replace(first, rotations=turned, translations=2 * first.translations - second.translations)
 
 
 def _from_fraction(motion: Motion, skeleton: Skeleton, first: float) -> Motion:

@@ -146,6 +146,9 @@ def _need_for_layers(requests: Sequence[BakeRequest], include_body: bool) -> Non
                 "their assets are the same for all shots",
                 "bake models that 'ssilk reduce' made",
             )
+        if request.start_cloth:
+            found, allowed = "a shot that goes on from another, in a folder of layers or a job", "one file is needed"
+            fail("--start-cloth", found, allowed, "bake it to a file, such as -o shot.usdc")
         if ".usdc" not in request.receiver.suffixes:
             fail(
                 f"--target {request.target}",

@@ -73,7 +73,8 @@ def verify(
             report(Message(text, "warning"))
     report(Started("verify", rollout.motion.frame_count, {"shot": str(path)}))
     found = verify_file(rollout, path, report)
-    report(Result("verify", {"shot": str(path), **found.figures()}))
+    cloth = {"fabric": rollout.fabric_words} if rollout.played else {}
+    report(Result("verify", {"shot": str(path), **cloth, **found.figures()}))
     return found
 
 

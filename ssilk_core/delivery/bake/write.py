@@ -182,7 +182,7 @@ def _write(
     poses = riders.poses(rollout.motion, rollout.poses())
     if output.suffix == GLB:
         return write_glb_shot(layer, riders.deformer, rollout.motion, poses, riders=riders, **common)
-    common |= {"units": rollout.units, "record": rollout.record, "info": rollout.info}
+    common |= {"units": rollout.units, "record": rollout.played or rollout.record, "info": rollout.info}
     if not rollout.request.writes_points:
         return write_shot(layer, riders.deformer, rollout.motion, poses, riders=riders, **common)
     if rollout.riders:

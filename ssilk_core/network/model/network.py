@@ -19,6 +19,7 @@ from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
 from .bodies import SeenBody, WornCloth, see_bodies
 from .decoder import Decoder
+from .fabrics import see_fabrics
 from .feedback import BodyFrames, DecodedState, Feedback, PointDecoder
 from .integrators import integrator
 
@@ -50,7 +51,13 @@ class GarmentModel(nn.Module):
         joints: character joints in the descriptors (`descriptors.descriptor_joints`).
         seed: of the initial parameters.
         family: bodies that it is trained for, of which it sees the one that it is on; the scene's alone by default.
+        fabrics: number of features of the fabric that P and S see in training (`network.fabrics`); none by default.
+
+    Attributes:
+        fabric: these features where descriptors lack them, shape (fabrics,); zero for the model's own fabric.
     """
+
+    fabric: Tensor
 
     def __init__(
         self,
@@ -59,6 +66,7 @@ class GarmentModel(nn.Module):
         joints: np.ndarray,
         seed: int = 0,
         family: DressedFamily | None = None,
+        fabrics: int = 0,
     ) -> None:
         super().__init__()
         self.scene, self.config, self.joints = scene, config, np.asarray(joints, dtype=np.int64)
@@ -66,8 +74,8 @@ class GarmentModel(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         self.decoder = Decoder(scene, config, generator)
         static, dynamic = descriptor_sizes(scene, self.joints, config)
-        self.proximity, self.described = proximity_size(scene, config), static + dynamic
-        self.static, z = static, config.latent
+        self.proximity, self.described = proximity_size(scene, config), fabrics + static + dynamic
+        self.static, z = fabrics + static, config.latent
         self.initialiser = mlp(static, config.widths, z, generator, 1.0)
         # Zero: training starts as the scheme integrates without S.
         self.integrator = integrator(config, dynamic)
@@ -79,6 +87,9 @@ class GarmentModel(nn.Module):
         )
         # Small: training starts as linear blend skinning.
         self.output = mlp(z, config.widths, self.decoder.output_count, generator, 0.01)
+        self.register_buffer("fabric", torch.zeros(fabrics), persistent=False)
+        if fabrics:
+            see_fabrics(self, fabrics, scheme.states * z)
         self.family = family
         if family:
             self.worn = WornCloth(family, self.decoder.rest, self.decoder.pivots)
@@ -101,13 +112,23 @@ class GarmentModel(nn.Module):
     def completed(self, values: Tensor, size: int) -> Tensor:
         """Return descriptors (..., size); those without features of proximity have nothing near.
 
+        Features of the fabric come first, then those of proximity. Where there are none, the fabric is `fabric`.
+
         Raises:
             SsilkError: they have the proximity of another number of points.
         """
-        near = values.shape[-1] - size + self.proximity
+        fabrics, near = len(self.fabric), values.shape[-1] - size + self.proximity
+        if fabrics and near in (0, self.proximity):  # as many as are left out may be features of the fabric
+            given, rest = values[..., :fabrics], values[..., fabrics:]
+        else:
+            given, rest, near = None, values, near + fabrics
         if near not in (0, self.proximity):
             fail(self.scene.garment.mesh.path, f"proximity at {near // 3} points", *sees_at(self.proximity))
-        return values if near == self.proximity else nn.functional.pad(values, (self.proximity, 0))
+        rest = rest if near == self.proximity else nn.functional.pad(rest, (self.proximity, 0))
+        if not fabrics:
+            return rest
+        given = self.fabric.expand(*rest.shape[:-1], fabrics) if given is None else given
+        return torch.cat([given, rest], dim=-1)
 
     def step(self, before: Tensor, now: Tensor, rest: Tensor, pose: Tensor, seen: Tensor) -> Tensor:
         """Return z_t from the two latents before it, the quasi-static one of frame t, and its dynamic descriptor.
@@ -130,7 +151,7 @@ class GarmentModel(nn.Module):
         """Return the points (M, 3, N) [m] at which the network sees colliders, at rest without any.
 
         Args:
-            static: descriptors without proximity, shape (N, S).
+            static: descriptors without proximity, shape (N, S), which may have features of the fabric.
             matrices: of the character, shape (J, 3, 4, N).
         """
         return self.sight(self.decoder, self.output(self.initial(static)), matrices)

@@ -18,6 +18,7 @@ from ..kernels.corners import elastic_tables
 from ..operators import difference_operator
 from .bending import bending_energy, dihedral_angles
 from .collision import ContactLaw
+from .factors import FabricFactors
 from .stitching import Stitching, held_stitches
 from .stretch import column_weights, deformation_gradient_operator, stiffened, stretch_density, stretched_areas
 
@@ -92,8 +93,9 @@ class GarmentEnergy:
         numbers = torch.hstack([self.bending_stiffness, self.rest_angle])
         self.tables = elastic_tables(mesh.vertex_count, mesh.faces, column_weights(mesh), areas, hinges, numbers)
 
-    def stretch(self, x: Tensor) -> Tensor:
-        return (self.area * stretch_density(self.gradient_operator(x), self.fabric)).sum(0)
+    def stretch(self, x: Tensor, moduli: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Return the energy of the membrane, where asked with other moduli of its model in each frame, (N,) each."""
+        return (self.area * stretch_density(self.gradient_operator(x), self.fabric, moduli)).sum(0)
 
     def bending(self, x: Tensor) -> Tensor:
         if len(self.rest_angle) == 0:
@@ -131,27 +133,44 @@ class GarmentEnergy:
         """Return the energy of contact at given signed distances of the samples (S, N)."""
         return (self.cloth.area * self.law.energy(distance)).sum(0)
 
-    def elastic(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return stretch and bending; this and the next two methods are fused where a device can."""
+    def elastic(self, x: Tensor, factors: FabricFactors | None = None) -> tuple[Tensor, Tensor]:
+        """Return stretch and bending; this and the next two methods are fused where a device can.
+
+        Args:
+            factors: of the fabric in each frame; its own by default.
+        """
+        moduli = factors.moduli(self.fabric) if factors else None
         if kernels.supports(x):
             from ..kernels.elastic import elastic_kernel
 
-            return elastic_kernel(x, self.tables, self.fabric)
-        if loops.supports(x):
+            stretch, bending = elastic_kernel(x, self.tables, self.fabric, moduli)
+        elif loops.supports(x):
             from ..loops.elastic import elastic_loop
 
-            return elastic_loop(x, self.tables, self.fabric)
-        return self.stretch(x), self.bending(x)
+            stretch, bending = elastic_loop(x, self.tables, self.fabric, moduli)
+        else:
+            stretch, bending = self.stretch(x, moduli), self.bending(x)
+        return stretch, bending * factors.bending if factors else bending
 
     def gravity_and_collision(
-        self, x: Tensor, root: Tensor, gravity: Tensor, sampled: Tensor, normal: Tensor, offset: Tensor
+        self,
+        x: Tensor,
+        root: Tensor,
+        gravity: Tensor,
+        sampled: Tensor,
+        normal: Tensor,
+        offset: Tensor,
+        factors: FabricFactors | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return gravity, with heights relative to `root` (3, N), and the collision with one plane for each sample.
 
         Args:
             sampled: positions of the samples (S, 3, N), with the gradient of x.
             normal, offset: unit normals (S, 3, N) and offsets (S, N) of the planes; they have no gradient.
+            factors: as in `elastic`; contact does not depend on them.
         """
+        if factors:
+            gravity = gravity * factors.density
         normal, offset, root = normal.detach(), offset.detach(), root.detach()
         law = self.law.stiffness, self.law.start, self.law.ramp
         if kernels.supports(x):
@@ -167,14 +186,27 @@ class GarmentEnergy:
         return falling, self.collision_at(signed_distance_to_planes(sampled, normal, offset))
 
     def inertia_and_drag(
-        self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float
+        self,
+        x: Tensor,
+        last: Tensor,
+        before: Tensor,
+        shift: Tensor,
+        dt: float,
+        factors: FabricFactors | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return inertia and drag of the first M frames of x (V, 3, N); only x has a gradient.
 
         Args:
             last, before: positions one and two frames ago (V, 3, M).
             shift: displacement of the air, which moves with the character's root, since the last frame (3, M).
+            factors: of the fabric in these M frames; its own by default.
         """
+        inertia, drag = self._inertia_and_drag(x, last, before, shift, dt)
+        return (inertia * factors.density, drag * factors.drag) if factors else (inertia, drag)
+
+    def _inertia_and_drag(
+        self, x: Tensor, last: Tensor, before: Tensor, shift: Tensor, dt: float
+    ) -> tuple[Tensor, Tensor]:
         weights = 1 / (dt * dt), self.fabric.drag / self.fabric.density / dt
         if kernels.supports(x):
             from ..kernels.pointwise import inertia_and_drag_kernel

@@ -104,12 +104,12 @@ def gradient_places(mesh: Mesh) -> tuple[Ints, Ints]:
     return np.repeat(np.arange(2 * len(mesh.faces)), 3), np.tile(mesh.faces.reshape(-1), 2)
 
 
-def stvk_density(gradient: Tensor, mu: float, lame_lambda: float) -> Tensor:
+def stvk_density(gradient: Tensor, mu: float | Tensor, lame_lambda: float | Tensor) -> Tensor:
     """Energy per rest area [J/m2], mu |G|^2 + lambda/2 tr(G)^2 with G = (F^T F - I)/2.
 
     Args:
         gradient: columns w_u, then w_v, shape (2 F, 3, N).
-        mu, lame_lambda: Lame parameters [N/m].
+        mu, lame_lambda: Lame parameters [N/m], where they differ from frame to frame (N,).
 
     Returns:
         Shape (F, N).
@@ -121,7 +121,7 @@ def stvk_density(gradient: Tensor, mu: float, lame_lambda: float) -> Tensor:
     return mu * (g_uu**2 + g_vv**2 + 2 * g_uv**2) + 0.5 * lame_lambda * (g_uu + g_vv) ** 2
 
 
-def baraff_witkin_density(gradient: Tensor, stretch: float, shear: float) -> Tensor:
+def baraff_witkin_density(gradient: Tensor, stretch: float | Tensor, shear: float | Tensor) -> Tensor:
     """Energy per rest area [J/m2], k_s ((|w_u|-1)^2 + (|w_v|-1)^2) + k_sh (w_u . w_v)^2; arguments as above."""
     w_u, w_v = gradient.chunk(2)
     # The length has no gradient at zero; a floor far below any real length keeps it finite.
@@ -130,8 +130,8 @@ def baraff_witkin_density(gradient: Tensor, stretch: float, shear: float) -> Ten
     return stretch * ((length_u - 1) ** 2 + (length_v - 1) ** 2) + shear * (w_u * w_v).sum(1) ** 2
 
 
-def stretch_density(gradient: Tensor, fabric: Fabric) -> Tensor:
-    """Energy per rest area [J/m2] of the fabric's own stretch model, shape (F, N)."""
+def stretch_density(gradient: Tensor, fabric: Fabric, moduli: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """Energy per rest area [J/m2] of the fabric's own stretch model, shape (F, N), with its own moduli or others."""
     if fabric.stretch_model == "stvk":
-        return stvk_density(gradient, fabric.lame_mu, fabric.lame_lambda)
-    return baraff_witkin_density(gradient, fabric.stretch, fabric.shear)
+        return stvk_density(gradient, *(moduli or (fabric.lame_mu, fabric.lame_lambda)))
+    return baraff_witkin_density(gradient, *(moduli or (fabric.stretch, fabric.shear)))

@@ -22,21 +22,29 @@ FRAMES, WARPS = 128, 2  # frames and warps of one program
 ELEMENTS = 8  # triangles or hinges that one program sums over
 
 
-def elastic_kernel(x: Tensor, tables: ElasticTables, fabric: Fabric) -> tuple[Tensor, Tensor]:
-    """Return stretch and bending [J] of positions x (V, 3, N), both (N,)."""
-    return _Elastic.apply(x.contiguous(), tables, fabric)
+def elastic_kernel(
+    x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return stretch and bending [J] of positions x (V, 3, N), both (N,).
+
+    Args:
+        moduli: of the stretch model in each frame (N,), without gradients; the fabric's own by default.
+    """
+    if moduli:
+        moduli = tuple(each.detach().contiguous() for each in moduli)  # type: ignore[assignment]
+    return _Elastic.apply(x.contiguous(), tables, fabric, moduli)
 
 
-def _membrane(fabric: Fabric) -> tuple[float, float, bool]:
-    """Return both moduli of the stretch model [N/m], and whether it is Baraff-Witkin's."""
+def _membrane(fabric: Fabric, moduli: tuple[Tensor, Tensor] | None) -> tuple[object, ...]:
+    """Return both moduli of the stretch model [N/m], whether each frame has its own, and if it is Baraff-Witkin's."""
     if fabric.stretch_model == "stvk":
-        return fabric.lame_mu, fabric.lame_lambda, False
-    return fabric.stretch, fabric.shear, True
+        return *(moduli or (fabric.lame_mu, fabric.lame_lambda)), moduli is not None, False
+    return *(moduli or (fabric.stretch, fabric.shear)), moduli is not None, True
 
 
 class _Elastic(Function):
     @staticmethod
-    def forward(ctx, x, tables, fabric):
+    def forward(ctx, x, tables, fabric, moduli):
         frames, blocks = x.shape[-1], triton.cdiv(x.shape[-1], FRAMES)
         faces, hinges = len(tables.faces), len(tables.hinges)
         stretch = x.new_empty(triton.cdiv(faces, ELEMENTS), frames)
@@ -44,7 +52,7 @@ class _Elastic(Function):
         slope = x.new_empty(hinges, frames)
         _stretch[len(stretch), blocks](
             *(x, tables.faces, tables.face_numbers, stretch),
-            *(*_membrane(fabric), faces, frames, ELEMENTS, FRAMES),
+            *(*_membrane(fabric, moduli), faces, frames, ELEMENTS, FRAMES),
             num_warps=WARPS,
         )
         if hinges:
@@ -54,7 +62,7 @@ class _Elastic(Function):
                 num_warps=WARPS,
             )
         ctx.save_for_backward(x, slope)
-        ctx.tables, ctx.fabric = tables, fabric
+        ctx.tables, ctx.membrane = tables, _membrane(fabric, moduli)
         return stretch.sum(0), bending.sum(0)
 
     @staticmethod
@@ -66,10 +74,10 @@ class _Elastic(Function):
         _gradient[vertices, triton.cdiv(frames, FRAMES)](
             *(x, slope, tables.starts, tables.corners, tables.corner_numbers),
             *(values.contiguous() for values in upstream),
-            *(grad, *_membrane(ctx.fabric), len(slope) > 0, frames, FRAMES),
+            *(grad, *ctx.membrane, len(slope) > 0, frames, FRAMES),
             num_warps=WARPS,
         )
-        return grad, None, None
+        return grad, None, None, None
 
 
 @triton.jit
@@ -90,6 +98,16 @@ def _columns(px, py, pz, qx, qy, qz, number):
 @triton.jit
 def _length(square):
     return tl.sqrt(tl.maximum(square, 1e-12))  # the floor is the reference implementation's
+
+
+@triton.jit
+def _modulus(values, n, inside, mixed: tl.constexpr):
+    """A modulus of all frames, or where they are mixed, that of each."""
+    if mixed:  # noqa: SIM108  # Triton compiles one branch of a statement alone
+        modulus = tl.load(values + n, mask=inside, other=0.0)
+    else:
+        modulus = values
+    return modulus
 
 
 @triton.jit
@@ -126,6 +144,7 @@ def _stretch(
     shares,
     first,
     second,
+    mixed: tl.constexpr,
     woven: tl.constexpr,
     count,
     frames,
@@ -136,6 +155,7 @@ def _stretch(
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames
     total = tl.zeros((block,), tl.float32)
+    one, other = _modulus(first, n, inside, mixed), _modulus(second, n, inside, mixed)
     for face in range(part * chunk, tl.minimum((part + 1) * chunk, count)):
         index, number = faces + face * 6, numbers + face * 8
         ax, ay, az = _point(x, index, frames, n, inside)
@@ -143,7 +163,7 @@ def _stretch(
         cx, cy, cz = _point(x, index + 2, frames, n, inside)
         ux, uy, uz, vx, vy, vz, _, _ = _columns(bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az, number)
         uu, uv, vv = dot(ux, uy, uz, ux, uy, uz), dot(ux, uy, uz, vx, vy, vz), dot(vx, vy, vz, vx, vy, vz)
-        total += tl.load(number + 4) * _density(uu, uv, vv, first, second, woven)
+        total += tl.load(number + 4) * _density(uu, uv, vv, one, other, woven)
     tl.store(shares + part * frames + n, total, mask=inside)
 
 
@@ -228,6 +248,7 @@ def _gradient(
     grad,
     first,
     second,
+    mixed: tl.constexpr,
     woven: tl.constexpr,
     hinged: tl.constexpr,
     frames,
@@ -239,6 +260,7 @@ def _gradient(
     ax, ay, az = load3(x + v * 3 * frames, frames, n, inside)
     sx, sy, sz = tl.zeros((block,), tl.float32), tl.zeros((block,), tl.float32), tl.zeros((block,), tl.float32)
     hx, hy, hz = sx, sy, sz
+    one, other = _modulus(first, n, inside, mixed), _modulus(second, n, inside, mixed)
     for row in range(tl.load(starts + v).to(tl.int64), tl.load(starts + v + 1).to(tl.int64)):
         index, number = corners + row * 6, numbers + row * 8
         px, py, pz = _point(x, index + 1, frames, n, inside)
@@ -246,7 +268,7 @@ def _gradient(
         px, py, pz, qx, qy, qz = px - ax, py - ay, pz - az, qx - ax, qy - ay, qz - az
         ux, uy, uz, vx, vy, vz, by_u, by_v = _columns(px, py, pz, qx, qy, qz, number)
         uu, uv, vv = dot(ux, uy, uz, ux, uy, uz), dot(ux, uy, uz, vx, vy, vz), dot(vx, vy, vz, vx, vy, vz)
-        p, q, r = _stress(uu, uv, vv, first, second, woven)
+        p, q, r = _stress(uu, uv, vv, one, other, woven)
         area = tl.load(number + 4)
         along_u, along_v = area * (by_u * p + by_v * q), area * (by_u * q + by_v * r)
         sx -= along_u * ux + along_v * vx

@@ -27,9 +27,15 @@ PART = 64  # elements that are added up before their sum is, so that rounding er
 HALF_PI, PI, TWO_PI = np.float32(np.pi / 2), np.float32(np.pi), np.float32(2 * np.pi)
 
 
-def elastic_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> tuple[Tensor, Tensor]:
-    """Return stretch and bending [J] of positions x (V, 3, N), both (N,)."""
-    return _Elastic.apply(x, tables, fabric)
+def elastic_loop(
+    x: Tensor, tables: ElasticTables, fabric: Fabric, moduli: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Return stretch and bending [J] of positions x (V, 3, N), both (N,).
+
+    Args:
+        moduli: of the stretch model in each frame (N,), without gradients; the fabric's own by default.
+    """
+    return _Elastic.apply(x, tables, fabric, moduli)
 
 
 def elastic_gradient_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> Tensor:
@@ -38,16 +44,18 @@ def elastic_gradient_loop(x: Tensor, tables: ElasticTables, fabric: Fabric) -> T
     return stretch + bending
 
 
-def _run(x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool) -> tuple[Tensor, Tensor]:
+def _run(
+    x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool, moduli: tuple[Tensor, Tensor] | None = None
+) -> tuple[Tensor, Tensor]:
     """Return both energies (2, N) and, where wanted, their gradients (2, V, 3, N)."""
     frames = x.shape[2]
     energy = torch.empty(2, frames)
     # The gradients of both energies; one vertex stands for all where they are not asked for.
     slopes = torch.empty(2, len(x) if wanted else 1, 3, frames)
     woven = fabric.stretch_model != "stvk"
-    moduli = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
+    own = (fabric.stretch, fabric.shear) if woven else (fabric.lame_mu, fabric.lame_lambda)
     rest = (tables.faces, tables.face_numbers, tables.hinges, tables.hinge_numbers)
-    numbers = (np.float32(modulus) for modulus in moduli)
+    numbers = map(array, moduli) if moduli else (np.full(frames, modulus, np.float32) for modulus in own)
     out = energy.numpy(), slopes.numpy()
     run_parts(_elastic, blocks_of(frames, LANES), array(x), *map(array, rest), *numbers, woven, wanted, *out)
     return energy, slopes
@@ -55,8 +63,8 @@ def _run(x: Tensor, tables: ElasticTables, fabric: Fabric, wanted: bool) -> tupl
 
 class _Elastic(Function):
     @staticmethod
-    def forward(ctx, x, tables, fabric):
-        energy, slopes = _run(x, tables, fabric, ctx.needs_input_grad[0])
+    def forward(ctx, x, tables, fabric, moduli):
+        energy, slopes = _run(x, tables, fabric, ctx.needs_input_grad[0], moduli)
         ctx.save_for_backward(slopes)
         return energy[0], energy[1]
 
@@ -64,7 +72,7 @@ class _Elastic(Function):
     @once_differentiable
     def backward(ctx, to_stretch, to_bending):
         ((stretch, bending),) = ctx.saved_tensors
-        return (stretch * to_stretch).addcmul_(bending, to_bending), None, None
+        return (stretch * to_stretch).addcmul_(bending, to_bending), None, None, None
 
 
 @compiled
@@ -74,6 +82,7 @@ def _elastic(
     vertices, _, frames = x.shape
     held = vertices if wanted else 0
     here, slope = np.empty((vertices, 3 * LANES), np.float32), np.empty((held, 3 * LANES), np.float32)
+    one, other = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     for block in range(start, stop):
         first_frame = block * LANES
         count = min(LANES, frames - first_frame)
@@ -81,8 +90,10 @@ def _elastic(
             for axis in range(3):
                 for n in range(LANES):
                     here[v, axis * LANES + n] = x[v, axis, first_frame + min(n, count - 1)]
+        for n in range(LANES):
+            one[n], other[n] = first[first_frame + min(n, count - 1)], second[first_frame + min(n, count - 1)]
         slope[:] = 0
-        _stretch(here, faces, face_numbers, first, second, woven, slope, energy[0, first_frame:], count)
+        _stretch(here, faces, face_numbers, one, other, woven, slope, energy[0, first_frame:], count)
         _copied(slope, slopes[0], first_frame, count)
         slope[:] = 0
         _bending(here, hinges, hinge_numbers, slope, energy[1, first_frame:], count)
@@ -163,9 +174,10 @@ def _write(work, n, numbers, ux, uy, uz, vx, vy, vz, p, q, r, density):
 
 
 @compiled
-def _stvk(work, numbers, mu, lame_lambda):
+def _stvk(work, numbers, first, second):
     one, half, two = np.float32(1), np.float32(0.5), np.float32(2)
     for n in range(LANES):
+        mu, lame_lambda = first[n], second[n]
         ux, uy, uz, vx, vy, vz = _columns(work, n, numbers)
         g_uu, g_vv = half * (ux * ux + uy * uy + uz * uz - one), half * (vx * vx + vy * vy + vz * vz - one)
         g_uv = half * (ux * vx + uy * vy + uz * vz)
@@ -177,9 +189,10 @@ def _stvk(work, numbers, mu, lame_lambda):
 
 
 @compiled
-def _woven(work, numbers, stretch, shear):
+def _woven(work, numbers, first, second):
     zero, one, two, least = np.float32(0), np.float32(1), np.float32(2), np.float32(1e-12)
     for n in range(LANES):
+        stretch, shear = first[n], second[n]
         ux, uy, uz, vx, vy, vz = _columns(work, n, numbers)
         uu, uv, vv = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
         long_u, long_v = sqrt(max(uu, least)), sqrt(max(vv, least))

@@ -66,6 +66,10 @@ def _is_scalars(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(item, str | int | float | list) for item in value.values())
 
 
+def _is_range(value: Any) -> bool:
+    return isinstance(value, list) and all(_is_text(item) or type(item) in (int, float) for item in value)
+
+
 KEYS = {
     "stage": Key("", _is_text, "the path of a stage"),
     "garment": Key("--garment", _is_text, "a path, a path:/prim or a prim"),
@@ -74,6 +78,7 @@ KEYS = {
     "preset": Key("--preset", lambda value: value in [*PRESETS], f"one of {', '.join(PRESETS)}"),
     "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
+    "fabrics": Key("--fabrics", _is_range, "a list of presets and factors, like ['silk', 4],"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
     "family": Key("--family", _is_texts, "a path or a list of paths"),
     "graded": Key("--graded", lambda value: isinstance(value, bool), "true or false"),
@@ -225,7 +230,7 @@ def _option(option: str, value: Any) -> list[str]:
         return [option] if value else []
     if isinstance(value, dict):
         return [word for name, item in value.items() for word in (option, f"{name}={_text(item)}")]
-    return [*filter(None, [option]), *(value if isinstance(value, list) else [str(value)])]
+    return [*filter(None, [option]), *map(str, value if isinstance(value, list) else [value])]
 
 
 def _text(value: Any) -> str:

@@ -14,6 +14,7 @@ import torch
 from ssilk_core.physics import kernels, loops
 from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.physics.energy.factors import FabricFactors
 from ssilk_core.physics.energy.graded import GradedRest
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import FABRICS, Fabric
@@ -70,8 +71,14 @@ def tensor(values: np.ndarray, dtype: torch.dtype = torch.float32) -> torch.Tens
     return torch.tensor(values.astype(np.float32), dtype=dtype, device=DEVICE)
 
 
-def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtype: torch.dtype) -> Found:
-    """Both terms that a method of `GarmentEnergy` returns, each with its gradient for a random upstream gradient."""
+def evaluate(
+    terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtype: torch.dtype, mixed: bool = False
+) -> Found:
+    """Both terms that a method of `GarmentEnergy` returns, each with its gradient for a random upstream gradient.
+
+    Args:
+        mixed: whether each frame has a fabric of its own.
+    """
     rng = np.random.default_rng(2)
     samples = contact_samples(mesh, fabric)
     sampled = np.einsum("sk,skcn->scn", samples.weights, positions[samples.corners])
@@ -86,12 +93,14 @@ def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtyp
     )
     energy = GarmentEnergy(mesh, fabric, device=DEVICE, dtype=dtype)
     x = tensor(positions, dtype).requires_grad_()
+    factors = FabricFactors.of(tensor(rng.uniform(-1, 1, (FRAMES, 5)), dtype)) if mixed else None
+    moving = factors.first(MOVING) if factors else None
     call = {
-        "elastic": lambda: energy.elastic(x),
+        "elastic": lambda: energy.elastic(x, factors),
         "potential": lambda: energy.gravity_and_collision(
-            x, root, gravity, energy.cloth.positions(x), normal, offset
+            x, root, gravity, energy.cloth.positions(x), normal, offset, factors
         ),
-        "kinetic": lambda: energy.inertia_and_drag(x, path[..., 1:-1], path[..., :-2], shift, 1 / 30),
+        "kinetic": lambda: energy.inertia_and_drag(x, path[..., 1:-1], path[..., :-2], shift, 1 / 30, moving),
     }
     found = []
     for value in call[terms]():
@@ -101,8 +110,10 @@ def evaluate(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, dtyp
     return found
 
 
-def assert_equal_to_reference(terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray) -> None:
-    fused, lbs = (evaluate(terms, mesh, fabric, positions, dtype) for dtype in (torch.float32, torch.float64))
+def assert_equal_to_reference(
+    terms: str, mesh: Mesh, fabric: Fabric, positions: np.ndarray, mixed: bool = False
+) -> None:
+    fused, lbs = (evaluate(terms, mesh, fabric, positions, dtype, mixed) for dtype in (torch.float32, torch.float64))
     for (value, gradient), (expected, slope) in zip(fused, lbs):
         relative = value / expected - 1
         assert np.abs(relative).max() < 2e-6 and abs(relative.mean()) < 4e-7
@@ -113,9 +124,15 @@ def assert_equal_to_reference(terms: str, mesh: Mesh, fabric: Fabric, positions:
         assert abs(bias.mean()) < 4e-7
 
 
+@pytest.mark.parametrize("mixed", [False, True], ids=["one", "mixed"])
 @pytest.mark.parametrize("fabric", [STVK, WOVEN], ids=lambda fabric: fabric.name)
-def test_stretch_and_bending(sheet, fabric):
-    assert_equal_to_reference("elastic", sheet, fabric, extreme(sheet.points))
+def test_stretch_and_bending(sheet, fabric, mixed):
+    assert_equal_to_reference("elastic", sheet, fabric, extreme(sheet.points), mixed)
+
+
+@pytest.mark.parametrize("terms", ["potential", "kinetic"])
+def test_terms_of_single_vertices_of_mixed_fabrics(sheet, terms):
+    assert_equal_to_reference(terms, sheet, STVK, crumpled(sheet.points), mixed=True)
 
 
 @pytest.mark.parametrize("fabric", [STVK, FABRICS["paper"]], ids=lambda fabric: fabric.contact_model)

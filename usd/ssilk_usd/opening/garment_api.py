@@ -43,8 +43,12 @@ def register_schema() -> None:
 def apply_garment_api(prim: Usd.Prim, record: GarmentRecord | None = None) -> None:
     """Mark a mesh as a garment, whether or not USD knows the schema, and author how its model was made."""
     prim.AddAppliedSchema(SCHEMA)
-    if record is None:
-        return
+    if record is not None:
+        author_record(prim, record)
+
+
+def author_record(prim: Usd.Prim, record: GarmentRecord) -> None:
+    """Author on a garment's mesh how its model was made, and the fabric that it plays."""
     names = Vt.TokenArray(list(record.parameters))
     values = Vt.DoubleArray([float(value) for value in record.parameters.values()])
     for name, kind, value in (

@@ -16,6 +16,7 @@ from ssilk_core.files import replacing, sha256
 from ssilk_core.scene.assets import Deformer, Floats, GarmentPose, Motion
 
 from ..names import shape_name
+from ..opening.garment_api import GarmentRecord, author_record
 from ..opening.specs import free_when_closed
 from ..opening.stage import open_stage
 from ..units import StageUnits
@@ -49,6 +50,7 @@ def write_animation(
     hidden: Sequence[tuple[int, bool]] = (),
     hidden_polygons: HiddenPolygons | None = None,
     points: bool = False,
+    record: GarmentRecord | None = None,
     provenance: Mapping[str, object] | None = None,
     path: Path | None = None,
 ) -> ShotSummary:
@@ -62,6 +64,7 @@ def write_animation(
         riders: what rides on the garment, as its asset has it.
         hidden_polygons: polygons of the bodies that this shot hides, in a variant.
         points: offer the point cache that `write_points` writes as a variant.
+        record: of the garment, where it is of another fabric in this shot than its asset says.
         path: the file to write, where it is not yet that of `layout`, which must be in the same folder.
 
     Raises:
@@ -75,6 +78,8 @@ def write_animation(
         asset = replace(asset, rider_shapes=riders.shapes if riders else asset.rider_shapes)
         asset = _define_own_shapes(stage, asset, deformer, units)
         asset = define_body_shapes(stage, asset, motion, units, before=list(map(shape_name, asset.shapes)))
+        if record:
+            author_record(stage.OverridePrim(asset.garment), record)
         set_metadata(stage, span, units)
         if lean:
             define_path(stage.GetPrimAtPath(asset.root))

@@ -57,6 +57,7 @@ class MeshTrajectories(Sequence[Floats]):
         self.times, step = self._sampled()
         second = float(self._shot.stage.GetTimeCodesPerSecond())
         self.fps, self.seconds = second / step, np.array(self.times) / second
+        self._second = second
         self.vertex_count = len(self[0])
         if vertex_count is not None and self.vertex_count != vertex_count:
             fail(
@@ -85,6 +86,14 @@ class MeshTrajectories(Sequence[Floats]):
 
     def __len__(self) -> int:
         return len(self.times)
+
+    def at(self, code: float) -> Floats:
+        """Return the points at a time code, also between frames."""
+        return self._shot.mesh_points(self._index, code)
+
+    def seconds_to_codes(self, seconds: float) -> float:
+        """Return how many time codes so many seconds are."""
+        return seconds * self._second
 
     @overload
     def __getitem__(self, frame: int) -> Floats: ...

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model in the fabric that is asked for, where it was trained for a range of fabrics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...errors import fail, fail_unknown
+from ...events import Event, Message
+from ...network.checkpoint import ONE_FABRIC, ModelFile
+from ...network.settings import apply_overrides
+from ...scene.fabric_range import FACTORS, fabric_with, factors_of, properties
+from ...scene.fabrics import Fabric, fabric_named
+
+TIMES = "x"  # at the end of a value that is a factor
+
+
+def in_fabric(
+    file: ModelFile, where: str, fabric: str | None, material: Sequence[str]
+) -> tuple[ModelFile, tuple[Event, ...]]:
+    """Return a model in the fabric that options ask for, and what there is to tell of that.
+
+    Args:
+        where: the model's path, for messages.
+        fabric: name of a preset; None for the model's own fabric.
+        material: "NAME=VALUE" properties of it, or "NAME=FACTORx" of what the model's own fabric has.
+
+    Raises:
+        SsilkError: the model knows one fabric alone, or its networks do not see a property that is asked for.
+    """
+    if not fabric and not material:
+        return file, ()
+    if file.fabrics is None:
+        asked = " ".join([*([f"--fabric {fabric}"] if fabric else []), *(f"--material {each}" for each in material)])
+        fail(where, f"{asked} for a model of one fabric", *ONE_FABRIC)
+    own, known = file.fabric, file.fabrics.range
+    wanted = _asked(own, fabric, material)
+    factors = factors_of(own, wanted)
+    values = ", ".join(f"{name} {factor:.3g}" for name, factor in zip(FACTORS, factors))
+    told: list[Event] = [Message(f"{where}: fabric '{wanted.name}', as factors of the model's own: {values}")]
+    if beyond := known.beyond(factors):
+        text = f"{beyond} is beyond the fabrics of its training: the network sees the nearest of these"
+        told.append(Message(f"{where}: {text}; --refine N or --quality hero solve for it", "warning"))
+    return file.on_fabric(wanted), tuple(told)
+
+
+def _asked(own: Fabric, fabric: str | None, material: Sequence[str]) -> Fabric:
+    """Return the fabric that options ask for, with all that networks do not see as the model's own has it."""
+    factors = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
+    absolute = []
+    for each in material:
+        name, _, text = each.partition("=")
+        where = f"--material {each}"
+        if text.endswith(TIMES):
+            if name not in FACTORS:
+                fail_unknown(where, "networks see no factor of it", name, FACTORS)
+            try:
+                factors[FACTORS.index(name)] = float(text.removesuffix(TIMES))
+            except ValueError:
+                fail(where, f"'{text}'", "a factor is a number before the x, such as bending=2x")
+        elif name not in properties(own):
+            fail_unknown(where, "networks do not see it", name, properties(own))
+        else:
+            absolute.append(each)
+    if not (np.isfinite(factors).all() and (factors >= 0).all() and factors[0] > 0 and factors[3] > 0):
+        found = ", ".join(f"{name} {factor:g}" for name, factor in zip(FACTORS, factors))
+        fail(
+            "--material",
+            f"factors {found}",
+            "they are finite and not negative, those of stretch and density positive",
+        )
+    return apply_overrides(fabric_with(own, factors, fabric), absolute)

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cloth that a shot begins with, from a shot or a cache that ends there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...errors import fail
+from ...scene.assets import Floats, Garment
+from .request import BakeRequest, split_start
+
+SLACK = 1e-6  # of a time code
+FAR = 0.01  # [m] RMS, from which on latents do not reach the cloth: it is warned of
+SEEN = 1e-4  # [m] that latents may miss at most without a blendshape that makes up for it
+BLEND = 0.5  # [s] after which that weighs nothing
+
+
+@dataclass(frozen=True, eq=False)
+class StartCloth:
+    """The cloth that a shot begins with.
+
+    Attributes:
+        points: one step of the model before the first frame, and in it, in world space [m], shape (2, V, 3).
+        moves: whether the first was read: otherwise it is as the second.
+        where: file, prim and time code, for messages.
+    """
+
+    points: Floats
+    moves: bool
+    where: str
+
+
+def read_start(text: str, garment: Garment, fps: float) -> StartCloth:
+    """Read the cloth of one frame of a shot or a cache, and of one step before that at a rate [1/s].
+
+    Raises:
+        SsilkError: it cannot be read, has not that frame, or is another mesh.
+    """
+    from ssilk_usd.shots.trajectories import MeshTrajectories
+
+    place, code = split_start(text)
+    cache = MeshTrajectories(place, garment.mesh.vertex_count, garment.mesh.faces)
+    first, last = float(cache.times[0]), float(cache.times[-1])
+    code = last if code is None else code
+    if not first - SLACK <= code <= last + SLACK:
+        found = f"a start at time code {code:.9g}"
+        fail(
+            place,
+            found,
+            f"it lasts from {first:.9g} to {last:.9g}",
+            "name a frame of it after '@', or none for its last",
+        )
+    earlier = code - cache.seconds_to_codes(1 / fps)
+    moves = earlier >= first - SLACK
+    now = cache.at(code)
+    points = np.stack([cache.at(max(earlier, first)) if moves else now, now])
+    if not np.isfinite(points).all():
+        fail(place, "points that are not finite", "all must be finite", "write it again")
+    return StartCloth(points, moves, f"{place} at {code:.9g}")
+
+
+def fading(frames: range, fps: float) -> Floats:
+    """Return the weights (F,) of what latents miss, in frames that are counted from the first, at a rate [1/s]."""
+    done: Floats = np.clip(np.array(frames, np.float64) / (fps * BLEND), 0, 1)
+    return np.asarray(1 - done**2 * (3 - 2 * done), np.float64)
+
+
+def need_startable(request: BakeRequest) -> None:
+    """Raise `SsilkError` where a start is asked for together with what it does not go with."""
+    for found, there, todo in (
+        ("linear blend skinning", request.lbs, "leave --lbs out"),
+        ("a run-up", request.pre_roll > 0, "leave --pre-roll out"),
+        ("a loop", request.loop, "leave --loop out"),
+        ("a solver in latents, which starts by itself", request.latent_iterations > 0, "leave --quality latent out"),
+        ("poses that are held", request.hold > 1, "leave --hold out"),
+    ):
+        if there:
+            fail("--start-cloth", f"a start and {found}", "one of both", todo)
