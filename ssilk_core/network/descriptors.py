@@ -84,12 +84,12 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
 
 def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
     """Return the places in `joints` (J',) of those whose rotations are features: all but the hub, and other roots."""
-    above = skeleton.hub_path[:-1]
+    above = skeleton.seen_hub_path[:-1]
     return np.array(
         [
             i
             for i, joint in enumerate(joints)
-            if joint in above or (joint != skeleton.hub and skeleton.parents[joint] >= 0)
+            if joint in above or (joint != skeleton.hub and skeleton.network_parents[joint] >= 0)
         ],
         dtype=np.int64,
     )
@@ -104,11 +104,11 @@ def pose_features(
         world: `motion_transforms` of the motion, if it is already computed.
         kind: of `settings.DESCRIPTORS`.
     """
-    world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
-    local = matrix_from_quaternion(motion.rotations[:, joints])
+    world = motion_transforms(motion, skeleton.parents) if world is None else world
+    local, world = _local_rotations(motion, skeleton, joints, world), world[:, joints]
     centre = place_of_hub(skeleton, joints)
     root, down = world[:, centre, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
-    above = np.flatnonzero(np.isin(joints, skeleton.hub_path[:-1]))
+    above = np.flatnonzero(np.isin(joints, skeleton.seen_hub_path[:-1]))
     local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
     static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
     gravity = None if motion.gravity is None else seen_gravity(motion.gravity)
@@ -127,6 +127,15 @@ def pose_features(
     ]
     dynamic = np.concatenate([rate, change, *turn, accelerations(world[..., :3, 3], root, motion.fps)], axis=1)
     return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity, near)
+
+
+def _local_rotations(motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats) -> Floats:
+    """Return rotations of joints to their parents as networks see these, shape (F, J', 3, 3)."""
+    if skeleton.seen_parents is None:
+        return matrix_from_quaternion(motion.rotations[:, joints])
+    above, turned = skeleton.seen_parents[joints], world[:, joints, :3, :3]
+    local = np.swapaxes(world[:, above, :3, :3], -1, -2) @ turned
+    return np.where((above >= 0)[:, None, None], local, turned)
 
 
 def accelerations(places: Floats, root: Floats, fps: float) -> Floats:

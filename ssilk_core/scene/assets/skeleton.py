@@ -30,6 +30,8 @@ class Skeleton:
             its jumps, and what is relative to the character is relative to it.
         placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
             above the skeleton tilt or scale it; None elsewhere.
+        seen_parents: parents as networks see them, where joints hang from others to be moved (`helper_joints`), shape
+            (J,); None for `parents`.
     """
 
     path: str
@@ -39,6 +41,7 @@ class Skeleton:
     rest_transforms: Floats
     hub: int = 0
     placement: Floats | None = None
+    seen_parents: Ints | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -58,6 +61,10 @@ class Skeleton:
             if self.placement.shape != (4, 4):
                 fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
             need_finite(self.placement, self.path, "placement")
+        if self.seen_parents is not None:
+            assign(self, seen_parents=frozen(self.seen_parents, np.int32))
+            if self.seen_parents.shape != (count,):
+                fail(self.path, f"{len(self.seen_parents)} seen parents", f"one for each of {count} joints is needed")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
@@ -80,10 +87,24 @@ class Skeleton:
     @property
     def hub_path(self) -> tuple[int, ...]:
         """The joints above the hub, from the top, and the hub."""
-        path = [self.hub]
-        while (above := int(self.parents[path[0]])) >= 0:
-            path.insert(0, above)
-        return tuple(path)
+        return _path_to(self.hub, self.parents)
+
+    @property
+    def network_parents(self) -> Ints:
+        """The parents that networks see, shape (J,)."""
+        return self.parents if self.seen_parents is None else self.seen_parents
+
+    @property
+    def seen_hub_path(self) -> tuple[int, ...]:
+        """The joints above the hub as networks see them, from the top, and the hub."""
+        return _path_to(self.hub, self.network_parents)
+
+
+def _path_to(joint: int, parents: Ints) -> tuple[int, ...]:
+    path = [joint]
+    while (above := int(parents[path[0]])) >= 0:
+        path.insert(0, above)
+    return tuple(path)
 
 
 def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> int:

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A garment's own joints as helper joints of another character, whose joints have other names, axes and bind poses.
+
+Each helper joint is one of the garment's character, a child of the other character's joint that stands for it, and
+holds still relative to that joint. It is bound where it was bound before, at the proportions of the other character:
+what a network sees of a pose, and what skins the garment, are as they were in training, whatever rig the character
+has. `alike` is the pose in which the other character stands as the garment's does in its bind pose: limbs point where
+the garment's point, and all else is as the character is bound, since joints within a trunk lie elsewhere in each rig
+without a trunk being bent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import fail
+from .assets import Body, Character, Floats, Ints, Skeleton
+from .joint_map import ancestors, heading, height, owners
+from .kinematics import invert_rigid, rigid, skin_points
+
+PREFIX = "ssilk_"  # of the names of helper joints
+LONG = 0.11  # of the height, from which on a bone is a limb's, not one of hands, feet, collar or spine
+BESIDE = 0.035  # of the height, by which it is beside the hub
+LOW = 0.12  # of the height over the lowest joint, below which joints are feet
+LEAN = 10.0  # [degrees] from which on a trunk is bound leaning, and not only with its joints elsewhere
+FLAT = 0.02  # of the largest principal value of joints, below which they lie on a line
+UNLIKE = 135.0  # [degrees] by which a limb is bound otherwise, from which on it is not known how it was turned
+
+
+@dataclass(frozen=True, eq=False)
+class PosedAlike:
+    """Another character in the bind pose of a garment's own.
+
+    Attributes:
+        transforms: its joints to the world, shape (J', 4, 4).
+        turned: by which each joint turns from where it is bound, beyond the trunk [degrees], shape (J',).
+        upright: rotation that makes its trunk stand and face as that of the garment's character, shape (3, 3).
+    """
+
+    transforms: Floats
+    turned: Floats
+    upright: Floats
+
+
+def alike(own: Skeleton, other: Skeleton, images: Ints) -> PosedAlike:
+    """Return another character in the bind pose of a garment's own.
+
+    Args:
+        images: the joint of the other one that stands for each of the own ones, or -1, shape (J,).
+
+    Raises:
+        SsilkError: a limb is bound so far from the own one that it does not say how it was turned.
+    """
+    binds, wanted = other.bind_transforms, _limbs(own, other, images)
+    turn = _upright(own, other, images, wanted)
+    feet = _feet(other)
+    turns, places = np.empty((other.joint_count, 3, 3)), np.empty((other.joint_count, 3))
+    hub = binds[images[own.hub], :3, 3]
+    for joint, parent in enumerate(other.parents.tolist()):
+        at = binds[joint, :3, 3]
+        if parent < 0:
+            turns[joint], places[joint] = turn, hub + turn @ (at - hub)
+        else:
+            turns[joint] = turns[parent]
+            places[joint] = places[parent] + turns[parent] @ (at - binds[parent, :3, 3])
+        if joint in feet:
+            turns[joint] = turn
+        elif joint in wanted:
+            end, direction = wanted[joint]
+            turns[joint] = _swing(turns[joint] @ (binds[end, :3, 3] - at), direction) @ turns[joint]
+    angles = _angles(np.swapaxes(turn, 0, 1) @ turns)
+    joint = int(angles.argmax())
+    if angles[joint] > UNLIKE:
+        found = f"'{_leaf(other, joint)}' is bound {angles[joint]:.0f} degrees from where {own.path} has it"
+        fail(other.path, found, f"up to {UNLIKE:.0f} degrees are allowed", "bind it in an A-pose or a T-pose")
+    return PosedAlike(rigid(turns @ binds[:, :3, :3], places), angles, turn)
+
+
+def _upright(own: Skeleton, other: Skeleton, images: Ints, limbs: Container[int]) -> Floats:
+    """Return the rotation (3, 3) with which the trunk of another character stands as the own one does.
+
+    It is a heading where the trunk is bound upright, as far as that can be told of joints that lie elsewhere in it.
+    """
+    turn, places = heading(own, other, images), own.bind_transforms[:, :3, 3]
+    trunk = [joint for joint in np.flatnonzero(images >= 0).tolist()
+             if not any(int(images[each]) in limbs for each in ancestors(own, joint))]  # fmt: skip
+    its = other.bind_transforms[images[trunk], :3, 3]
+    hub = other.bind_transforms[images[own.hub], :3, 3]
+    a = (places[trunk] - places[own.hub]) / height(own)
+    b = (its - hub) @ turn.T / height(other)
+    left, values, right = np.linalg.svd(a.T @ b)
+    if values[1] < FLAT * values[0]:  # joints on a line say nothing of turns about it
+        return turn
+    lean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
+    return lean @ turn if _angles(lean) > LEAN else turn
+
+
+def _angles(rotations: Floats) -> Floats:
+    """Return angles [degrees] of rotations (..., 3, 3)."""
+    return np.degrees(np.arccos(((np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2).clip(-1, 1)))
+
+
+def _limbs(own: Skeleton, other: Skeleton, images: Ints) -> dict[int, tuple[int, Floats]]:
+    """Return for joints of the other character that begin a bone of a limb its end, and where the own one points."""
+    places, its = own.bind_transforms[:, :3, 3], other.bind_transforms[:, :3, 3]
+    found = dict[int, tuple[int, Floats]]()
+    for end in np.flatnonzero(images >= 0).tolist():
+        above = [joint for joint in ancestors(own, end) if images[joint] >= 0]
+        if not above or images[above[0]] not in ancestors(other, int(images[end])):
+            continue
+        joint = above[0]
+        bones = ((places, own, joint, end), (its, other, int(images[joint]), int(images[end])))
+        lengths = [np.linalg.norm(at[to] - at[of]) / height(each) for at, each, of, to in bones]
+        beside = np.linalg.norm((places[joint] - places[own.hub])[[0, 2]]) / height(own)
+        if min(lengths) > LONG and beside > BESIDE:
+            found[int(images[joint])] = int(images[end]), places[end] - places[joint]
+    return found
+
+
+def _feet(skeleton: Skeleton) -> set[int]:
+    """Return the joints of feet: they stand on the ground in any bind pose."""
+    heights = skeleton.bind_transforms[:, 1, 3]
+    return set(np.flatnonzero(heights < heights.min() + LOW * height(skeleton)).tolist())
+
+
+def _swing(before: Floats, after: Floats) -> Floats:
+    """Return the least rotation that takes one direction (3,) to another."""
+    a, b = (each / np.linalg.norm(each) for each in (before, after))
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -1 + 1e-9:
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        axis /= np.linalg.norm(axis)
+        return 2 * np.outer(axis, axis) - np.eye(3)
+    cross = np.cross(np.eye(3), axis)
+    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+
+
+def helper_binds(own: Skeleton, posed: PosedAlike, images: Ints) -> Floats:
+    """Return where the own joints are bound on another character: at its proportions, as `alike` has it, (J, 4, 4)."""
+    binds = np.array(own.bind_transforms)
+    carried_by = owners(own, images)
+    for joint, owner in enumerate(carried_by.tolist()):
+        binds[joint, :3, 3] = posed.transforms[images[owner], :3, 3]
+        if joint != owner:  # as far from it as it was
+            binds[joint, :3, 3] += own.bind_transforms[joint, :3, 3] - own.bind_transforms[owner, :3, 3]
+    return binds
+
+
+def with_helpers(own: Skeleton, other: Skeleton, images: Ints, posed: PosedAlike) -> Skeleton:
+    """Return another character's skeleton with the own joints as helper joints at its end, in their order.
+
+    The own hub is that of the result.
+    """
+    above, binds = images[owners(own, images)], helper_binds(own, posed, images)
+    rest = invert_rigid(posed.transforms[above]) @ binds
+    taken = {name.rpartition("/")[2] for name in other.joint_names}
+    names = []
+    for joint in range(own.joint_count):
+        leaf = f"{PREFIX}{_leaf(own, joint)}"
+        while leaf in taken:
+            leaf += "_"
+        taken.add(leaf)
+        names.append(f"{other.joint_names[above[joint]]}/{leaf}")
+    count = other.joint_count
+    return replace(
+        other,
+        joint_names=(*other.joint_names, *names),
+        parents=np.concatenate([other.parents, above]),
+        bind_transforms=np.concatenate([other.bind_transforms, binds]),
+        rest_transforms=np.concatenate([other.rest_transforms, rest]),
+        hub=count + own.hub,
+        seen_parents=np.concatenate([other.parents, np.where(own.parents < 0, -1, count + own.parents)]),
+    )
+
+
+def body_alike(character: Character, posed: PosedAlike) -> Body:
+    """Return a character's merged body in the pose of `alike`."""
+    body = character.merged_body()
+    moves = posed.transforms @ invert_rigid(character.skeleton.bind_transforms)
+    return replace(body, mesh=replace(body.mesh, points=skin_points(body.mesh.points, body.skin, moves[None])[0]))
+
+
+def _leaf(skeleton: Skeleton, joint: int) -> str:
+    return skeleton.joint_names[joint].rpartition("/")[2]
