@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import fail
-from .assets import Body, Character, Floats, Ints, Skeleton
+from .assets import Body, Character, Floats, Ints, ProxyRig, Skeleton, SkinWeights
 from .joint_map import ancestors, heading, height, owners
 from .kinematics import invert_rigid, rigid, skin_points
 
@@ -139,7 +139,7 @@ def _swing(before: Floats, after: Floats) -> Floats:
 
 
 def helper_binds(own: Skeleton, posed: PosedAlike, images: Ints) -> Floats:
-    """Return where the own joints are bound on another character: at its proportions, as `alike` has it, (J, 4, 4)."""
+    """Return where the own joints are bound on another character that is posed alike, shape (J, 4, 4)."""
     binds = np.array(own.bind_transforms)
     carried_by = owners(own, images)
     for joint, owner in enumerate(carried_by.tolist()):
@@ -181,6 +181,34 @@ def body_alike(character: Character, posed: PosedAlike) -> Body:
     body = character.merged_body()
     moves = posed.transforms @ invert_rigid(character.skeleton.bind_transforms)
     return replace(body, mesh=replace(body.mesh, points=skin_points(body.mesh.points, body.skin, moves[None])[0]))
+
+
+def unposed(points: Floats, skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
+    """Return where points (V, 3) of a pose are in the bind pose, by linear blend skinning, shape (V, 3)."""
+    return (np.linalg.inv(_blended(skin, posed, skeleton)) @ _homogeneous(points)[..., None])[:, :3, 0]
+
+
+def posed_points(points: Floats, skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
+    """Invert `unposed`."""
+    return (_blended(skin, posed, skeleton) @ _homogeneous(points)[..., None])[:, :3, 0]
+
+
+def _blended(skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
+    moves = posed.transforms @ invert_rigid(skeleton.bind_transforms)
+    return np.einsum("vi,viab->vab", skin.weights, moves[skin.indices])
+
+
+def _homogeneous(points: Floats) -> Floats:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def moved_proxies(rig: ProxyRig, cloth: Floats, moves: Floats) -> Floats:
+    """Return bind transforms of proxies (P, 4, 4) that move with the vertices that they lie at; both (V, 3)."""
+    binds = np.array(rig.bind_transforms)
+    if len(binds):
+        at = np.linalg.norm(binds[:, None, :3, 3] - cloth[None], axis=-1).argmin(axis=1)
+        binds[:, :3, 3] += moves[at]
+    return binds
 
 
 def _leaf(skeleton: Skeleton, joint: int) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..errors import fail, fail_unknown
 from ..files import replacing
-from .assets import Floats, Ints, Skeleton
+from .assets import Floats, Ints, Skeleton, SkinWeights
 
 TABLE = "joints"
 BESIDE = 0.04  # of the height, by which a joint beside the hub has a side
@@ -34,6 +34,8 @@ NAMED_SIDES = tuple(
     )
     for side in ("left", "right")
 )
+LEFT = 0.02  # of a garment's weight on a joint that none stands for, from which on it is told
+AWAY = 0.03  # of the height, from a joint to the one that it moves with
 LISTED = 3
 ALLOWED = "a line holds a joint of the garment's character, and the joint of the other one that stands for it"
 
@@ -187,6 +189,28 @@ def owners(skeleton: Skeleton, images: Ints) -> Ints:
 def height(skeleton: Skeleton) -> float:
     """Return how far joints are apart in height in the bind pose [m]."""
     return float(np.ptp(skeleton.bind_transforms[:, 1, 3])) or 1.0
+
+
+def size_ratio(own: Skeleton, other: Skeleton, images: Ints) -> float:
+    """Return how large another character is, relative to the own one: by the bones between joints of both."""
+    lengths = np.zeros(2)
+    for joint in np.flatnonzero(images >= 0).tolist():
+        above = next((each for each in ancestors(own, joint) if images[each] >= 0), None)
+        if above is not None:
+            pairs = ((own, joint, above), (other, int(images[joint]), int(images[above])))
+            lengths += [np.linalg.norm(np.subtract(*each.bind_transforms[[a, b], :3, 3])) for each, a, b in pairs]
+    return float(lengths[1] / lengths[0]) if lengths[0] > 0 else 1.0
+
+
+def weights_left(skin: SkinWeights, own: Skeleton, images: Ints) -> list[tuple[int, float]]:
+    """Return joints that none stands for and that move much of a garment, with their shares of its weight.
+
+    Joints at the place of the one that they move with are left out: they lose little.
+    """
+    weights, places = skin.dense(own.joint_count).mean(axis=0), own.bind_transforms[:, :3, 3]
+    away = np.linalg.norm(places - places[owners(own, images)], axis=1) > AWAY * height(own)
+    some = np.flatnonzero((images < 0) & (weights > LEFT) & away)
+    return sorted(((int(joint), float(weights[joint])) for joint in some), key=lambda pair: -pair[1])
 
 
 def heading(own: Skeleton, other: Skeleton, images: Ints) -> Floats:

@@ -3,8 +3,8 @@
 
 Names are taken apart into a side, a part of the body and a number, whatever a program puts around them (`mixamorig:`,
 `DEF-`, `Bip01 L`, `_l`, `.L`). What no name tells is told by where joints are, in terms that no pose changes: the
-branch of the skeleton that they are on (trunk, arm, leg), its side, and how far they are from the hub along the bones,
-in heights. Along each branch joints are matched in their order. What differs in number is left without a counterpart.
+branch of the skeleton that they are on (trunk, arm, leg), its side, and how far from the hub along the bones, in
+heights. Along each branch joints are matched in their order. What differs in number is left without a counterpart.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ import numpy as np
 from ...scene.assets import Floats, Skeleton
 from ...scene.joint_map import JointMap, ancestors, height, named_side, short_names
 
-PREFIXES = re.compile(r"(?i)^(?:.*[:|]|mixamorig\d*_|def[-_]|org[-_]|bip0*1?[ _]|j_bip_[lrc]_|[mf]_avg_|cc_base_|jnt_|bn_|valvebiped)+")
+PREFIXES = re.compile(
+    r"(?i)^(?:.*[:|]|mixamorig\d*_|def[-_]|org[-_]|bip0*1?[ _]|j_bip_[lrc]_|[mf]_avg_|cc_base_|jnt_|bn_|valvebiped)+"
+)
 SUFFIXES = re.compile(r"(?i)[-_. ](?:joint|jnt|bone|bind|skin)$")
 SIDES = re.compile(r"(?i:left|right)|(?:^|(?<=[^A-Za-z]))[LlRr](?=[^A-Za-z]|$)|^[LlRr](?=[A-Z][a-z])|(?<=[a-z])[LR]$")
 # The first names of each part are unlike all others; those of `LATER` mean another part where that one has its own.
@@ -101,7 +103,7 @@ def _middle(skeleton: Skeleton) -> int:
 
 
 def _note(figures: Sequence[_Figure], joint: int, image: int, how: str, pairs: Mapping, names: Sequence[str]) -> str:
-    own, other = (figure.skeleton for figure in figures)
+    own = figures[0].skeleton
     if joint == own.hub:
         return "carries the body"
     if image < 0:
@@ -143,7 +145,7 @@ def _read_names(leaves: Sequence[str]) -> list[_Named]:
             part = other if word == of and side and words & set(beside.split()) and not theirs else part
         if word == "hip":
             part = "thigh" if side else "hips"
-        if part in SIDED and not side or part not in SIDED and side:
+        if (part in SIDED and not side) or (part not in SIDED and side):
             part = ""  # such as a pelvis of each side
         found.append(_Named(part, side, number))
     return found
@@ -170,7 +172,9 @@ def _branches(figure: _Figure, leaves: Sequence[str]) -> dict[tuple[str, str], l
         for side in ("left", "right"):
             named = [joint for joint, each in enumerate(figure.named) if each.side == side and each.part in parts]
             if named:
-                found[kind, side] = sorted(named, key=lambda joint: (len(ancestors(skeleton, joint)), figure.reach[joint]))
+                found[kind, side] = sorted(
+                    named, key=lambda joint: (len(ancestors(skeleton, joint)), figure.reach[joint])
+                )
     missing = [(kind, side) for kind in LIMBS for side in ("left", "right") if (kind, side) not in found]
     found |= {branch: way for branch, way in _by_place(figure).items() if branch in missing}
     limbs = {joint for branch in found.values() for joint in branch}
@@ -261,7 +265,7 @@ def _aligned(figures: Sequence[_Figure], mine: Sequence[int], its: Sequence[int]
         alone = sum(figures[0].named[each].part == part for each in mine) == 1
         first = part in ("neck", "thigh", "shin", "upper arm", "forearm", "collar", "hand", "foot", "toe")
         earlier = any(figures[0].named[each].part == part for each in mine[:row])
-        if same and (alone and len(same) == 1 or (first or part == "head") and not earlier):
+        if same and ((alone and len(same) == 1) or ((first or part == "head") and not earlier)):
             if not fixed or same[0] > fixed[-1][1]:
                 fixed.append((row, same[0]))
     for row, column in fixed:
@@ -285,7 +289,7 @@ def _span(figure: _Figure, branch: Sequence[int], first: int, last: int) -> tupl
 def _in_order(
     figures: Sequence[_Figure], mine: Sequence[int], its: Sequence[int], spans: Sequence[tuple[float, float]]
 ) -> dict[int, tuple[int, str]]:
-    """Match joints in their order so that reaches differ least; a joint may be left out at the cost of `TOLERANCE`."""
+    """Match joints in their order so that reaches differ least; leaving one out costs as much as `TOLERANCE`."""
     if not mine or not its:
         return {}
     at = []

@@ -14,6 +14,7 @@ from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyPlace, has_bones, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
+from .onto import has_joints_of, put_onto
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -43,7 +44,7 @@ class WornModel:
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
-    """Put a model on the character of a stage, as `worn_by`.
+    """Put a model on the character of a stage, as `worn_by`; one with another skeleton as `onto.put_onto`.
 
     Raises:
         SsilkError: the stage's character is none that the model dresses, or it cannot be read.
@@ -51,6 +52,10 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
+    if not has_joints_of(character.skeleton, file.scene.character.skeleton) and (
+        put := put_onto(file, stage, character)
+    ):
+        return WornModel(put.file, put.file.scene, put.told, put.identity)
     names = file.bodies.family.bodies.meshes if file.bodies else ()
     known = character
     if not names_of(character).issuperset(names) and has_meshes(stage, root, names):

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model on a character with another skeleton, onto which 'ssilk rig --onto' has put its garment.
+
+The model's own joints become helper joints of that character (`scene.helper_joints`): children of the joints that
+stand for them, at whose ends nothing changes for the network. The garment lies where its stage has it, brought into
+the pose in which the model is bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import fail
+from ...events import Event, Message, format_count
+from ...files import split_location
+from ...network.checkpoint import ModelFile
+from ...scene.assets import Character, Floats, Garment, Ints, Scene, Skeleton, SkinWeights
+from ...scene.family import BodyFamily
+from ...scene.helper_joints import PosedAlike, alike, helper_binds, moved_proxies, posed_points, with_helpers
+from ...scene.joint_map import JointMap, short_names, size_ratio, weights_left
+
+if TYPE_CHECKING:
+    from pxr import Usd
+    from ssilk_usd.reading.stand_ins import PutOn
+
+TURNED = 10.0  # [degrees] by which limbs are bound otherwise, from which on it is told
+TALLER = 0.15  # of the height, by which a character is larger or smaller, from which on it is a warning
+
+
+@dataclass(frozen=True, eq=False)
+class PutOnModel:
+    """A model on a character with another skeleton.
+
+    Attributes:
+        file: as a model for that character.
+        told: what there is to say of it.
+        identity: what tells the character from others.
+    """
+
+    file: ModelFile
+    told: tuple[Event, ...]
+    identity: tuple[float, ...]
+
+
+def has_joints_of(character: Skeleton, trained: Skeleton) -> bool:
+    """Return whether a skeleton has all joints of a model, by their paths or unique names."""
+    from ssilk_usd.reading.skin import match_joints
+
+    return min(match_joints(trained.joint_names, character.joint_names)) >= 0
+
+
+def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnModel | None:
+    """Return a model on a character with another skeleton; None where its garment was not put onto it.
+
+    Raises:
+        SsilkError: it was put on from another character or mesh, or the map of joints is not sound.
+    """
+    from ssilk_usd.reading.stand_ins import read_put_on
+
+    prim = split_location(character.skeleton.path)[1]
+    there = read_put_on(stage, character.skeleton, prim or "")
+    if not there:
+        return None
+    put = _chosen(file, there, character)
+    own, other = file.scene.character.skeleton, character.skeleton
+    images = _images(file, put, other)
+    posed = alike(own, other, images)
+    binds = helper_binds(own, posed, images)
+    coordinates = None
+    if file.bodies is not None:
+        coordinates = _nearest_body(file.bodies.family.bodies, binds[:, :3, 3], images >= 0)
+        file = file.on_body(coordinates)
+    assert put.garment.skin is not None
+    points = posed_points(put.garment.mesh.points, put.garment.skin, posed, other)
+    scene = _scene(file, put.garment, character, with_helpers(own, other, images, posed), points)
+    told = tuple(_told(file, character, images, posed, coordinates))
+    identity = tuple((np.round(binds[:, :3, 3].reshape(-1), 6) + 0.0).tolist())
+    return PutOnModel(replace(file, scene=scene, joints=file.joints + other.joint_count), told, identity)
+
+
+def _chosen(file: ModelFile, there: Sequence[PutOn], character: Character) -> PutOn:
+    """Return the garment of a stage that is the model's."""
+    own, names = file.scene.garment.mesh, set(file.scene.character.skeleton.joint_names)
+    alike = [
+        each
+        for each in there
+        if each.garment.mesh.vertex_count == own.vertex_count
+        and np.array_equal(each.garment.mesh.faces, own.faces)
+        and names.issubset(each.stands_for)
+    ]
+    if len(alike) > 1:
+        leaf = own.path.rpartition("/")[2]
+        alike = [each for each in alike if each.garment.mesh.path.rpartition("/")[2] == leaf]
+    if len(alike) != 1:
+        listed = ", ".join(f"{each.garment.mesh.path} of {each.garment.mesh.vertex_count} points" for each in there)
+        allowed = (
+            f"one of the model's {own.vertex_count} points, from the character that it was trained on, is needed"
+        )
+        fail(character.path, f"garments that were put onto it are {listed}", allowed, "run 'ssilk rig --onto' for it")
+    if alike[0].garment.skin is None:
+        fail(alike[0].garment.mesh.path, "it has no weights", "'ssilk rig --onto' writes some", "run it again")
+    return alike[0]
+
+
+def _images(file: ModelFile, put: PutOn, other: Skeleton) -> Ints:
+    own = file.scene.character.skeleton
+    names = {name: put.stands_for[name] for name in own.joint_names}
+    return JointMap(put.garment.mesh.path, names).images(own, other)
+
+
+def _scene(file: ModelFile, lies: Garment, character: Character, skeleton: Skeleton, points: Floats) -> Scene:
+    """Return the model's garment at points (V, 3) on the helper joints of a character."""
+    own, count = file.scene, character.skeleton.joint_count
+
+    def moved(skin: SkinWeights) -> SkinWeights:
+        return SkinWeights(skin.path, skin.indices + count, skin.weights)
+
+    mesh = replace(own.garment.mesh, path=lies.mesh.path, points=points)
+    garment = replace(
+        own.garment, mesh=mesh, skin=moved(own.lbs_skin), sewn=own.garment.sewn_mesh.points, colour=lies.colour
+    )
+    paths = [*skeleton.joint_names]
+    for name, parent in zip(own.rig.joint_names, own.rig.parents + count):
+        paths.append(f"{paths[parent]}/{name.rpartition('/')[2]}")
+    rig = replace(
+        own.rig,
+        joint_names=tuple(paths[skeleton.joint_count :]),
+        parents=own.rig.parents + count,
+        bind_transforms=moved_proxies(own.rig, own.garment.mesh.points, points - own.garment.mesh.points),
+        skin=moved(own.rig.skin),
+    )
+    return Scene(replace(character, skeleton=skeleton), garment, rig)
+
+
+def _nearest_body(family: BodyFamily, joints: Floats, known: Ints) -> Floats:
+    """Return the coordinates (K,) of the body within a family whose joints are most like some (J, 3) [m]."""
+    count = int(np.count_nonzero(known))
+    moves = family.joint_moves[:, known].reshape(family.size, -1)
+    # Where the body stands is no part of its shape.
+    anywhere = np.tile(np.eye(3), (1, count))
+    wanted = (joints - family.joints)[known].reshape(-1)
+    held = 1e-3 * np.eye(family.size + 3)[: family.size]  # joints alone may not tell all directions apart
+    found = np.linalg.lstsq(
+        np.concatenate([np.concatenate([moves, anywhere]).T, held]),
+        np.concatenate([wanted, np.zeros(family.size)]),
+        rcond=None,
+    )[0][: family.size]
+    return family.nearest(found)
+
+
+def _told(
+    file: ModelFile, character: Character, images: Ints, posed: PosedAlike, coordinates: Floats | None
+) -> list[Event]:
+    own, other = file.scene.character.skeleton, character.skeleton
+    path, names, others = character.path, short_names(own), short_names(other)
+    mapped = int(np.count_nonzero(images >= 0))
+    text = f"{path}: joints of this character stand for {mapped} of the model's {format_count(len(images), 'joints')}"
+    told: list[Event] = [Message(text)]
+    if coordinates is not None:
+        place = ", ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in coordinates)
+        told.append(
+            Message(f"{path}: the network sees the body of its family whose joints are most alike, ({place})")
+        )
+    turned = [joint for joint in images[images >= 0].tolist() if posed.turned[joint] > TURNED]
+    if turned:
+        most = max(turned, key=lambda joint: posed.turned[joint])
+        found = f"{len(turned)} joints are bound up to {posed.turned[most]:.0f} degrees ('{others[most]}')"
+        told.append(Message(f"{path}: {found} from where the model has them, which is taken into account"))
+    left = weights_left(file.scene.lbs_skin, own, images)
+    if left:
+        listed = ", ".join(f"{names[joint]} ({share:.0%})" for joint, share in left[:3])
+        told.append(Message(f"{path}: joints with weights that none stands for move with those above them: {listed}"))
+    ratio = size_ratio(own, other, images)
+    if abs(ratio - 1) > TALLER:
+        found = f"it is {abs(ratio - 1):.0%} {'taller' if ratio > 1 else 'smaller'} than the body of the training"
+        told.append(Message(f"{path}: {found}; the network moves its garment as there", "warning"))
+    return told
