@@ -26,7 +26,7 @@ import numpy as np
 
 from ..physics.constants import GRAVITY
 from ..scene.assets import Floats, Motion, Skeleton
-from ..scene.kinematics import matrix_from_quaternion, motion_transforms
+from ..scene.kinematics import local_transforms, matrix_from_quaternion, motion_transforms
 from .proximity import proximity_vectors
 
 RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
@@ -84,12 +84,13 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
 
 def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
     """Return the places in `joints` (J',) of those whose rotations are features: all but the hub, and other roots."""
-    above = skeleton.seen_hub_path[:-1]
+    skeleton = seen_skeleton(skeleton)
+    above = skeleton.hub_path[:-1]
     return np.array(
         [
             i
             for i, joint in enumerate(joints)
-            if joint in above or (joint != skeleton.hub and skeleton.network_parents[joint] >= 0)
+            if joint in above or (joint != skeleton.hub and skeleton.parents[joint] >= 0)
         ],
         dtype=np.int64,
     )
@@ -105,10 +106,15 @@ def pose_features(
         kind: of `settings.DESCRIPTORS`.
     """
     world = motion_transforms(motion, skeleton.parents) if world is None else world
-    local, world = _local_rotations(motion, skeleton, joints, world), world[:, joints]
+    if skeleton.seen is None:
+        local = matrix_from_quaternion(motion.rotations[:, joints])
+    else:
+        world, skeleton = skeleton.seen.world(world), skeleton.seen.skeleton
+        local = local_transforms(world, skeleton.parents)[:, joints, :3, :3]
+    world = world[:, joints]
     centre = place_of_hub(skeleton, joints)
     root, down = world[:, centre, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
-    above = np.flatnonzero(np.isin(joints, skeleton.seen_hub_path[:-1]))
+    above = np.flatnonzero(np.isin(joints, skeleton.hub_path[:-1]))
     local[:, above] = np.swapaxes(root, -1, -2)[:, None] @ world[:, above, :3, :3]
     static = six_d(local[:, inner_joints(skeleton, joints)]).reshape(len(local), -1)
     gravity = None if motion.gravity is None else seen_gravity(motion.gravity)
@@ -129,15 +135,6 @@ def pose_features(
     return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity, near)
 
 
-def _local_rotations(motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats) -> Floats:
-    """Return rotations of joints to their parents as networks see these, shape (F, J', 3, 3)."""
-    if skeleton.seen_parents is None:
-        return matrix_from_quaternion(motion.rotations[:, joints])
-    above, turned = skeleton.seen_parents[joints], world[:, joints, :3, :3]
-    local = np.swapaxes(world[:, above, :3, :3], -1, -2) @ turned
-    return np.where((above >= 0)[:, None, None], local, turned)
-
-
 def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
     """Return accelerations of joints in the root's frame [g], the last of relative features before these saturate.
 
@@ -150,6 +147,11 @@ def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
     """
     acceleration = _differences(places, fps)[1] / (RATE_TIME**2 * GRAVITY)
     return np.einsum("fba,fjb->fja", root, acceleration).reshape(len(places), -1)
+
+
+def seen_skeleton(skeleton: Skeleton) -> Skeleton:
+    """Return the skeleton that a network sees on a character."""
+    return skeleton if skeleton.seen is None else skeleton.seen.skeleton
 
 
 def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:

@@ -8,8 +8,8 @@ import numpy as np
 from ...errors import SsilkError
 from ...events import format_count
 from ...scene.assets import Character, Garment, Ints, Skeleton
-from ...scene.helper_joints import alike
 from ...scene.joint_map import JointMap, short_names, size_ratio, weights_left
+from ...scene.posed_alike import alike
 from ..preflight.finding import Finding, Findings, format_joints, index_tuple
 
 LISTED = 6

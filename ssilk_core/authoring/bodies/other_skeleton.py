@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Put a garment onto a character with another skeleton and another body, by a map of joints.
 
-The other character is posed as the garment's own is bound (`scene.helper_joints`). The own body's mesh is laid onto
+The other character is posed as the garment's own is bound (`scene.posed_alike`). The own body's mesh is laid onto
 its surface there, and the garment moves with it as on a body of its family (`carry`), then out of the other body.
 Weights go to the joints that stand for those that had them. Where several joints of the other character move what one
 did, such as a longer spine or twist joints, they share its weight as they do in the skin beneath. The garment is then
@@ -17,9 +17,9 @@ import numpy as np
 
 from ...events import Message, Reporter
 from ...scene.assets import Body, Character, Floats, Ints, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
-from ...scene.helper_joints import PosedAlike, alike, body_alike, helper_binds, moved_proxies, unposed
 from ...scene.joint_map import owners
 from ...scene.kinematics import invert_rigid
+from ...scene.posed_alike import PosedAlike, alike, body_alike, fitted_binds, moved_proxies, unposed
 from ..preflight.fit import describe_left, describe_move
 from ..preflight.settle import Settled, settle
 from .carry import carried_moves
@@ -67,7 +67,7 @@ def carry_onto(scene: Scene, other: Character, images: Ints) -> CarriedOnto:
     own = scene.character.skeleton
     posed = alike(own, other.skeleton, images)
     theirs, base, cloth = body_alike(other, posed), scene.character.merged_body(), scene.garment.mesh
-    fitted = fitted_body(base, own, helper_binds(own, posed, images), theirs.mesh)
+    fitted = fitted_body(base, own, fitted_binds(own, posed, images), theirs.mesh)
     moves = carried_moves(cloth, scene.lbs_skin, base, fitted, own.joint_count)
     unsettled = replace(cloth, points=cloth.points + moves)
     settled = settle(unsettled, theirs.mesh)

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model on a character with another skeleton, onto which 'ssilk rig --onto' has put its garment.
 
-The model's own joints become helper joints of that character (`scene.helper_joints`): children of the joints that
-stand for them, at whose ends nothing changes for the network. The garment lies where its stage has it, brought into
-the pose in which the model is bound.
+The network sees its own joints, carried by those that stand for them (`scene.posed_alike`), and all else is the
+other character's. The garment is brought from the pose in which the model is bound into the character's bind pose, by
+its trained weights: its points, its blendshapes, and its proxies with the joints that they hang from. Where a vertex
+follows joints that are bound alike, it then moves as on the model's own character, and where joints are bound
+otherwise, as skinning blends them. What proxies turn is not brought along, so that they have to hang from joints that
+are bound nearly as the model's.
 """
 
 from __future__ import annotations
@@ -18,16 +21,30 @@ from ...errors import fail
 from ...events import Event, Message, format_count
 from ...files import split_location
 from ...network.checkpoint import ModelFile
-from ...scene.assets import Character, Floats, Garment, Ints, Scene, Skeleton, SkinWeights
+from ...network.runtime.deformer import deformer
+from ...scene.assets import PINNED, Character, Floats, Garment, Ints, Scene, Skeleton, SkinWeights
 from ...scene.family import BodyFamily
-from ...scene.helper_joints import PosedAlike, alike, helper_binds, moved_proxies, posed_points, with_helpers
 from ...scene.joint_map import JointMap, short_names, size_ratio, weights_left
+from ...scene.kinematics import invert_rigid
+from ...scene.posed_alike import (
+    PosedAlike,
+    alike,
+    fitted_binds,
+    moved_proxies,
+    posed_points,
+    rotation_angles,
+    seen_on,
+    unposed,
+    upright,
+)
 
 if TYPE_CHECKING:
     from pxr import Usd
     from ssilk_usd.reading.stand_ins import PutOn
 
 TURNED = 10.0  # [degrees] by which limbs are bound otherwise, from which on it is told
+PROXIES_TURNED = 12.0  # [degrees] by which joints with proxies may be bound otherwise
+IN_BIND_POSE = ("decoder.shapes", "decoder.offset")  # parameters that are displacements in the bind pose
 TALLER = 0.15  # of the height, by which a character is larger or smaller, from which on it is a warning
 
 
@@ -69,17 +86,18 @@ def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnMo
     own, other = file.scene.character.skeleton, character.skeleton
     images = _images(file, put, other)
     posed = alike(own, other, images)
-    binds = helper_binds(own, posed, images)
+    binds = fitted_binds(own, posed, images)
     coordinates = None
     if file.bodies is not None:
         coordinates = _nearest_body(file.bodies.family.bodies, binds[:, :3, 3], images >= 0)
         file = file.on_body(coordinates)
     assert put.garment.skin is not None
     points = posed_points(put.garment.mesh.points, put.garment.skin, posed, other)
-    scene = _scene(file, put.garment, character, with_helpers(own, other, images, posed), points)
+    stands = upright(character, int(images[own.hub]), posed)
+    stands = replace(stands, skeleton=seen_on(own, stands.skeleton, images, posed))
     told = tuple(_told(file, character, images, posed, coordinates))
     identity = tuple((np.round(binds[:, :3, 3].reshape(-1), 6) + 0.0).tolist())
-    return PutOnModel(replace(file, scene=scene, joints=file.joints + other.joint_count), told, identity)
+    return PutOnModel(_bound(file, put.garment, stands, posed, points), told, identity)
 
 
 def _chosen(file: ModelFile, there: Sequence[PutOn], character: Character) -> PutOn:
@@ -112,28 +130,63 @@ def _images(file: ModelFile, put: PutOn, other: Skeleton) -> Ints:
     return JointMap(put.garment.mesh.path, names).images(own, other)
 
 
-def _scene(file: ModelFile, lies: Garment, character: Character, skeleton: Skeleton, points: Floats) -> Scene:
-    """Return the model's garment at points (V, 3) on the helper joints of a character."""
-    own, count = file.scene, character.skeleton.joint_count
+def _bound(file: ModelFile, lies: Garment, character: Character, posed: PosedAlike, points: Floats) -> ModelFile:
+    """Return a model for a character, on which its garment lies at points (V, 3) in the pose of the model's bind."""
+    own, skeleton = file.scene, character.skeleton
+    assert skeleton.seen is not None
+    carriers = skeleton.seen.carriers
+    movers = np.concatenate([carriers, skeleton.joint_count + np.arange(own.rig.proxy_count)])
+    roots = _roots(own)
+    limbs = posed.transforms @ invert_rigid(skeleton.bind_transforms)  # to the pose of the model's bind
+    _need_alike(file, character, carriers[roots], limbs)
 
-    def moved(skin: SkinWeights) -> SkinWeights:
-        return SkinWeights(skin.path, skin.indices + count, skin.weights)
+    def moved(skin: SkinWeights, joints: Ints) -> SkinWeights:
+        return SkinWeights(skin.path, joints[skin.indices], skin.weights)
 
-    mesh = replace(own.garment.mesh, path=lies.mesh.path, points=points)
+    trained = deformer(file).skin
+    carried = moved(trained, np.concatenate([carriers, carriers[roots]]))
+    blended = np.einsum("vi,viab->vab", carried.weights, limbs[carried.indices])
+    lies_at = unposed(points, carried, posed, skeleton)
+    mesh = replace(own.garment.mesh, path=lies.mesh.path, points=lies_at)
     garment = replace(
-        own.garment, mesh=mesh, skin=moved(own.lbs_skin), sewn=own.garment.sewn_mesh.points, colour=lies.colour
-    )
-    paths = [*skeleton.joint_names]
-    for name, parent in zip(own.rig.joint_names, own.rig.parents + count):
+        own.garment, mesh=mesh, skin=moved(own.lbs_skin, movers), sewn=own.garment.sewn_mesh.points,
+        colour=lies.colour,
+    )  # fmt: skip
+    binds = moved_proxies(own.rig, own.garment.mesh.points, points - own.garment.mesh.points)
+    parents, paths = movers[own.rig.parents], [*skeleton.joint_names]
+    for name, parent in zip(own.rig.joint_names, parents):
         paths.append(f"{paths[parent]}/{name.rpartition('/')[2]}")
     rig = replace(
-        own.rig,
-        joint_names=tuple(paths[skeleton.joint_count :]),
-        parents=own.rig.parents + count,
-        bind_transforms=moved_proxies(own.rig, own.garment.mesh.points, points - own.garment.mesh.points),
-        skin=moved(own.rig.skin),
-    )
-    return Scene(replace(character, skeleton=skeleton), garment, rig)
+        own.rig, joint_names=tuple(paths[skeleton.joint_count :]), parents=parents,
+        bind_transforms=invert_rigid(limbs[carriers[roots]]) @ binds, skin=moved(own.rig.skin, movers),
+    )  # fmt: skip
+    back = np.linalg.inv(blended[own.classes != PINNED, :3, :3])
+    parameters = {
+        name: (np.einsum("vab,vb...->va...", back, values).astype(values.dtype) if name in IN_BIND_POSE else values)
+        for name, values in file.parameters.items()
+    }
+    return replace(file, scene=Scene(character, garment, rig), parameters=parameters)
+
+
+def _roots(scene: Scene) -> Ints:
+    """Return the joint of the character that each proxy hangs from, by way of others or not, shape (P,)."""
+    count, found = scene.character.skeleton.joint_count, list[int]()
+    for parent in scene.rig.parents.tolist():
+        found.append(parent if parent < count else found[parent - count])
+    return np.array(found, dtype=np.int64)
+
+
+def _need_alike(file: ModelFile, character: Character, roots: Ints, limbs: Floats) -> None:
+    """Raise `SsilkError` where proxies hang from joints that are bound far from where the model has them."""
+    if not len(roots):
+        return
+    angles = rotation_angles(limbs[roots, :3, :3])
+    worst = int(angles.argmax())
+    if angles[worst] > PROXIES_TURNED:
+        name = character.skeleton.joint_names[roots[worst]].rpartition("/")[2]
+        found = f"'{name}', from which proxies hang, is bound {angles[worst]:.0f} degrees from where the model has it"
+        allowed = f"the model's proxies may be turned by {PROXIES_TURNED:.0f} degrees"
+        fail(character.path, found, allowed, "bind that limb as the garment's character does, or train on this one")
 
 
 def _nearest_body(family: BodyFamily, joints: Floats, known: Ints) -> Floats:

@@ -30,8 +30,7 @@ class Skeleton:
             its jumps, and what is relative to the character is relative to it.
         placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
             above the skeleton tilt or scale it; None elsewhere.
-        seen_parents: parents as networks see them, where joints hang from others to be moved (`helper_joints`), shape
-            (J,); None for `parents`.
+        seen: the joints that a network sees in place of these; None for these.
     """
 
     path: str
@@ -41,7 +40,7 @@ class Skeleton:
     rest_transforms: Floats
     hub: int = 0
     placement: Floats | None = None
-    seen_parents: Ints | None = None
+    seen: SeenJoints | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -61,10 +60,6 @@ class Skeleton:
             if self.placement.shape != (4, 4):
                 fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
             need_finite(self.placement, self.path, "placement")
-        if self.seen_parents is not None:
-            assign(self, seen_parents=frozen(self.seen_parents, np.int32))
-            if self.seen_parents.shape != (count,):
-                fail(self.path, f"{len(self.seen_parents)} seen parents", f"one for each of {count} joints is needed")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
@@ -87,24 +82,32 @@ class Skeleton:
     @property
     def hub_path(self) -> tuple[int, ...]:
         """The joints above the hub, from the top, and the hub."""
-        return _path_to(self.hub, self.parents)
-
-    @property
-    def network_parents(self) -> Ints:
-        """The parents that networks see, shape (J,)."""
-        return self.parents if self.seen_parents is None else self.seen_parents
-
-    @property
-    def seen_hub_path(self) -> tuple[int, ...]:
-        """The joints above the hub as networks see them, from the top, and the hub."""
-        return _path_to(self.hub, self.network_parents)
+        path = [self.hub]
+        while (above := int(self.parents[path[0]])) >= 0:
+            path.insert(0, above)
+        return tuple(path)
 
 
-def _path_to(joint: int, parents: Ints) -> tuple[int, ...]:
-    path = [joint]
-    while (above := int(parents[path[0]])) >= 0:
-        path.insert(0, above)
-    return tuple(path)
+@dataclass(frozen=True, eq=False)
+class SeenJoints:
+    """Joints of the character that a network was trained on, as another character carries them.
+
+    Attributes:
+        skeleton: those joints, bound at the proportions of the other character.
+        carriers: the joint of the other character that carries each of them, shape (J,).
+        offsets: where they are in the space of these, rigid, shape (J, 4, 4).
+    """
+
+    skeleton: Skeleton
+    carriers: Ints
+    offsets: Floats
+
+    def __post_init__(self) -> None:
+        assign(self, carriers=frozen(self.carriers, np.int64), offsets=frozen(self.offsets, np.float64))
+
+    def world(self, transforms: Floats) -> Floats:
+        """Return joint-to-world transforms (F, J, 4, 4) from those of the other character (F, J', 4, 4)."""
+        return transforms[:, self.carriers] @ self.offsets
 
 
 def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> int:

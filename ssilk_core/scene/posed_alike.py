@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A garment's own joints as helper joints of another character, whose joints have other names, axes and bind poses.
+"""A character with another skeleton, posed as a garment's own character is bound.
 
-Each helper joint is one of the garment's character, a child of the other character's joint that stands for it, and
-holds still relative to that joint. It is bound where it was bound before, at the proportions of the other character:
-what a network sees of a pose, and what skins the garment, are as they were in training, whatever rig the character
-has. `alike` is the pose in which the other character stands as the garment's does in its bind pose: limbs point where
-the garment's point, and all else is as the character is bound, since joints within a trunk lie elsewhere in each rig
-without a trunk being bent.
+Limbs point where those of the own character point, and all else is as the character is bound: joints within a trunk
+lie elsewhere in each rig without a trunk being bent. In that pose the garment lies on the other character as on its
+own, and what moves each joint of the own one on from there is the joint of the other one that stands for it. So a
+network sees the joints that it was trained on, carried by those of the other character (`SeenJoints`), whatever
+names, axes and bind pose these have.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ import numpy as np
 
 from ..errors import fail
 from .assets import Body, Character, Floats, Ints, ProxyRig, Skeleton, SkinWeights
+from .assets.skeleton import SeenJoints
 from .joint_map import ancestors, heading, height, owners
-from .kinematics import invert_rigid, rigid, skin_points
+from .kinematics import invert_rigid, local_transforms, rigid, skin_points
 
-PREFIX = "ssilk_"  # of the names of helper joints
 LONG = 0.11  # of the height, from which on a bone is a limb's, not one of hands, feet, collar or spine
 BESIDE = 0.035  # of the height, by which it is beside the hub
 LOW = 0.12  # of the height over the lowest joint, below which joints are feet
@@ -71,7 +70,7 @@ def alike(own: Skeleton, other: Skeleton, images: Ints) -> PosedAlike:
         elif joint in wanted:
             end, direction = wanted[joint]
             turns[joint] = _swing(turns[joint] @ (binds[end, :3, 3] - at), direction) @ turns[joint]
-    angles = _angles(np.swapaxes(turn, 0, 1) @ turns)
+    angles = rotation_angles(np.swapaxes(turn, 0, 1) @ turns)
     joint = int(angles.argmax())
     if angles[joint] > UNLIKE:
         found = f"'{_leaf(other, joint)}' is bound {angles[joint]:.0f} degrees from where {own.path} has it"
@@ -95,10 +94,10 @@ def _upright(own: Skeleton, other: Skeleton, images: Ints, limbs: Container[int]
     if values[1] < FLAT * values[0]:  # joints on a line say nothing of turns about it
         return turn
     lean = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
-    return lean @ turn if _angles(lean) > LEAN else turn
+    return lean @ turn if rotation_angles(lean) > LEAN else turn
 
 
-def _angles(rotations: Floats) -> Floats:
+def rotation_angles(rotations: Floats) -> Floats:
     """Return angles [degrees] of rotations (..., 3, 3)."""
     return np.degrees(np.arccos(((np.trace(rotations, axis1=-2, axis2=-1) - 1) / 2).clip(-1, 1)))
 
@@ -138,41 +137,43 @@ def _swing(before: Floats, after: Floats) -> Floats:
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def helper_binds(own: Skeleton, posed: PosedAlike, images: Ints) -> Floats:
+def fitted_binds(own: Skeleton, posed: PosedAlike, images: Ints) -> Floats:
     """Return where the own joints are bound on another character that is posed alike, shape (J, 4, 4)."""
     binds = np.array(own.bind_transforms)
-    carried_by = owners(own, images)
-    for joint, owner in enumerate(carried_by.tolist()):
+    for joint, owner in enumerate(owners(own, images).tolist()):
         binds[joint, :3, 3] = posed.transforms[images[owner], :3, 3]
         if joint != owner:  # as far from it as it was
             binds[joint, :3, 3] += own.bind_transforms[joint, :3, 3] - own.bind_transforms[owner, :3, 3]
     return binds
 
 
-def with_helpers(own: Skeleton, other: Skeleton, images: Ints, posed: PosedAlike) -> Skeleton:
-    """Return another character's skeleton with the own joints as helper joints at its end, in their order.
+def seen_on(own: Skeleton, other: Skeleton, images: Ints, posed: PosedAlike) -> Skeleton:
+    """Return another character's skeleton on which a network sees the own joints; its hub stands for the own one."""
+    carriers, binds = images[owners(own, images)], fitted_binds(own, posed, images)
+    rest = local_transforms(binds, own.parents)
+    seen = replace(own, bind_transforms=binds, rest_transforms=rest, placement=None)
+    offsets = invert_rigid(posed.transforms[carriers]) @ binds
+    return replace(other, hub=int(images[own.hub]), seen=SeenJoints(seen, carriers, offsets))
 
-    The own hub is that of the result.
+
+def upright(character: Character, hub: int, posed: PosedAlike) -> Character:
+    """Return a character whose bind pose is turned as a whole, so that its trunk is bound as it is when posed alike.
+
+    Neither joints nor skin move differently for it.
     """
-    above, binds = images[owners(own, images)], helper_binds(own, posed, images)
-    rest = invert_rigid(posed.transforms[above]) @ binds
-    taken = {name.rpartition("/")[2] for name in other.joint_names}
-    names = []
-    for joint in range(own.joint_count):
-        leaf = f"{PREFIX}{_leaf(own, joint)}"
-        while leaf in taken:
-            leaf += "_"
-        taken.add(leaf)
-        names.append(f"{other.joint_names[above[joint]]}/{leaf}")
-    count = other.joint_count
+    binds = character.skeleton.bind_transforms
+    if np.array_equal(posed.upright, np.eye(3)):
+        return character
+    turn = rigid(posed.upright, binds[hub, :3, 3] - posed.upright @ binds[hub, :3, 3])
+
+    def turned(body: Body) -> Body:
+        return replace(body, mesh=replace(body.mesh, points=body.mesh.points @ turn[:3, :3].T + turn[:3, 3]))
+
     return replace(
-        other,
-        joint_names=(*other.joint_names, *names),
-        parents=np.concatenate([other.parents, above]),
-        bind_transforms=np.concatenate([other.bind_transforms, binds]),
-        rest_transforms=np.concatenate([other.rest_transforms, rest]),
-        hub=count + own.hub,
-        seen_parents=np.concatenate([other.parents, np.where(own.parents < 0, -1, count + own.parents)]),
+        character,
+        skeleton=replace(character.skeleton, bind_transforms=turn @ binds),
+        bodies=tuple(map(turned, character.bodies)),
+        stand_ins=tuple(map(turned, character.stand_ins)),
     )
 
 
