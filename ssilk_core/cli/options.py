@@ -32,6 +32,7 @@ from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
+from ..scene.posed_alike import shaped_as_in_stage
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
@@ -460,7 +461,9 @@ def with_shapes(options: argparse.Namespace, motion: Motion, source: str | Path,
     from ssilk_usd.reading.body_shapes import with_body_shapes
 
     chosen = {"root": options.root, "garment": options.garment}
-    return with_body_shapes(options.stage, str(source), motion, character, **chosen)
+    return shaped_as_in_stage(
+        character, lambda own: with_body_shapes(options.stage, str(source), motion, own, **chosen)
+    )
 
 
 def load_scene(

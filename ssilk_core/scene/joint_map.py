@@ -24,6 +24,7 @@ from .assets import Floats, Ints, Skeleton, SkinWeights
 
 TABLE = "joints"
 BESIDE = 0.04  # of the height, by which a joint beside the hub has a side
+MIDDLE, OUT = 0.02, 0.15  # of the height: in the middle, and beyond what may be so in another rig
 FACING = 20.0  # [degrees] between headings, from which on characters face another way in their bind poses
 NAMED_SIDES = tuple(
     (
@@ -117,6 +118,10 @@ class JointMap:
             if min(np.linalg.norm(a), np.linalg.norm(b)) > BESIDE and a @ b < 0:
                 found = f"'{image}' for '{name}' is on the other side of the body"
                 fail(self.path, found, "left stands for left", "correct it")
+            near, far = sorted([float(np.linalg.norm(a)), float(np.linalg.norm(b))])
+            if near < MIDDLE and far > OUT:
+                found = f"of '{image}' and '{name}' one is in the middle of the body and one far beside it"
+                fail(self.path, found, "joints stand for those of the same limb", "correct it")
 
 
 def read_joint_map(path: str | Path) -> JointMap:

@@ -10,13 +10,13 @@ names, axes and bind pose these have.
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import fail
-from .assets import Body, Character, Floats, Ints, ProxyRig, Skeleton, SkinWeights
+from .assets import Body, Character, Floats, Ints, Motion, ProxyRig, Skeleton, SkinWeights
 from .assets.skeleton import SeenJoints
 from .joint_map import ancestors, heading, height, owners
 from .kinematics import invert_rigid, local_transforms, rigid, skin_points
@@ -147,34 +147,48 @@ def fitted_binds(own: Skeleton, posed: PosedAlike, images: Ints) -> Floats:
     return binds
 
 
-def seen_on(own: Skeleton, other: Skeleton, images: Ints, posed: PosedAlike) -> Skeleton:
-    """Return another character's skeleton on which a network sees the own joints; its hub stands for the own one."""
+def carrying(own: Skeleton, other: Character, images: Ints, posed: PosedAlike) -> Character:
+    """Return another character on which a network sees the own joints; its hub stands for the own one.
+
+    Its bind pose is turned as a whole, so that its trunk is bound as it is when posed alike. Neither joints nor skin
+    move differently for it.
+    """
     carriers, binds = images[owners(own, images)], fitted_binds(own, posed, images)
     rest = local_transforms(binds, own.parents)
-    seen = replace(own, bind_transforms=binds, rest_transforms=rest, placement=None)
-    offsets = invert_rigid(posed.transforms[carriers]) @ binds
-    return replace(other, hub=int(images[own.hub]), seen=SeenJoints(seen, carriers, offsets))
+    at = other.skeleton.bind_transforms[images[own.hub], :3, 3]
+    turn = rigid(posed.upright, at - posed.upright @ at)
+    seen = SeenJoints(
+        replace(own, bind_transforms=binds, rest_transforms=rest, placement=None),
+        carriers, invert_rigid(posed.transforms[carriers]) @ binds, turn,
+    )  # fmt: skip
+    character = turned(other, turn)
+    return replace(character, skeleton=replace(character.skeleton, hub=int(images[own.hub]), seen=seen))
 
 
-def upright(character: Character, hub: int, posed: PosedAlike) -> Character:
-    """Return a character whose bind pose is turned as a whole, so that its trunk is bound as it is when posed alike.
-
-    Neither joints nor skin move differently for it.
-    """
-    binds = character.skeleton.bind_transforms
-    if np.array_equal(posed.upright, np.eye(3)):
+def turned(character: Character, turn: Floats) -> Character:
+    """Return a character whose bind pose is turned as a whole by a rigid transform (4, 4)."""
+    if np.array_equal(turn, np.eye(4)):
         return character
-    turn = rigid(posed.upright, binds[hub, :3, 3] - posed.upright @ binds[hub, :3, 3])
 
-    def turned(body: Body) -> Body:
+    def moved(body: Body) -> Body:
         return replace(body, mesh=replace(body.mesh, points=body.mesh.points @ turn[:3, :3].T + turn[:3, 3]))
 
     return replace(
         character,
-        skeleton=replace(character.skeleton, bind_transforms=turn @ binds),
-        bodies=tuple(map(turned, character.bodies)),
-        stand_ins=tuple(map(turned, character.stand_ins)),
+        skeleton=replace(character.skeleton, bind_transforms=turn @ character.skeleton.bind_transforms),
+        bodies=tuple(map(moved, character.bodies)),
+        stand_ins=tuple(map(moved, character.stand_ins)),
     )
+
+
+def shaped_as_in_stage(character: Character, read: Callable[[Character], Motion]) -> Motion:
+    """Return what `read` makes of a motion for a character as its stage has it, with its shapes in the character's
+    bind pose."""
+    seen = character.skeleton.seen
+    if seen is None or np.array_equal(seen.turn, np.eye(4)):
+        return read(character)
+    motion, turn = read(turned(character, invert_rigid(seen.turn))), seen.turn[:3, :3]
+    return replace(motion, shapes=tuple(replace(shape, offsets=shape.offsets @ turn.T) for shape in motion.shapes))
 
 
 def body_alike(character: Character, posed: PosedAlike) -> Body:

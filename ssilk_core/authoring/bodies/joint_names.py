@@ -256,18 +256,14 @@ def _beside(skeleton: Skeleton) -> Floats:
 
 
 def _aligned(figures: Sequence[_Figure], mine: Sequence[int], its: Sequence[int]) -> dict[int, tuple[int, str]]:
-    """Return which joints of a branch stand for each other: those of the same part, and between these by place."""
+    """Return which joints of a branch stand for each other: the first of each part, and between these by place."""
     found = dict[int, tuple[int, str]]()
-    fixed = []
-    for row, joint in enumerate(mine):
-        part = figures[0].named[joint].part
-        same = [column for column, each in enumerate(its) if part and figures[1].named[each].part == part]
-        alone = sum(figures[0].named[each].part == part for each in mine) == 1
-        first = part in ("neck", "thigh", "shin", "upper arm", "forearm", "collar", "hand", "foot", "toe")
-        earlier = any(figures[0].named[each].part == part for each in mine[:row])
-        if same and ((alone and len(same) == 1) or ((first or part == "head") and not earlier)):
-            if not fixed or same[0] > fixed[-1][1]:
-                fixed.append((row, same[0]))
+    parts = [[figure.named[joint].part for joint in branch] for figure, branch in zip(figures, (mine, its))]
+    fixed = list[tuple[int, int]]()
+    for row, part in enumerate(parts[0]):
+        begins = part not in ("", "spine") and parts[0].index(part) == row and part in parts[1]
+        if begins and (not fixed or parts[1].index(part) > fixed[-1][1]):
+            fixed.append((row, parts[1].index(part)))
     for row, column in fixed:
         found[mine[row]] = its[column], "name"
     begin = (-1, -1)

@@ -29,13 +29,12 @@ from ...scene.kinematics import invert_rigid
 from ...scene.posed_alike import (
     PosedAlike,
     alike,
+    carrying,
     fitted_binds,
     moved_proxies,
     posed_points,
     rotation_angles,
-    seen_on,
     unposed,
-    upright,
 )
 
 if TYPE_CHECKING:
@@ -89,12 +88,11 @@ def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnMo
     binds = fitted_binds(own, posed, images)
     coordinates = None
     if file.bodies is not None:
-        coordinates = _nearest_body(file.bodies.family.bodies, binds[:, :3, 3], images >= 0)
+        coordinates = _nearest_body(file.bodies.family.bodies, binds[:, :3, 3], np.flatnonzero(images >= 0))
         file = file.on_body(coordinates)
     assert put.garment.skin is not None
     points = posed_points(put.garment.mesh.points, put.garment.skin, posed, other)
-    stands = upright(character, int(images[own.hub]), posed)
-    stands = replace(stands, skeleton=seen_on(own, stands.skeleton, images, posed))
+    stands = carrying(own, character, images, posed)
     told = tuple(_told(file, character, images, posed, coordinates))
     identity = tuple((np.round(binds[:, :3, 3].reshape(-1), 6) + 0.0).tolist())
     return PutOnModel(_bound(file, put.garment, stands, posed, points), told, identity)
@@ -190,8 +188,9 @@ def _need_alike(file: ModelFile, character: Character, roots: Ints, limbs: Float
 
 
 def _nearest_body(family: BodyFamily, joints: Floats, known: Ints) -> Floats:
-    """Return the coordinates (K,) of the body within a family whose joints are most like some (J, 3) [m]."""
-    count = int(np.count_nonzero(known))
+    """Return the coordinates (K,) of the body within a family whose joints are most like some (J, 3) [m], (N,) of
+    which are known."""
+    count = len(known)
     moves = family.joint_moves[:, known].reshape(family.size, -1)
     # Where the body stands is no part of its shape.
     anywhere = np.tile(np.eye(3), (1, count))

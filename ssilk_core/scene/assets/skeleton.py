@@ -96,14 +96,17 @@ class SeenJoints:
         skeleton: those joints, bound at the proportions of the other character.
         carriers: the joint of the other character that carries each of them, shape (J,).
         offsets: where they are in the space of these, rigid, shape (J, 4, 4).
+        turn: by which the other character's bind pose is turned from what its stage has, rigid, shape (4, 4).
     """
 
     skeleton: Skeleton
     carriers: Ints
     offsets: Floats
+    turn: Floats
 
     def __post_init__(self) -> None:
         assign(self, carriers=frozen(self.carriers, np.int64), offsets=frozen(self.offsets, np.float64))
+        assign(self, turn=frozen(self.turn, np.float64))
 
     def world(self, transforms: Floats) -> Floats:
         """Return joint-to-world transforms (F, J, 4, 4) from those of the other character (F, J', 4, 4)."""
