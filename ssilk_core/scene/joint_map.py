@@ -108,18 +108,19 @@ class JointMap:
         mapped = np.flatnonzero(images >= 0)
         there = _about_hub(other, images[own.hub]) @ heading(own, other, images).T
         here = _about_hub(own, own.hub)
+        across = np.zeros(3)  # from side to side, which is where limbs are apart most
+        across[[0, 2]] = np.linalg.svd(here[mapped][:, [0, 2]])[2][0]
         for joint in mapped.tolist():
             name, image = _leaf(own, joint), _leaf(other, int(images[joint]))
             sides = named_side(name), named_side(image)
             if None not in sides and sides[0] != sides[1]:
                 found = f"'{image}' on the {sides[1]} stands for '{name}' on the {sides[0]}"
                 fail(self.path, found, "left stands for left", "correct it")
-            a, b = here[joint, [0, 2]], there[images[joint], [0, 2]]
-            if min(np.linalg.norm(a), np.linalg.norm(b)) > BESIDE and a @ b < 0:
+            a, b = (float(each @ across) for each in (here[joint], there[images[joint]]))
+            if min(abs(a), abs(b)) > BESIDE and a * b < 0:
                 found = f"'{image}' for '{name}' is on the other side of the body"
                 fail(self.path, found, "left stands for left", "correct it")
-            near, far = sorted([float(np.linalg.norm(a)), float(np.linalg.norm(b))])
-            if near < MIDDLE and far > OUT:
+            if min(abs(a), abs(b)) < MIDDLE and max(abs(a), abs(b)) > OUT:
                 found = f"of '{image}' and '{name}' one is in the middle of the body and one far beside it"
                 fail(self.path, found, "joints stand for those of the same limb", "correct it")
 
