@@ -52,9 +52,7 @@ def _outer(mesh: Mesh) -> Mesh:
     normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(min=1e-12)
     over = corners.mean(axis=1) + OVER * normals
     within = np.asarray(igl.fast_winding_number(mesh.points, mesh.faces.astype(np.int64), over)).reshape(-1) > 0.5
-    return (
-        mesh if within.all() else replace(mesh, faces=mesh.faces[~within], polygon_counts=None, polygon_indices=None)
-    )
+    return mesh if within.all() else Mesh(mesh.path, mesh.points, mesh.faces[~within])
 
 
 def _carried(body: Body, skeleton: Skeleton, binds: Floats) -> Floats:
