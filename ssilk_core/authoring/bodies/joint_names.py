@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -22,6 +22,7 @@ from ...scene.joint_map import JointMap, ancestors, height, named_side, short_na
 PREFIXES = re.compile(
     r"(?i)^(?:.*[:|]|mixamorig\d*_|def[-_]|org[-_]|bip0*1?[ _]|j_bip_[lrc]_|[mf]_avg_|cc_base_|jnt_|bn_|valvebiped)+"
 )
+DEFORMING = re.compile(r"(?i)def[-_]")
 SUFFIXES = re.compile(r"(?i)[-_. ](?:joint|jnt|bone|bind|skin)$")
 SIDES = re.compile(r"(?i:left|right)|(?:^|(?<=[^A-Za-z]))[LlRr](?=[^A-Za-z]|$)|^[LlRr](?=[A-Z][a-z])|(?<=[a-z])[LR]$")
 # The first names of each part are unlike all others; those of `LATER` mean another part where that one has its own.
@@ -47,8 +48,9 @@ FINGERS = re.compile(r"thumb|index|middle|ring|pinky|little|finger|metacarpal|me
 OTHERS = re.compile(r"twist|roll|end|nub|helper|corrective|ik|pole|breast|pec|eye|jaw|tongue|weapon|attach|prop")
 ARM, LEG, TRUNK = "arm", "leg", "trunk"
 LIMBS = {ARM: ("collar", "upper arm", "forearm", "hand"), LEG: ("thigh", "shin", "foot", "toe")}
-TOLERANCE = 0.09  # of the height, by which joints that stand for each other are otherwise far from the hub
+TOLERANCE = 0.12  # of the height, by which joints that stand for each other are otherwise far from the hub
 DOWN = 0.15  # of the height, from the hub to the end of a leg at least
+AT_HIPS = 0.08  # of the height, within which of the thighs hips are
 OUT = 0.08  # of the height, from the middle to the end of an arm at least
 
 
@@ -78,8 +80,8 @@ class _Figure:
 
 def propose(own: Skeleton, other: Skeleton, path: str) -> JointMap:
     """Return which joints of another character stand for the own ones; `path` is that of the map, for messages."""
-    figures = _figure(own), _figure(other)
-    pairs: dict[int, tuple[int, str]] = {own.hub: (_middle(other), "")}
+    figures = _figure(own), _figure(replace(other, hub=_hips(other)))
+    pairs: dict[int, tuple[int, str]] = {own.hub: (figures[1].skeleton.hub, "")}
     for branch, mine in figures[0].branches.items():
         its = figures[1].branches.get(branch, [])
         found = _aligned(figures, mine, its)
@@ -94,12 +96,29 @@ def propose(own: Skeleton, other: Skeleton, path: str) -> JointMap:
     return JointMap(path, images, notes)
 
 
-def _middle(skeleton: Skeleton) -> int:
-    """Return the hub, or what is above one of a side, such as a pelvis of two halves."""
-    joint = skeleton.hub
-    while named_side(skeleton.joint_names[joint].rpartition("/")[2]) and skeleton.parents[joint] >= 0:
-        joint = int(skeleton.parents[joint])
-    return joint
+def _hips(skeleton: Skeleton) -> int:
+    """Return the joint that stands for hips: the one of that name, else the hub.
+
+    Where the hub is no joint between spine and thighs, as where limbs have roots of their own, it is the joint there
+    from which these hang, else the lowest one of the spine.
+    """
+    named, heights = _read_names(_leaves(skeleton)), skeleton.bind_transforms[:, 1, 3] / height(skeleton)
+    hips = [joint for joint, each in enumerate(named) if each.part == "hips"]
+    if hips:
+        return min(hips, key=lambda joint: (joint != skeleton.hub, len(ancestors(skeleton, joint))))
+    spine, thighs = ([joint for joint, each in enumerate(named) if each.part == part] for part in ("spine", "thigh"))
+    if not (spine and thighs) or skeleton.hub in spine:
+        return skeleton.hub
+    lowest, level = min(spine, key=lambda joint: heights[joint]), heights[thighs].max()
+    ways = [{joint, *ancestors(skeleton, joint)} for joint in (lowest, *thighs)]
+    shared = [joint for joint in set.intersection(*ways) if abs(heights[joint] - level) < AT_HIPS]
+    if shared:
+        return max(shared, key=lambda joint: len(ancestors(skeleton, joint)))
+    return lowest if heights[lowest] < level + AT_HIPS else skeleton.hub
+
+
+def _leaves(skeleton: Skeleton) -> list[str]:
+    return [name.rpartition("/")[2] for name in skeleton.joint_names]
 
 
 def _note(figures: Sequence[_Figure], joint: int, image: int, how: str, pairs: Mapping, names: Sequence[str]) -> str:
@@ -116,26 +135,37 @@ def _note(figures: Sequence[_Figure], joint: int, image: int, how: str, pairs: M
 
 
 def _figure(skeleton: Skeleton) -> _Figure:
-    leaves = [name.rpartition("/")[2] for name in skeleton.joint_names]
-    reach = np.array([_along_bones(skeleton, joint) for joint in range(skeleton.joint_count)]) / height(skeleton)
+    leaves = _leaves(skeleton)
+    reach = _reaches(skeleton) / height(skeleton)
     figure = _Figure(skeleton, _read_names(leaves), reach)
     figure.branches = _branches(figure, leaves)
     return figure
 
 
-def _along_bones(skeleton: Skeleton, joint: int) -> float:
-    """Return how far a joint is from the hub along the bones [m]; as the crow flies where no bones lead there."""
-    places = skeleton.bind_transforms[:, :3, 3]
-    ways = [[each, *ancestors(skeleton, each)] for each in (joint, skeleton.hub)]
-    meeting = next((each for each in ways[0] if each in ways[1]), None)
-    if meeting is None:
-        return float(np.linalg.norm(places[joint] - places[skeleton.hub]))
-    bones = [pair for way in ways for pair in pairwise(way[: way.index(meeting) + 1])]
-    return float(sum(np.linalg.norm(places[a] - places[b]) for a, b in bones))
+def _reaches(skeleton: Skeleton) -> Floats:
+    """Return how far joints are from the hub along the bones [m], shape (J,).
+
+    Limbs with roots of their own are taken to hang from the nearest joint, the nearest limb first.
+    """
+    places, parents = skeleton.bind_transforms[:, :3, 3], skeleton.parents
+    found = np.full(skeleton.joint_count, np.inf)
+    found[skeleton.hub] = 0
+    for below, above in pairwise([skeleton.hub, *ancestors(skeleton, skeleton.hub)]):
+        found[above] = found[below] + np.linalg.norm(places[above] - places[below])
+    while True:
+        for joint in range(skeleton.joint_count):
+            if np.isinf(found[joint]) and parents[joint] >= 0:
+                found[joint] = found[parents[joint]] + np.linalg.norm(places[joint] - places[parents[joint]])
+        held, loose = np.flatnonzero(np.isfinite(found)), np.flatnonzero(np.isinf(found) & (parents < 0))
+        if not len(loose):
+            return found
+        away = np.linalg.norm(places[loose, None] - places[held], axis=-1)
+        root, near = np.unravel_index(int(away.argmin()), away.shape)
+        found[loose[root]] = found[held[near]] + away[root, near]
 
 
 def _read_names(leaves: Sequence[str]) -> list[_Named]:
-    bare = [_bare(leaf) for leaf in leaves]
+    bare = _bare_names(leaves)
     words = {word for word, _, _ in bare}
     found = []
     for word, side, number in bare:
@@ -149,6 +179,12 @@ def _read_names(leaves: Sequence[str]) -> list[_Named]:
             part = ""  # such as a pelvis of each side
         found.append(_Named(part, side, number))
     return found
+
+
+def _bare_names(leaves: Sequence[str]) -> list[tuple[str, str | None, int]]:
+    """Return what `_bare` makes of names; of control rigs, of those joints alone that deform."""
+    deforming = [bool(DEFORMING.match(leaf)) for leaf in leaves]
+    return [_bare(leaf) if each or not any(deforming) else ("", None, 0) for leaf, each in zip(leaves, deforming)]
 
 
 def _bare(leaf: str) -> tuple[str, str | None, int]:
@@ -172,9 +208,8 @@ def _branches(figure: _Figure, leaves: Sequence[str]) -> dict[tuple[str, str], l
         for side in ("left", "right"):
             named = [joint for joint, each in enumerate(figure.named) if each.side == side and each.part in parts]
             if named:
-                found[kind, side] = sorted(
-                    named, key=lambda joint: (len(ancestors(skeleton, joint)), figure.reach[joint])
-                )
+                order = {joint: (parts.index(figure.named[joint].part), figure.reach[joint]) for joint in named}
+                found[kind, side] = sorted(named, key=order.__getitem__)
     missing = [(kind, side) for kind in LIMBS for side in ("left", "right") if (kind, side) not in found]
     found |= {branch: way for branch, way in _by_place(figure).items() if branch in missing}
     limbs = {joint for branch in found.values() for joint in branch}
@@ -321,8 +356,8 @@ def _by_whole_name(figures: Sequence[_Figure], pairs: Mapping[int, tuple[int, st
     keys: list[dict[tuple, list[int]]] = []
     for figure in figures:
         found: dict[tuple, list[int]] = {}
-        for joint, name in enumerate(figure.skeleton.joint_names):
-            found.setdefault(_bare(name.rpartition("/")[2]), []).append(joint)
+        for joint, bare in enumerate(_bare_names(_leaves(figure.skeleton))):
+            found.setdefault(bare, []).append(joint)
         keys.append(found)
     matched = {}
     for key, joints in keys[0].items():

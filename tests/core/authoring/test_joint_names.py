@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joints of other rigs are found by their names, and where these say nothing by their places."""
 
+import numpy as np
 import pytest
 
 from ssilk_core.authoring.bodies.joint_names import propose
+from ssilk_core.scene.assets import Skeleton
 
 from ..humanoids import PARTS, SCHEMES, humanoid
 
@@ -48,3 +50,20 @@ def test_the_file_says_how_each_was_found():
     assert by_place["LeftArm"].startswith("by place, 0 %")
     left = propose(OWN, humanoid(SCHEMES["unreal"], without=("left hand",)), "map.toml")
     assert left.names["LeftHand"] == "" and left.notes["LeftHand"] == "none: moves with LeftForeArm"
+
+
+@pytest.mark.parametrize("controls", [False, True], ids=["deforming joints alone", "a control rig"])
+def test_limbs_of_a_control_rig_that_have_roots_of_their_own_are_found(controls):
+    names = SCHEMES["rigify"]
+    whole = humanoid(names, arms=30)
+    # As only deforming joints are exported, or beside joints of the same names that control them.
+    parents = np.array(whole.parents)
+    loose = [PARTS.index(f"{side} {part}") for side in ("left", "right") for part in ("collar", "upper arm", "thigh")]
+    parents[loose] = -1
+    binds, paths = whole.bind_transforms, [name.rpartition("/")[2] for name in whole.joint_names]
+    if controls:
+        others = [f"ORG{name.removeprefix('DEF')}" for name in paths]
+        paths, binds = others + paths, np.concatenate([binds, binds])
+        parents = np.concatenate([whole.parents, np.where(parents < 0, -1, parents + len(PARTS))])
+    other = Skeleton("/rigify", tuple(paths), parents, binds, binds, hub=len(paths) - 1)  # a foot, as a hub may be
+    assert parts_found(names, OWN, other) == {part: part for part in PARTS}
