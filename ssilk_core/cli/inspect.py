@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import SsilkError, fail
 from ..events import Reporter, Result, silent
-from ..files import replacing
+from ..files import replacing, split_location
 from ..training.settings import PRESETS, preset_named
 from . import options as shared
 from ._inspected import Inspected
@@ -62,7 +62,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
     )  # fmt: skip
     verb.add_argument(
-        "--onto", type=Path, metavar="STAGE",
+        "--onto", type=Path, metavar="STAGE[:/ROOT]",
         help="a character with another skeleton, to put the garment on: which of its joints stand for which",
     )  # fmt: skip
     verb.add_argument(
@@ -177,25 +177,24 @@ def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Re
             allowed = "a map says which joints of --onto stand for those of the garment's character"
             fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
         return []
-    from ssilk_usd.reading.character import read_character
-
     from ..authoring.bodies.joint_findings import joint_findings
     from ..authoring.bodies.joint_names import propose
     from ..scene.joint_map import read_joint_map, write_joint_map
 
-    other = read_character(options.onto, root=options.root, bodies=options.body, report=report)
+    other = shared.read_onto(options, report)
     if options.joints and options.joints.exists():
         return list(joint_findings(read_joint_map(options.joints), inputs.character, other, inputs.garment))
     found = propose(inputs.character.skeleton, other.skeleton, str(options.joints or options.onto))
     if options.joints:
-        shared.check_output(options.joints, options.stage, options.onto)
+        shared.check_output(options.joints, options.stage, split_location(str(options.onto))[0])
         write_joint_map(options.joints, found, _about_map(options))
     return list(joint_findings(found, inputs.character, other, inputs.garment))
 
 
 def _about_map(options: argparse.Namespace) -> str:
+    name = Path(split_location(str(options.onto))[0]).name
     return (
-        f'Which joint of {options.onto.name} stands for each joint of {options.stage.name}; "" for none.\n'
+        f'Which joint of {name} stands for each joint of {options.stage.name}; "" for none.\n'
         "Edit it, check it with 'ssilk inspect', and give it to 'ssilk rig --onto' as --joints."
     )
 

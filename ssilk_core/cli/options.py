@@ -434,6 +434,16 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
+def read_onto(options: argparse.Namespace, report: Reporter) -> Character:
+    """Read the character of --onto, "STAGE[:/ROOT]", which has another skeleton: --root and --body name others."""
+    from ssilk_usd.reading.character import read_character
+
+    file, root = split_location(str(options.onto))
+    if not Path(file).exists():
+        fail(file, "there is no such file", "a USD stage with a character is needed")
+    return read_character(file, root=root, report=report)
+
+
 def tell_shapes(
     options: argparse.Namespace, motions: Iterable[Motion], report: Reporter, *, trained: Character | None = None
 ) -> None:

@@ -20,6 +20,7 @@ from ..authoring.setup.classes import USUAL
 from ..authoring.setup.rig import RigOptions
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
+from ..files import split_location
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--onto",
         type=Path,
-        metavar="STAGE",
+        metavar="STAGE[:/ROOT]",
         help="another body of the same skeleton and topology, to put the garment on; with --joints any character",
     )
     verb.add_argument(
@@ -69,7 +70,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES
 
-    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], options.onto)
+    onto = split_location(str(options.onto))[0] if options.onto else None
+    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], onto)
     report(Started("rig", options.proxies))
     if options.joints and not options.onto:
         allowed = "a map says which joints of --onto stand for those of the garment's character"
@@ -92,7 +94,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         (scene, stands_for), moved = _on_skeleton(options, scene, report), None
     elif options.onto:
         scene, moved = _on_other(options, scene, report), None
-    source = options.onto or options.stage
+    source = onto or options.stage
     left_out = write_rigged_stage(source, scene, options.output, moved=moved, stands_for=stands_for)
     if left_out:
         report(Message(f"{options.output}: {left_out}", "warning"))
@@ -125,7 +127,8 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     from ..authoring.preflight.fit import describe_left, describe_move
 
     path = scene.garment.mesh.path
-    other = read_character(options.onto, root=options.root, bodies=options.body, report=report)
+    file, root = split_location(str(options.onto))
+    other = read_character(file, root=root or options.root, bodies=options.body, report=report)
     if other.skeleton.joint_names != scene.character.skeleton.joint_names:
         _need_map(options, scene, other)
     family = need_family([scene.character, other])
@@ -161,13 +164,12 @@ def _on_skeleton(options: argparse.Namespace, scene: Scene, report: Reporter) ->
         SsilkError: the map is not sound, or the character is bound in a pose that cannot be made out.
     """
     import numpy as np
-    from ssilk_usd.reading.character import read_character
 
     from ..authoring.bodies.other_skeleton import carry_onto, tell_carried
     from ..scene.joint_map import read_joint_map
 
     names = read_joint_map(options.joints)
-    other = read_character(options.onto, root=options.root, bodies=options.body, report=report)
+    other = shared.read_onto(options, report)
     own, skeleton = scene.character.skeleton, other.skeleton
     images = names.images(own, skeleton)
     carried = carry_onto(scene, other, images)

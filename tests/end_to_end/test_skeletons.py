@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.cli import main
@@ -174,6 +174,19 @@ def test_without_a_map_the_verb_is_named_that_proposes_one(world, capsys):
     assert run("bake model.safetensors --stage other.usda --motion other_clip.usda -o out.usda") == 2
     assert "put the garment onto its joints by 'ssilk rig --onto' with a map of joints" in capsys.readouterr().err
     assert not Path("out.usda").exists()
+
+
+def test_one_of_several_characters_is_named_with_its_stage(world):
+    stage = Usd.Stage.Open("other.usda")
+    Sdf.CopySpec(stage.GetRootLayer(), "/Hero", stage.GetRootLayer(), "/Twin")
+    for prim in stage.GetPrimAtPath("/Twin").GetAllChildren():
+        UsdSkel.BindingAPI.Apply(prim).CreateSkeletonRel().SetTargets(["/Twin/Rig"])
+    UsdSkel.BindingAPI.Apply(stage.GetPrimAtPath("/Twin")).CreateSkeletonRel().SetTargets(["/Twin/Rig"])
+    stage.Save()
+    assert run("inspect rigged.usda --onto other.usda --joints map.toml") == 2
+    put_on("other.usda:/Twin")
+    rigged = Usd.Stage.Open("other_skirt.usda")
+    assert rigged.GetPrimAtPath("/Twin/Skirt") and not rigged.GetPrimAtPath("/Hero/Skirt")
 
 
 def test_an_unsound_map_writes_nothing(world, capsys):
