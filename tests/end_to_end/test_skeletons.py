@@ -31,21 +31,17 @@ def rows(rotations: np.ndarray, places: np.ndarray) -> list[Gf.Matrix4d]:
     return [Gf.Matrix4d(matrix.tolist()) for matrix in found]
 
 
-def write_other(path: Path, turn: float = 0.0, size: float = 1.0) -> np.ndarray:
+def write_other(path: Path, size: float = 1.0) -> np.ndarray:
     """The hero's body under other joint names, with axes of their own and points in another order.
-
-    Args:
-        turn: by which the joints and the body face another way in the bind pose [degrees].
 
     Returns:
         The joints' rotations in the bind pose, shape (3, 3, 3).
     """
     stage = Usd.Stage.Open(Usd.Stage.Open("hero.usda").Flatten())
     stage.RemovePrim("/Hero/Skirt")
-    heading = Rotation.from_euler("y", turn, degrees=True).as_matrix()
-    axes = heading @ Rotation.random(3, random_state=2).as_matrix()
+    axes = Rotation.random(3, random_state=2).as_matrix()
     rig = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
-    places = np.array([np.array(matrix)[3, :3] for matrix in rig.GetBindTransformsAttr().Get()]) @ heading.T * size
+    places = np.array([np.array(matrix)[3, :3] for matrix in rig.GetBindTransformsAttr().Get()]) * size
     rig.GetJointsAttr().Set(JOINTS)
     rig.GetBindTransformsAttr().Set(rows(axes, places))
     local = [axes[0], *(before.T @ after for before, after in pairwise(axes))]
@@ -55,7 +51,7 @@ def write_other(path: Path, turn: float = 0.0, size: float = 1.0) -> np.ndarray:
     points = np.array(mesh.GetPointsAttr().Get(), dtype=float)
     order = np.random.default_rng(5).permutation(len(points))
     place = np.argsort(order)
-    moved = (points[order] @ heading.T * size).astype(np.float32)
+    moved = (points[order] * size).astype(np.float32)
     mesh.GetPointsAttr().Set(Vt.Vec3fArray.FromNumpy(moved))
     faces = np.array(mesh.GetFaceVertexIndicesAttr().Get())
     mesh.GetFaceVertexIndicesAttr().Set(Vt.IntArray.FromNumpy(place[faces].astype(np.int32)))
@@ -65,12 +61,11 @@ def write_other(path: Path, turn: float = 0.0, size: float = 1.0) -> np.ndarray:
     return axes
 
 
-def write_clip(path: Path, axes: np.ndarray, turn: float = 0.0) -> None:
+def write_clip(path: Path, axes: np.ndarray) -> None:
     """The toy's clip as the other character moves it: joints turn alike in the world since the bind pose."""
     stage = Usd.Stage.Open(Usd.Stage.Open("clip.usda").Flatten())
     animation = UsdSkel.Animation(stage.GetPrimAtPath("/Clip"))
     animation.GetJointsAttr().Set(JOINTS)
-    heading = Rotation.from_euler("y", turn, degrees=True).as_matrix().T  # to the pose of the hero
     for time in animation.GetRotationsAttr().GetTimeSamples():
         turns = [Gf.Matrix3d(Gf.Quatd(each)) for each in animation.GetRotationsAttr().Get(time)]
         world, found = np.eye(3), []
@@ -79,7 +74,7 @@ def write_clip(path: Path, axes: np.ndarray, turn: float = 0.0) -> None:
         for joint, (own, step) in enumerate(zip(turns, moved)):
             at.append(above.T @ (world @ step) if joint else step)
             world = world @ np.array(own).T
-            its = world @ heading @ axes[joint]
+            its = world @ axes[joint]
             found.append(above.T @ its)
             above = its
         quaternions = Rotation.from_matrix(np.array(found)).as_quat()
@@ -130,17 +125,14 @@ def test_a_map_is_proposed_to_be_edited_and_an_edited_one_is_kept_and_checked(wo
     assert "'root_x' stands for both 'Hips' and 'Spine'" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("turn", [0, 180])
-def test_the_cloth_moves_on_the_other_joints_as_on_its_own(world, turn):
-    write_clip(world / "other_clip.usda", write_other(world / "other.usda", turn), turn)
+def test_the_cloth_moves_on_the_other_joints_as_on_its_own(world):
     put_on()
     assert run(f"{BAKE} --stage rigged.usda -o own.usda") == 0
     assert run("bake model.safetensors --stage other_skirt.usda --motion other_clip.usda -o shot_other.usda") == 0
     for frame in (0, 7, 39):
         own, its = shown("own.usda", frame), shown("shot_other.usda", frame)
         np.testing.assert_allclose(np.sort(its["Body"][:, 1]), np.sort(own["Body"][:, 1]), atol=1e-4)
-        # A body that is as round as this one does not tell by a face's width how it is turned.
-        np.testing.assert_allclose(its["Skirt"], own["Skirt"], atol=0.004 if turn else 2e-4)
+        np.testing.assert_allclose(its["Skirt"], own["Skirt"], atol=2e-4)
     stage = Usd.Stage.Open("shot_other.usda")
     (skeleton,) = [UsdSkel.Skeleton(prim) for prim in stage.Traverse() if prim.IsA(UsdSkel.Skeleton)]
     joints = [str(joint) for joint in skeleton.GetJointsAttr().Get()]
