@@ -59,6 +59,10 @@ SCHEMES = {
                   "Clavicle UpperArm Forearm Hand Thigh Calf Foot Toe0", "Bip01_{S}_{name}"),
     "vrm": _named("J_Bip_C_Hips J_Bip_C_Spine J_Bip_C_Chest J_Bip_C_UpperChest J_Bip_C_Neck J_Bip_C_Head",
                   "Shoulder UpperArm LowerArm Hand UpperLeg LowerLeg Foot ToeBase", "J_Bip_{S}_{name}"),
+    "daz": _named("pelvis abdomenLower abdomenUpper chestLower neckLower head",
+                  "Collar ShldrBend ForearmBend Hand ThighBend Shin Foot Toe", "{s}{name}"),
+    "advanced": _named("Root_M Spine1_M Spine2_M Chest_M Neck_M Head_M",
+                       "Scapula Shoulder Elbow Wrist Hip Knee Ankle Toes", "{name}_{S}"),
     "numbers": {part: f"J{number:02d}" for number, part in enumerate(PARTS)},
 }  # fmt: skip
 

@@ -23,26 +23,27 @@ PREFIXES = re.compile(
     r"(?i)^(?:.*[:|]|mixamorig\d*_|def[-_]|org[-_]|bip0*1?[ _]|j_bip_[lrc]_|[mf]_avg_|cc_base_|jnt_|bn_|valvebiped)+"
 )
 DEFORMING = re.compile(r"(?i)def[-_]")
-SUFFIXES = re.compile(r"(?i)[-_. ](?:joint|jnt|bone|bind|skin)$")
+SUFFIXES = re.compile(r"(?i)[-_. ](?:joint|jnt|bone|bind|skin|m|mid|c)$")
 SIDES = re.compile(r"(?i:left|right)|(?:^|(?<=[^A-Za-z]))[LlRr](?=[^A-Za-z]|$)|^[LlRr](?=[A-Z][a-z])|(?<=[a-z])[LR]$")
 # The first names of each part are unlike all others; those of `LATER` mean another part where that one has its own.
 PARTS = {
     "hips": "hips pelvis hip",
-    "spine": "spine chest upperchest torso lowerback abdomen waist ribs ribcage",
-    "neck": "neck",
+    "spine": "spine chest upperchest chestupper chestlower torso lowerback abdomen abdomenupper abdomenlower waist "
+    "ribs ribcage",
+    "neck": "neck necklower",
     "head": "head skull",
-    "collar": "clavicle collar collarbone shoulder",
-    "upper arm": "upperarm uparm arm shldr armupper bicep humerus",
-    "forearm": "forearm lowerarm lowarm elbow armlower",
+    "collar": "clavicle collar collarbone scapula shoulder",
+    "upper arm": "upperarm uparm arm shldr shldrbend armupper bicep humerus",
+    "forearm": "forearm forearmbend lowerarm lowarm elbow armlower",
     "hand": "hand wrist palm",
-    "thigh": "upleg thigh upperleg hip legupper femur",
+    "thigh": "upleg thigh thighbend upperleg hip legupper femur",
     "shin": "leg calf shin lowerleg lowleg knee leglower shank",
     "foot": "foot ankle",
     "toe": "toe toebase toes ball",
 }
 WORDS = {word: part for part, words in reversed(list(PARTS.items())) for word in words.split()}
 # SMPL's shoulder is the upper arm, beside a collar, and its foot the toes, beside an ankle.
-LATER = {("shoulder", "collar clavicle collarbone"): "upper arm", ("foot", "ankle"): "toe"}
+LATER = {("shoulder", "collar clavicle collarbone scapula"): "upper arm", ("foot", "ankle"): "toe"}
 SIDED = ("collar", "upper arm", "forearm", "hand", "thigh", "shin", "foot", "toe")
 FINGERS = re.compile(r"thumb|index|middle|ring|pinky|little|finger|metacarpal|meta|carpal")
 OTHERS = re.compile(r"twist|roll|end|nub|helper|corrective|ik|pole|breast|pec|eye|jaw|tongue|weapon|attach|prop")
