@@ -123,14 +123,14 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     from ssilk_usd.reading.character import read_character
 
     from ..authoring.bodies.carry import carry
-    from ..authoring.bodies.differences import need_family
+    from ..authoring.bodies.differences import differences, need_family
     from ..authoring.preflight.fit import describe_left, describe_move
 
     path = scene.garment.mesh.path
     file, root = split_location(str(options.onto))
     other = read_character(file, root=root or options.root, bodies=options.body, report=report)
-    if other.skeleton.joint_names != scene.character.skeleton.joint_names:
-        _need_map(options, scene, other)
+    if found := differences(scene.character, other):
+        _need_map(options, scene, other, found)
     family = need_family([scene.character, other])
     carried = carry(scene, other)
     moved = np.linalg.norm(carried.scene.garment.mesh.points - scene.garment.mesh.points, axis=1)
@@ -145,14 +145,12 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     return carried.scene
 
 
-def _need_map(options: argparse.Namespace, scene: Scene, other: Character) -> None:
-    """Raise `SsilkError` for a character with another skeleton, and name the verb that proposes a map of joints."""
-    from ..authoring.bodies.differences import differences
-
+def _need_map(options: argparse.Namespace, scene: Scene, other: Character, found: list[str]) -> None:
+    """Raise `SsilkError` for a character that is found to differ, and name the verb that proposes a map of joints."""
     fail(
         other.path,
-        f"it is no member of the family of {scene.character.path}: {'; '.join(differences(scene.character, other))}",
-        "another skeleton needs a map of joints",
+        f"it is no member of the family of {scene.character.path}: {'; '.join(found)}",
+        "members of a family have the same joints, parents and order of points, and others need a map of joints",
         f"'ssilk inspect {options.stage} --onto {options.onto} --joints MAP.toml' proposes one for --joints",
     )
 

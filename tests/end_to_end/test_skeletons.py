@@ -140,6 +140,28 @@ def test_the_cloth_moves_on_the_other_joints_as_on_its_own(world):
     assert run("verify shot_other.usda") == 0
 
 
+def test_characters_that_name_their_joints_alike_may_be_bound_otherwise(world, toy, capsys):
+    axes = write_other(world / "other.usda")
+    stage = Usd.Stage.Open("other.usda")
+    UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig")).GetJointsAttr().Set(["Hips", "Hips/Spine", "Hips/Spine/Head"])
+    stage.Save()
+    write_clip(world / "other_clip.usda", axes)
+    clip = Usd.Stage.Open("other_clip.usda")
+    UsdSkel.Animation(clip.GetPrimAtPath("/Clip")).GetJointsAttr().Set(["Hips", "Hips/Spine", "Hips/Spine/Head"])
+    clip.GetRootLayer().Save()
+    assert run("rig rigged.usda --onto other.usda -o out.usda") == 2
+    assert "the faces of " in (told := capsys.readouterr().err) and "--joints MAP.toml' proposes one" in told
+    put_on()
+    assert run(f"{BAKE} --stage rigged.usda -o own.usda") == 0
+    assert run("bake model.safetensors --stage other_skirt.usda --motion other_clip.usda -o shot_other.usda") == 0
+    np.testing.assert_allclose(shown("shot_other.usda", 7)["Skirt"], shown("own.usda", 7)["Skirt"], atol=2e-4)
+    # A model that was trained there is the character's own.
+    assert run("train other_skirt.usda --motions other_clip.usda -o other.safetensors", *toy.training) in (0, 5)
+    capsys.readouterr()
+    assert run("bake other.safetensors --stage other_skirt.usda --motion other_clip.usda -o anew.usda") == 0
+    assert "stand for" not in capsys.readouterr().err
+
+
 def test_what_is_refined_and_what_is_skinned_alone_is_the_other_characters(world, capsys):
     put_on()
     command = "bake model.safetensors --stage other_skirt.usda --motion other_clip.usda"

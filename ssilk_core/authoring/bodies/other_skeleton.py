@@ -123,8 +123,10 @@ class _Shares:
         away, at = cKDTree(body.mesh.points).query(points, k=min(NEAREST, len(body.mesh.points)))
         near = 1 / (away.reshape(len(points), -1) + 1e-4)
         near /= near.sum(axis=1, keepdims=True)
-        dense = body.skin.dense(other.joint_count)
-        self.beneath = np.einsum("vk,vkj->vj", near, dense[at.reshape(len(points), -1)])
+        dense, at = body.skin.dense(other.joint_count), at.reshape(len(points), -1)
+        self.beneath = np.zeros((len(points), other.joint_count))
+        for share, rows in zip(near.T, at.T):
+            self.beneath += share[:, None] * dense[rows]
 
     def of(self, skin: SkinWeights, proxies: int) -> SkinWeights:
         """Return weights over the own joints, then so many proxies, as weights over the other's, then these."""

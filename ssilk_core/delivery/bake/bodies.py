@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import fail
+from ...errors import SsilkError, fail
 from ...events import Event, Message
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyPlace, has_bones, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
-from .onto import has_joints_of, put_onto
+from .onto import put_onto
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -52,9 +52,7 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
-    if not has_joints_of(character.skeleton, file.scene.character.skeleton) and (
-        put := put_onto(file, stage, character)
-    ):
+    if not _is_own(file, character) and (put := put_onto(file, stage, character)):
         return WornModel(put.file, put.file.scene, put.told, put.identity)
     names = file.bodies.family.bodies.meshes if file.bodies else ()
     known = character
@@ -62,6 +60,15 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
         # Meshes that a joint carries are read where they are named alone, as `--body` may have named them.
         known = read_character(stage, root=root, bodies=names)
     return worn_by(file, character, known)
+
+
+def _is_own(file: ModelFile, character: Character) -> bool:
+    """Return whether a character is the one that a model was trained on, or first of its family."""
+    try:
+        in_order_of(file.scene.character.skeleton, character)
+    except SsilkError:
+        return False
+    return True
 
 
 def worn_by(file: ModelFile, character: Character, known: Character) -> WornModel:

@@ -62,13 +62,6 @@ class PutOnModel:
     identity: tuple[float, ...]
 
 
-def has_joints_of(character: Skeleton, trained: Skeleton) -> bool:
-    """Return whether a skeleton has all joints of a model, by their paths or unique names."""
-    from ssilk_usd.reading.skin import match_joints
-
-    return min(match_joints(trained.joint_names, character.joint_names)) >= 0
-
-
 def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnModel | None:
     """Return a model on a character with another skeleton; None where its garment was not put onto it.
 
@@ -79,9 +72,9 @@ def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnMo
 
     prim = split_location(character.skeleton.path)[1]
     there = read_put_on(stage, character.skeleton, prim or "")
-    if not there:
+    put = _chosen(file, there, character) if there else None
+    if put is None:
         return None
-    put = _chosen(file, there, character)
     own, other = file.scene.character.skeleton, character.skeleton
     images = _images(file, put, other)
     posed = alike(own, other, images)
@@ -98,28 +91,36 @@ def put_onto(file: ModelFile, stage: Usd.Stage, character: Character) -> PutOnMo
     return PutOnModel(_bound(file, put.garment, stands, posed, points), told, identity)
 
 
-def _chosen(file: ModelFile, there: Sequence[PutOn], character: Character) -> PutOn:
-    """Return the garment of a stage that is the model's."""
-    own, names = file.scene.garment.mesh, set(file.scene.character.skeleton.joint_names)
-    alike = [
+def _chosen(file: ModelFile, there: Sequence[PutOn], character: Character) -> PutOn | None:
+    """Return the garment of a stage that is the model's; None where the character may have the model's joints itself.
+
+    Raises:
+        SsilkError: it is none of them.
+    """
+    from ssilk_usd.reading.skin import match_joints
+
+    own, skeleton = file.scene.garment.mesh, file.scene.character.skeleton
+    same = [
         each
         for each in there
         if each.garment.mesh.vertex_count == own.vertex_count
         and np.array_equal(each.garment.mesh.faces, own.faces)
-        and names.issubset(each.stands_for)
+        and set(skeleton.joint_names).issubset(each.stands_for)
     ]
-    if len(alike) > 1:
+    if len(same) > 1:
         leaf = own.path.rpartition("/")[2]
-        alike = [each for each in alike if each.garment.mesh.path.rpartition("/")[2] == leaf]
-    if len(alike) != 1:
+        same = [each for each in same if each.garment.mesh.path.rpartition("/")[2] == leaf]
+    if not same and min(match_joints(skeleton.joint_names, character.skeleton.joint_names)) >= 0:
+        return None
+    if len(same) != 1:
         listed = ", ".join(f"{each.garment.mesh.path} of {each.garment.mesh.vertex_count} points" for each in there)
         allowed = (
             f"one of the model's {own.vertex_count} points, from the character that it was trained on, is needed"
         )
         fail(character.path, f"garments that were put onto it are {listed}", allowed, "run 'ssilk rig --onto' for it")
-    if alike[0].garment.skin is None:
-        fail(alike[0].garment.mesh.path, "it has no weights", "'ssilk rig --onto' writes some", "run it again")
-    return alike[0]
+    if same[0].garment.skin is None:
+        fail(same[0].garment.mesh.path, "it has no weights", "'ssilk rig --onto' writes some", "run it again")
+    return same[0]
 
 
 def _images(file: ModelFile, put: PutOn, other: Skeleton) -> Ints:
