@@ -85,19 +85,27 @@ class Countdown:
 
     The first step tells no time and does not count for the pace, because it often loads or settles what the others
     find ready.
+
+    Args:
+        done: steps that are done already.
+        at_once: steps that end together, as several threads do them: the pace is that of so many.
     """
 
-    def __init__(self, total: int, report: Reporter, done: int = 0) -> None:
-        self.total, self.report, self.done = total, report, done
+    def __init__(self, total: int, report: Reporter, done: int = 0, at_once: int = 1) -> None:
+        self.total, self.report, self.done, self.at_once = total, report, done, at_once
         self._first: tuple[float, int] | None = None
+        self._pace: float | None = None
+        self._counted = done
 
     def __call__(self, steps: int = 1) -> None:
         """Report that so many more steps are done."""
         self.done += steps
-        now = time.monotonic()
-        since, before = self._first = self._first or (now, self.done)
-        pace = (now - since) / (self.done - before) if self.done > before else None
-        self.report(Progress(self.done, self.total, None if pace is None else pace * (self.total - self.done)))
+        if self.done >= self._counted + self.at_once:
+            self._counted, now = self.done, time.monotonic()
+            since, before = self._first = self._first or (now, self.done)
+            self._pace = (now - since) / (self.done - before) if self.done > before else None
+        left = None if self._pace is None else self._pace * (self.total - self.done)
+        self.report(Progress(self.done, self.total, left))
 
 
 class JsonReporter:

@@ -90,7 +90,7 @@ def joint_order(joints: Joints, names: Sequence[str], *, fewer_proxies: bool = F
         raise SetupError(
             f"The bones are not those that the garment was trained with ('{odd[0].rpartition('/')[2]}' was added, "
             "removed, renamed or has another parent); undo that, tell which bone it is by Match Bones in the Baking "
-            "panel, or train again."
+            "panel, train again, or put it onto another rig by 'ssilk rig --onto'."
         )
     places = {name: place for place, name in enumerate(names)}
     return np.array([places.get(path, -1) for path in paths])

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     from ..quality.evaluation.results import EvaluationResults
     from ..scene.assets import Skeleton
 
+COLUMNS = 118  # of a terminal, which tables fit
+
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
@@ -80,7 +82,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     rows = [row for _, row in results.rows]
     worst = worst_bodies(rows)
     if not options.json:
-        print(tables(rows))
+        print(tables(rows, COLUMNS))
     told: dict[str, object] = {f"worst body, {one.place}": one.words for one in worst}
     if options.json:
         told = {"figures": results.figures, **({"worst bodies": [asdict(one) for one in worst]} if worst else {})}

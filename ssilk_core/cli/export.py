@@ -101,4 +101,8 @@ def _on_body(options: argparse.Namespace, file: ModelFile, report: Reporter) -> 
     on = worn(file, open_stage(options.stage), options.root)
     for event in on.told:
         report(event)
+    if on.scene.character.skeleton.seen is not None:
+        found = "the garment was put onto it from a character with another skeleton"
+        allowed = "descriptors of an exported network are of the skeleton that it was trained on"
+        fail(str(options.stage), found, allowed, "leave --stage out, or train on this character")
     return on.file

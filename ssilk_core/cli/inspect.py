@@ -4,6 +4,8 @@
 Every finding names the prim, the count, what was found, why it matters and what to do. --fix writes a copy of the
 garment's file with all safe repairs made, and reports what is left. The exit code is 2 when there are errors, and 0
 otherwise. --family also says whether further characters are bodies of one family with the first, or what differs.
+--onto proposes which joints of another character stand for those of this one, as 'ssilk rig --onto' takes them:
+--joints names the file that gets the proposal, to be edited, or the edited file, which is then checked.
 --over also finds where the garment starts inside others that it is worn over, and --fix settles it off these.
 
 A list as 'ssilk wardrobe' takes it (.toml) in place of the stage is inspected garment by garment, inner ones first,
@@ -22,7 +24,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import SsilkError, fail
 from ..events import Reporter, Result, silent
-from ..files import replacing
+from ..files import replacing, split_location
 from ..training.settings import PRESETS, preset_named
 from . import options as shared
 from ._inspected import Inspected
@@ -60,6 +62,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
     )  # fmt: skip
     verb.add_argument(
+        "--onto", type=Path, metavar="STAGE[:/ROOT]",
+        help="a character with another skeleton, to put the garment on: which of its joints stand for which",
+    )  # fmt: skip
+    verb.add_argument(
+        "--joints", type=Path, metavar="MAP",
+        help="map of joints for --onto (.toml): written where there is no such file, else checked",
+    )  # fmt: skip
+    verb.add_argument(
         "--fix", type=Path, metavar="OUT",
         help="write a repaired copy of the garment's file (.usdc, .usd or .usda); of a list, a folder of copies",
     )  # fmt: skip
@@ -87,7 +97,8 @@ def _inspect(options: argparse.Namespace, report: Reporter) -> Inspected:
     if options.fix:
         repaired = _fix(options, inputs)
         inputs = _read(_moved(options, options.fix), silent)
-    return Inspected([*inspect(inputs), *_on_family(options, inputs, report)], repaired)
+    others = (*_on_family(options, inputs, report), *_on_skeleton(options, inputs, report))
+    return Inspected([*inspect(inputs), *others], repaired)
 
 
 def _read(options: argparse.Namespace, report: Reporter) -> PreflightInput:
@@ -157,6 +168,35 @@ def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Repo
 
     others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
     return list(family_findings([inputs.character, *others]))
+
+
+def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
+    """Return what there is to say of the joints of --onto; write the map of --joints where there is none yet."""
+    if not options.onto:
+        if options.joints:
+            allowed = "a map says which joints of --onto stand for those of the garment's character"
+            fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
+        return []
+    from ..authoring.bodies.joint_findings import joint_findings
+    from ..authoring.bodies.joint_names import propose
+    from ..scene.joint_map import read_joint_map, write_joint_map
+
+    other = shared.read_onto(options, report)
+    if options.joints and options.joints.exists():
+        return list(joint_findings(read_joint_map(options.joints), inputs.character, other, inputs.garment))
+    found = propose(inputs.character.skeleton, other.skeleton, str(options.joints or options.onto))
+    if options.joints:
+        shared.check_output(options.joints, options.stage, split_location(str(options.onto))[0])
+        write_joint_map(options.joints, found, _about_map(options))
+    return list(joint_findings(found, inputs.character, other, inputs.garment))
+
+
+def _about_map(options: argparse.Namespace) -> str:
+    name = Path(split_location(str(options.onto))[0]).name
+    return (
+        f'Which joint of {name} stands for each joint of {options.stage.name}; "" for none.\n'
+        "Edit it, check it with 'ssilk inspect', and give it to 'ssilk rig --onto' as --joints."
+    )
 
 
 def _readable(paths: Sequence[Path], skeleton: Skeleton) -> tuple[list[Motion], dict[str, str]]:

@@ -33,6 +33,7 @@ from ..scene.assets.reshaped import reshaped
 from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
+from ..scene.posed_alike import shaped_as_in_stage
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
@@ -459,6 +460,16 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
+def read_onto(options: argparse.Namespace, report: Reporter) -> Character:
+    """Read the character of --onto, "STAGE[:/ROOT]", which has another skeleton: --root and --body name others."""
+    from ssilk_usd.reading.character import read_character
+
+    file, root = split_location(str(options.onto))
+    if not Path(file).exists():
+        fail(file, "there is no such file", "a USD stage with a character is needed")
+    return read_character(file, root=root, report=report)
+
+
 def tell_shapes(
     options: argparse.Namespace, motions: Iterable[Motion], report: Reporter, *, trained: Character | None = None
 ) -> None:
@@ -486,7 +497,9 @@ def with_shapes(options: argparse.Namespace, motion: Motion, source: str | Path,
     from ssilk_usd.reading.body_shapes import with_body_shapes
 
     chosen = {"root": options.root, "garment": options.garment}
-    return with_body_shapes(options.stage, str(source), motion, character, **chosen)
+    return shaped_as_in_stage(
+        character, lambda own: with_body_shapes(options.stage, str(source), motion, own, **chosen)
+    )
 
 
 def load_scene(

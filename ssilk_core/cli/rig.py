@@ -4,7 +4,9 @@
 The proxies are joints at the end of the skeleton and can be edited by hand like any other joint. Weights, classes and
 proxies that the stage already has are kept. A garment that lies in the body is settled out of it first. Where a limb
 goes through it, it stays as it is, with a warning. --onto puts it on another body of the same family instead, to see
-how it would lie there: the file written is that body's.
+how it would lie there: the file written is that body's. With --joints that body may have any other skeleton and mesh,
+such as a Mixamo, Rigify, Unreal or SMPL character: a model of the garment bakes on the file written, and a training
+with it makes one for that body.
 """
 
 from __future__ import annotations
@@ -16,8 +18,9 @@ from typing import TYPE_CHECKING
 
 from ..authoring.setup.classes import USUAL
 from ..authoring.setup.rig import RigOptions
-from ..errors import EXIT_OK
+from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
+from ..files import split_location
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -46,9 +49,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--onto",
         type=Path,
-        metavar="STAGE",
-        help="another body of the same skeleton and topology, to put the garment on",
+        metavar="STAGE[:/ROOT]",
+        help="another body of the same skeleton and topology, to put the garment on; with --joints any character",
     )
+    verb.add_argument(
+        "--joints", type=Path, metavar="MAP",
+        help="which joints of --onto stand for those of the garment's character (.toml), as 'ssilk inspect --onto' "
+             "proposes it",
+    )  # fmt: skip
     verb.add_argument(
         "--keep-shape", action="store_true", help="leave the garment as it is, even where it lies inside the body"
     )
@@ -62,8 +70,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES
 
-    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], options.onto)
+    onto = split_location(str(options.onto))[0] if options.onto else None
+    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], onto)
     report(Started("rig", options.proxies))
+    if options.joints and not options.onto:
+        allowed = "a map says which joints of --onto stand for those of the garment's character"
+        fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
     character, garment, rig = shared.read(options, report)
     if garment.surface is not None:
         shared.stated_fabric(garment.surface, report)
@@ -77,9 +89,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         report=report,
     )
     moved = settled.mesh.points - garment.mesh.points if settled else None
-    if options.onto:
+    stands_for = None
+    if options.joints:
+        (scene, stands_for), moved = _on_skeleton(options, scene, report), None
+    elif options.onto:
         scene, moved = _on_other(options, scene, report), None
-    left_out = write_rigged_stage(options.onto or options.stage, scene, options.output, moved=moved)
+    source = onto or options.stage
+    left_out = write_rigged_stage(source, scene, options.output, moved=moved, stands_for=stands_for)
     if left_out:
         report(Message(f"{options.output}: {left_out}", "warning"))
     counts = np.bincount(scene.classes, minlength=3)
@@ -107,11 +123,14 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     from ssilk_usd.reading.character import read_character
 
     from ..authoring.bodies.carry import carry
-    from ..authoring.bodies.differences import need_family
+    from ..authoring.bodies.differences import differences, need_family
     from ..authoring.preflight.fit import describe_left, describe_move
 
     path = scene.garment.mesh.path
-    other = read_character(options.onto, root=options.root, bodies=options.body, report=report)
+    file, root = split_location(str(options.onto))
+    other = read_character(file, root=root or options.root, bodies=options.body, report=report)
+    if found := differences(scene.character, other):
+        _need_map(options, scene, other, found)
     family = need_family([scene.character, other])
     carried = carry(scene, other)
     moved = np.linalg.norm(carried.scene.garment.mesh.points - scene.garment.mesh.points, axis=1)
@@ -124,6 +143,37 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     if left := describe_left(carried.settled, carried.unsettled, other):
         report(Message(f"{path}: {left}", "warning"))
     return carried.scene
+
+
+def _need_map(options: argparse.Namespace, scene: Scene, other: Character, found: list[str]) -> None:
+    """Raise `SsilkError` for a character that is found to differ, and name the verb that proposes a map of joints."""
+    fail(
+        other.path,
+        f"it is no member of the family of {scene.character.path}: {'; '.join(found)}",
+        "members of a family have the same joints, parents and order of points, and others need a map of joints",
+        f"'ssilk inspect {options.stage} --onto {options.onto} --joints MAP.toml' proposes one for --joints",
+    )
+
+
+def _on_skeleton(options: argparse.Namespace, scene: Scene, report: Reporter) -> tuple[Scene, dict[str, str]]:
+    """Return the scene on the character of --onto, by the map of --joints, and which of its joints stand for which.
+
+    Raises:
+        SsilkError: the map is not sound, or the character is bound in a pose that cannot be made out.
+    """
+    import numpy as np
+
+    from ..authoring.bodies.other_skeleton import carry_onto, tell_carried
+    from ..scene.joint_map import read_joint_map
+
+    names = read_joint_map(options.joints)
+    other = shared.read_onto(options, report)
+    own, skeleton = scene.character.skeleton, other.skeleton
+    images = names.images(own, skeleton)
+    carried = carry_onto(scene, other, images)
+    tell_carried(carried, scene, report)
+    others = np.array([*skeleton.joint_names, ""])
+    return carried.scene, dict(zip(own.joint_names, others[images].tolist()))
 
 
 def settled_garment(character: Character, garment: Garment, report: Reporter) -> Garment | None:

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..physics.constants import GRAVITY
 from ..scene.assets import Floats, Motion, Skeleton
-from ..scene.kinematics import matrix_from_quaternion, motion_transforms
+from ..scene.kinematics import local_transforms, matrix_from_quaternion, motion_transforms
 from .proximity import proximity_vectors
 
 RATE_TIME = 0.1  # [s] unit of time of rates, which gives features of order one for everyday motion
@@ -84,6 +84,7 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
 
 def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
     """Return the places in `joints` (J',) of those whose rotations are features: all but the hub, and other roots."""
+    skeleton = seen_skeleton(skeleton)
     above = skeleton.hub_path[:-1]
     return np.array(
         [
@@ -104,8 +105,13 @@ def pose_features(
         world: `motion_transforms` of the motion, if it is already computed.
         kind: of `settings.DESCRIPTORS`.
     """
-    world = (motion_transforms(motion, skeleton.parents) if world is None else world)[:, joints]
-    local = matrix_from_quaternion(motion.rotations[:, joints])
+    world = motion_transforms(motion, skeleton.parents) if world is None else world
+    if skeleton.seen is None:
+        local = matrix_from_quaternion(motion.rotations[:, joints])
+    else:
+        world, skeleton = skeleton.seen.world(world), skeleton.seen.skeleton
+        local = local_transforms(world, skeleton.parents)[:, joints, :3, :3]
+    world = world[:, joints]
     centre = place_of_hub(skeleton, joints)
     root, down = world[:, centre, :3, :3], np.swapaxes(world[..., :3, :3], -1, -2)
     above = np.flatnonzero(np.isin(joints, skeleton.hub_path[:-1]))
@@ -141,6 +147,11 @@ def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
     """
     acceleration = _differences(places, fps)[1] / (RATE_TIME**2 * GRAVITY)
     return np.einsum("fba,fjb->fja", root, acceleration).reshape(len(places), -1)
+
+
+def seen_skeleton(skeleton: Skeleton) -> Skeleton:
+    """Return the skeleton that a network sees on a character."""
+    return skeleton if skeleton.seen is None else skeleton.seen.skeleton
 
 
 def place_of_hub(skeleton: Skeleton, joints: np.ndarray) -> int:

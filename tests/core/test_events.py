@@ -123,6 +123,12 @@ def test_the_time_left_is_told_at_the_pace_since_the_first_step(monkeypatch):
     assert told == [Progress(4, 10, None), Progress(5, 10, 10.0), Progress(6, 10, 12.0)]
     done(4)
     assert told[-1] == Progress(10, 10, 0.0)
+    told.clear()
+    done = events.Countdown(8, told.append, at_once=2)  # two threads end their steps together, every 4 s
+    for seconds in (4, 0.01, 3.99, 0.01, 3.99, 0.01):
+        now[0] += seconds
+        done()
+    assert [each.seconds_left for each in told] == [None, None, None, 8.0, 6.0, 4.0]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.cli import main
-from ssilk_core.delivery.bake import BakeRequest, bake
+from ssilk_core.delivery.bake import BakeRequest, bake, verify
 from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.looped import seam_words
 
@@ -97,6 +97,16 @@ def test_the_last_frame_flows_into_the_first(stage):
     assert told["seam from rest, at most [mm]"] == pytest.approx(1000 * seam_of(plain), rel=0.01)
 
 
+def test_a_loop_is_verified_with_its_seam(stage, capsys):
+    baked("plain.usdc"), baked("loop.usdc", "cycle.usda", "--loop")
+    assert verify("plain.usdc").seam_mm is None
+    found = verify("loop.usdc")
+    assert found.seam_mm == pytest.approx(1000 * seam_of(points_of("loop.usdc")), abs=1e-3) and found.seam_mm < 0.01
+    capsys.readouterr()
+    assert main(["verify", "loop.usdc"]) == 0
+    assert "seam of the loop, at most [mm]" in capsys.readouterr().err
+
+
 def test_a_round_is_what_many_rounds_come_to(stage):
     write_cycle("long.usda", 10 * ROUND + 1)
     long, found = baked("long.usdc", "long.usda"), baked("loop.usdc", "cycle.usda", "--loop")
@@ -135,9 +145,9 @@ def test_a_round_is_told_of_a_shot_with_more_shapes_than_the_network_has(stage):
 
 @pytest.mark.parametrize(
     "more",
-    [["--hold", "2"], ["--fps", "60"], ["--samples-per-frame", "2"], ["--quality", "game"], ["--wind", "0,0,0"],
-     ["--latent-iterations", "1"]],
-    ids=["twos", "rate", "samples", "game", "air", "latents"],
+    [["--hold", "2"], ["--fps", "60"], ["--fps", "28.75"], ["--samples-per-frame", "2"], ["--quality", "game"],
+     ["--wind", "0,0,0"], ["--latent-iterations", "1"]],
+    ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents"],
 )  # fmt: skip
 def test_a_loop_goes_with_other_wishes(stage, more):
     found = baked("loop.usdc", "cycle.usda", "--loop", *more)
@@ -226,7 +236,12 @@ def say_often() -> None:
         (None, ["--loop", "--hold", "5"], "poses that are held for 5 samples, in a round of 24"),
         (None, ["--loop", "--gusts", "2"], "gusts; in a loop each round feels the same"),
         (None, ["--loop", "--wind", "0,0,5"], "a round turns by 23 degrees in wind"),
-        (None, ["--loop", "--fps", "29"], "are between those of the motion"),
+        (
+            None,
+            ["--loop", "--fps", "29"],
+            "24 frames of cycle.usda take 23.2 samples; a loop ends on a sample, where it "
+            "begins again; give --fps 28.75 or 30, or leave it out",
+        ),
         (free_at_the_end, ["--loop"], "ssilk:free is 1 in the first frame and 0.5 in the last"),
         (say_often, [], "ssilk:loop is yes; true or false is needed"),
     ],

@@ -94,6 +94,26 @@ def test_what_was_painted_after_the_training_is_told(stage, capsys):
     np.testing.assert_array_equal(points_of("painted.usdc"), points_of("plain.usdc"))
 
 
+def test_one_that_changes_in_time_is_told_and_counts_as_at_first(stage, capsys):
+    count = count_of("hero.usda")
+    stiffen("hero.usda", np.full(count, 4.0))
+    opened = Usd.Stage.Open("hero.usda")
+    attribute = UsdGeom.PrimvarsAPI(opened.GetPrimAtPath("/Hero/Skirt")).GetPrimvar("ssilk:stiffness").GetAttr()
+    for time, value in ((3.0, 4.0), (9.0, 4.0)):
+        attribute.Set([value] * count, time)
+    opened.GetRootLayer().Save()
+    assert run("rig hero.usda --garment Skirt --proxies 4 -o own.usda") == 0
+    assert "changes from time code" not in capsys.readouterr().err
+    attribute.Set([5.0] * count, 9.0)
+    opened.GetRootLayer().Save()
+    assert run("rig hero.usda --garment Skirt --proxies 4 -o own.usda") == 0
+    told = capsys.readouterr().err
+    assert "ssilk:stiffness changes from time code 3 to 9; cloth has its value at the first of these" in told
+    rigged = Usd.Stage.Open("own.usda")
+    found = UsdGeom.PrimvarsAPI(rigged.GetPrimAtPath("/Hero/Skirt")).GetPrimvar("ssilk:stiffness")
+    np.testing.assert_array_equal(found.Get(), np.full(count, 4.0))
+
+
 def test_a_model_without_it_has_the_file_that_it_had(stage):
     assert load_model("model.safetensors").scene.garment.mesh.stiffness is None
     assert b"scene.mesh.stiffness" not in (stage / "model.safetensors").read_bytes()

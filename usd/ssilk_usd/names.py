@@ -23,6 +23,9 @@ FREE, HOLD, LOOP = "ssilk:free", "ssilk:hold", "ssilk:loop"
 RIDES_ON, RIDE_VERTICES, RIDE_SOFT = "ssilk:ridesOn", "ssilk:rideVertices", "ssilk:rideSoft"
 # Of a baked garment: those of its proxy joints that carry riders.
 RIDER_JOINTS = "ssilk:riderJoints"
+# Of a garment that was put onto another skeleton: the joints of the character that it was made on, and for each the
+# one that stands for it, or "".
+FROM_JOINTS, ONTO_JOINTS = "ssilk:fromJoints", "ssilk:ontoJoints"
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...errors import fail
+from ...errors import SsilkError, fail
 from ...events import Event, Message
 from ...files import split_location
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyFamily, BodyPlace, has_bones, names_of
 from .character import BIND_TOLERANCE, TODO, in_order_of
+from .onto import put_onto
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -46,7 +47,7 @@ class WornModel:
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
-    """Put a model on the character of a stage, as `worn_by`.
+    """Put a model on the character of a stage, as `worn_by`; one with another skeleton as `onto.put_onto`.
 
     Raises:
         SsilkError: the stage's character is none that the model dresses, or it cannot be read.
@@ -54,12 +55,23 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
+    if not _is_own(file, character) and (put := put_onto(file, stage, character)):
+        return WornModel(put.file, put.file.scene, put.told, put.identity)
     names = file.bodies.family.bodies.meshes if file.bodies else ()
     known = character
     if not names_of(character).issuperset(names) and has_meshes(stage, root, names):
         # Meshes that a joint carries are read where they are named alone, as `--body` may have named them.
         known = read_character(stage, root=root, bodies=names)
     return worn_by(file, character, known)
+
+
+def _is_own(file: ModelFile, character: Character) -> bool:
+    """Return whether a character is the one that a model was trained on, or first of its family."""
+    try:
+        in_order_of(file.scene.character.skeleton, character)
+    except SsilkError:
+        return False
+    return True
 
 
 def worn_by(file: ModelFile, character: Character, known: Character) -> WornModel:

@@ -13,6 +13,7 @@ from ...scene.family import with_joints
 
 BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 ALLOWED, TODO = "a model bakes on the character it was trained with", "train on this character"
+ONTO = f"{TODO}, or put the garment onto its joints by 'ssilk rig --onto' with a map of joints"
 
 
 def in_order_of(trained: Skeleton, character: Character, *, moved: bool = False) -> Character:
@@ -49,7 +50,7 @@ def _places(found: Skeleton, trained: Skeleton) -> Ints:
     order = np.array(match_joints(trained.joint_names, found.joint_names))
     missing = [name for name, place in zip(trained.joint_names, order) if place < 0]
     if missing:
-        fail(found.path, f"{len(missing)} of the model's joints are missing ({_some(missing)})", ALLOWED, TODO)
+        fail(found.path, f"{len(missing)} of the model's joints are missing ({_some(missing)})", ALLOWED, ONTO)
     more = [name for place, name in enumerate(found.joint_names) if place not in order]
     if more:
         fail(found.path, f"{len(more)} of its joints are not the model's ({_some(more)})", ALLOWED, TODO)

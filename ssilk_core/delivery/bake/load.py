@@ -16,9 +16,10 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Deformer, Floats, Mesh, Motion, Skeleton
+from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Scene, Skeleton
 from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
+from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
@@ -167,7 +168,10 @@ class LoadedGarment:
         garment = self.deformer.scene.garment.mesh.path.rpartition("/")[2]
 
         def shaped(motion: Motion) -> Motion:
-            return with_body_shapes(request.stage, request.motion, motion, character, root=root, garment=garment)
+            def read(own: Character) -> Motion:
+                return with_body_shapes(request.stage, request.motion, motion, own, root=root, garment=garment)
+
+            return shaped_as_in_stage(character, read)
 
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
         if frames is None:
@@ -332,8 +336,12 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=(*told, *in_words),
         body=on.body,
-        first=first.scene.character.skeleton if on.body else None,
+        first=first.scene.character.skeleton if on.body and _same_joints(first.scene, scene) else None,
     )
+
+
+def _same_joints(one: Scene, other: Scene) -> bool:
+    return one.character.skeleton.joint_count == other.character.skeleton.joint_count
 
 
 def _on_stage(

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
@@ -73,6 +74,9 @@ def find_loop(request: BakeRequest, source: Motion, shot: Motion, skeleton: Skel
     first = shot.start * rate - source.start
     frames = (shot.frame_count - 1) * rate
     if max(abs(first - round(first)), abs(frames - round(frames))) > 1e-3:
+        if request.fps and abs(first - round(first)) <= 1e-3:
+            last = source.frame_count - 1 - round(first)
+            _refuse_rate(request, min(int(np.floor(frames + rate - 1e-3)), last), source.fps)
         code = shot.start / request.samples_per_frame
         found = f"its frames from time code {code:g} on are between those of the motion"
         fail(name, found, "a loop begins and ends at frames of the motion", "give --range, or leave --fps out")
@@ -92,6 +96,18 @@ def find_loop(request: BakeRequest, source: Motion, shot: Motion, skeleton: Skel
         todo = "let the last frame show the pose of the first, or leave --fps and --samples-per-frame out"
         fail(name, found, "a loop needs all samples of its round", todo)
     return Loop(cycle, round(period), rounds(own, skeleton, cycle, MOST_ROUNDS + 1))
+
+
+def _refuse_rate(request: BakeRequest, frames: int, fps: float) -> NoReturn:
+    """Raise `SsilkError` for a rate at which a round of so many frames, at `fps`, does not end on a sample."""
+    assert request.fps is not None
+    taken = frames / fps * request.fps * request.samples_per_frame
+    whole = [count / frames * fps / request.samples_per_frame for count in (int(taken), int(taken) + 1) if count]
+    found = (
+        f"{request.fps:g} frames per second, at which {frames} frames of {request.motion} take {taken:.5g} samples"
+    )
+    rates = " or ".join(f"{rate:.6g}" for rate in whole)
+    fail("--fps", found, "a loop ends on a sample, where it begins again", f"give --fps {rates}, or leave it out")
 
 
 def need_alone(request: BakeRequest) -> None:

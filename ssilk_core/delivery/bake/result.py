@@ -49,6 +49,8 @@ class Verification:
         rms_error_m: RMS distance from the points that the shot stands for [m]; None where it holds its own vertices.
         stated_faults: what the certificate of the file says of how free its frames are, where that was checked.
         counted_faults: what was found of it.
+        seam_mm: distance between the first frame of a loop and where its last ones lead, of the vertex that misses it
+            most [mm]; None where it is no loop.
     """
 
     frames: int
@@ -58,11 +60,14 @@ class Verification:
     rms_error_m: float | None = None
     stated_faults: str | None = None
     counted_faults: str | None = None
+    seam_mm: float | None = None
 
     def figures(self) -> dict[str, object]:
         """Return figures for people."""
         stated = {"certificate of the file": self.stated_faults, "counted in it": self.counted_faults}
-        return {**self._compared(), **{name: value for name, value in stated.items() if value is not None}}
+        seam = {} if self.seam_mm is None else {"seam of the loop, at most [mm]": f"{self.seam_mm:.3g}"}
+        compared = {**self._compared(), **seam}
+        return {**compared, **{name: value for name, value in stated.items() if value is not None}}
 
     def _compared(self) -> dict[str, object]:
         if self.mean_energy_j is not None:

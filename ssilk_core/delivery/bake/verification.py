@@ -16,10 +16,12 @@ from ...errors import VerificationError, fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import sha256
 from ...scene.assets import Floats
+from ...scene.cycles import LEAST_FRAMES
 from ..gltf.play import GlbShot
 from ..targets import GLB
 from .certificate.verified import verify_certificate
 from .load import load_rollout
+from .looped import seam
 from .opened import open_shot, provenance_of
 from .origin import read_origin
 from .refinement import refined_points, verify_energies
@@ -120,6 +122,19 @@ def verify_file(rollout: BakeRollout, path: Path, report: Reporter) -> Verificat
     """
     need_valid(path, report)
     shot = open_shot(path)
+    return replace(_verify_shot(rollout, path, shot, report), seam_mm=_seam(rollout, shot))
+
+
+def _seam(rollout: BakeRollout, shot: PosedGarment) -> float | None:
+    """Return how far the end of a loop misses its beginning in its file [mm]; None where it is no loop."""
+    times = shot.sample_times(rollout.request.samples_per_frame)
+    if rollout.loop is None or len(times) < LEAST_FRAMES:
+        return None
+    points = [shot.garment_points(time) for time in (*times[:3], *times[-2:])]
+    return 1000 * seam(rollout.loop.cycle, points[:3], points[3:], rollout.motion.fps).apart
+
+
+def _verify_shot(rollout: BakeRollout, path: Path, shot: Shot | GlbShot, report: Reporter) -> Verification:
     verify_riders(shot, shot.sample_times(rollout.request.samples_per_frame), rollout.rider_joints(), report)
     if not (rollout.request.certify and rollout.certificate is None):
         return _verify_points(rollout, path, shot, None, report)

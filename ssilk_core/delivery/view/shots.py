@@ -239,7 +239,7 @@ def _drawn(panels: Iterator[Picture], look: Look, total: int, report: Reporter) 
         )
         return add_captions(image, top=panel.top, bottom=panel.bottom)
 
-    told = Countdown(total, report)
+    told = Countdown(total, report, at_once=look.workers)
     for image in ordered_map(draw, panels, look.workers):
         told()
         yield image

@@ -36,11 +36,35 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], words: int) ->
     return "\n".join([line(header), line(rule), *map(line, rows)]) + "\n"
 
 
-def tables(rows: Sequence[ResultRow]) -> str:
-    """Return a table for each kind of figures that any row has, with the methods of a split side by side."""
+def in_parts(header: Sequence[str], rows: Sequence[Sequence[str]], words: int, most: int) -> str:
+    """Return the table of `aligned` as several of at most so many characters, each with the `words` first columns.
+
+    A column that is wider by itself gets a table of its own.
+    """
+    widths = [max(map(len, column)) + len(" | ") for column in zip(header, *rows)]
+    parts, free = list[list[int]](), 0
+    for column, width in enumerate(widths[words:], words):
+        if not parts or width > free:
+            parts.append([])
+            free = most - sum(widths[:words]) - len("|")
+        parts[-1].append(column)
+        free -= width
+    chosen = [[*range(words), *part] for part in parts]
+    return "\n".join(
+        aligned([header[column] for column in part], [[row[column] for column in part] for row in rows], words)
+        for part in chosen
+    )
+
+
+def tables(rows: Sequence[ResultRow], most: int | None = None) -> str:
+    """Return a table for each kind of figures that any row has, with the methods of a split side by side.
+
+    Args:
+        most: characters of a line, for which wide tables come in parts; None for whole tables.
+    """
     places = {(row.garment, row.split): place for place, row in reversed(list(enumerate(rows)))}
     together = sorted(rows, key=lambda row: places[row.garment, row.split])
-    return "\n".join(text for text in (_table(together, *kind) for kind in KINDS) if text)
+    return "\n".join(text for text in (_table(together, *kind, most) for kind in KINDS) if text)
 
 
 def _table(
@@ -48,11 +72,15 @@ def _table(
     pick: Callable[[Figures], Any],
     header: Sequence[str],
     cells: Callable[[Any], list[str]],
+    most: int | None,
 ) -> str:
     lines = [
         [row.garment, row.split, row.method, *cells(part)] for row in rows if (part := pick(row.figures)) is not None
     ]
-    return aligned(["garment", "split", "method", *header], lines, 3) if lines else ""
+    if not lines:
+        return ""
+    whole = ["garment", "split", "method", *header]
+    return aligned(whole, lines, 3) if most is None else in_parts(whole, lines, 3, most)
 
 
 ENERGIES = ("frames", "L_tot [J]", *(f"{name} [J]" for name in TERMS), "vertices inside the body [%]",

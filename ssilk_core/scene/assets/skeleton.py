@@ -30,6 +30,7 @@ class Skeleton:
             its jumps, and what is relative to the character is relative to it.
         placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
             above the skeleton tilt or scale it; None elsewhere.
+        seen: the joints that a network sees in place of these; None for these.
     """
 
     path: str
@@ -39,6 +40,7 @@ class Skeleton:
     rest_transforms: Floats
     hub: int = 0
     placement: Floats | None = None
+    seen: SeenJoints | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -84,6 +86,31 @@ class Skeleton:
         while (above := int(self.parents[path[0]])) >= 0:
             path.insert(0, above)
         return tuple(path)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenJoints:
+    """Joints of the character that a network was trained on, as another character carries them.
+
+    Attributes:
+        skeleton: those joints, bound at the proportions of the other character.
+        carriers: the joint of the other character that carries each of them, shape (J,).
+        offsets: where they are in the space of these, rigid, shape (J, 4, 4).
+        turn: by which the other character's bind pose is turned from what its stage has, rigid, shape (4, 4).
+    """
+
+    skeleton: Skeleton
+    carriers: Ints
+    offsets: Floats
+    turn: Floats
+
+    def __post_init__(self) -> None:
+        assign(self, carriers=frozen(self.carriers, np.int64), offsets=frozen(self.offsets, np.float64))
+        assign(self, turn=frozen(self.turn, np.float64))
+
+    def world(self, transforms: Floats) -> Floats:
+        """Return joint-to-world transforms (F, J, 4, 4) from those of the other character (F, J', 4, 4)."""
+        return transforms[:, self.carriers] @ self.offsets
 
 
 def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> int:

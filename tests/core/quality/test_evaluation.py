@@ -53,7 +53,7 @@ from ssilk_core.quality.evaluation.record import recorded
 from ssilk_core.quality.evaluation.run import SIMULATOR, evaluate
 from ssilk_core.quality.evaluation.solver_errors import solver_errors, windows_of
 from ssilk_core.quality.evaluation.splits import chosen, read_index, splits_of
-from ssilk_core.quality.evaluation.tables import aligned, tables
+from ssilk_core.quality.evaluation.tables import aligned, in_parts, tables
 from ssilk_core.quality.evaluation.takes import Take, back_and_forth, stopped, takes_of
 from ssilk_core.quality.evaluation.tally import Tally, figures, reference_errors
 from ssilk_core.scene.assets import TIGHT, Motion
@@ -433,6 +433,7 @@ def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_mo
     text = tables(rows)
     first = [line.split("|")[2].strip() for line in text.split("\n\n")[0].splitlines()[2:]]
     assert first == ["valid"] * 4 + ["flips"] * 4  # the methods of a split stand together
+    assert max(map(len, text.splitlines())) > 118 >= max(map(len, tables(rows, 118).splitlines()))
     assert text.count("| garment") == 10 and len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1
 
 
@@ -556,6 +557,19 @@ def test_no_take_is_refused(dressed, motion):
 def test_tables_are_aligned():
     text = aligned(["name", "value"], [["1_a", "1.5"], ["longer", "-20"]], 1)
     assert text == "| name   | value |\n| ------ | ----: |\n| 1_a    |   1.5 |\n| longer |   -20 |\n"
+
+
+def test_wide_tables_come_in_parts_that_repeat_the_words():
+    header, rows = ["name", "first", "second value", "third"], [["a", "1", "2", "3"], ["bcde", "10", "20", "30"]]
+    text = in_parts(header, rows, 1, 31)
+    assert text.split("\n\n") == [
+        "| name | first | second value |\n| ---- | ----: | -----------: |\n| a    |     1 |            2 |\n"
+        "| bcde |    10 |           20 |",
+        "| name | third |\n| ---- | ----: |\n| a    |     3 |\n| bcde |    30 |\n",
+    ]
+    assert in_parts(header, rows, 1, 200) == aligned(header, rows, 1)
+    narrow = in_parts(header, rows, 1, 5)  # no column can be cut
+    assert [line.split(" | ")[1].split(" |")[0].strip() for line in narrow.splitlines()[::5]] == header[1:]
 
 
 def test_a_simulation_is_where_the_solver_goes_from_its_own_states(scene, dressed, toy_motion):

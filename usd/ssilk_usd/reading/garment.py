@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
-from ssilk_core.events import Reporter, silent
+from ssilk_core.events import Message, Reporter, silent
 from ssilk_core.scene.assets import Floats, Garment, Ints, Mesh, Skeleton, SkinWeights
 
 from ..names import CLASS, LBS_SKIN, LEVEL, PIN, PROXIES, STIFFNESS
@@ -26,6 +26,7 @@ from ..opening.stage import (
     stage_name,
     world_matrix,
 )
+from ..opening.times import change_times
 from ..units import StageUnits
 from .bindings import need_skinned
 from .carried import carried_by
@@ -88,6 +89,7 @@ def read_garment(
     pinned = None if pins is None else (pins >= 0.5).astype(np.int64)  # may be painted as weights
     surface = read_surface(prim, mesh)
     tell_parts(prim, report)
+    _tell_changes(prim, report)
     return Garment(mesh, skin, _whole(prim, _per_point(prim, CLASS)), pinned, levels, surface, display_colour(prim))
 
 
@@ -224,6 +226,18 @@ def _per_point(prim: Usd.Prim, name: str) -> Floats | None:
             "paint it on points",
         )
     return np.array(primvar.ComputeFlattened(EARLIEST), dtype=np.float64).reshape(-1)
+
+
+def _tell_changes(prim: Usd.Prim, report: Reporter) -> None:
+    """Warn of a stiffness that changes in time: cloth has one."""
+    primvar = UsdGeom.PrimvarsAPI(prim).GetPrimvar(STIFFNESS.removeprefix("primvars:"))
+    times = change_times([primvar.GetAttr()]) if primvar else []
+    if len(times) < 2:
+        return
+    first = np.array(primvar.ComputeFlattened(times[0]))
+    if any(not np.array_equal(first, np.array(primvar.ComputeFlattened(time))) for time in times[1:]):
+        text = f"{STIFFNESS} changes from time code {times[0]:g} to {times[-1]:g}"
+        report(Message(f"{location(prim)}: {text}; cloth has its value at the first of these throughout", "warning"))
 
 
 def _whole(prim: Usd.Prim, classes: Floats | None) -> Ints | None:

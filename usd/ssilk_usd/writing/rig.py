@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from ssilk_core.errors import fail
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
-from ..names import CLASS, LBS_SKIN, LEVEL, PIN, SKEL, STIFFNESS
+from ..names import CLASS, FROM_JOINTS, LBS_SKIN, LEVEL, ONTO_JOINTS, PIN, SKEL, STIFFNESS
 from ..opening.garment_api import apply_garment_api
 from ..opening.stage import (
     PRIMS,
@@ -45,7 +46,14 @@ from .surface import reads_as, shield_surface, write_surface
 SAME_SHAPE = 1e-7  # of a garment's size, by which its points may differ and are left as they are
 
 
-def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, moved: Floats | None = None) -> str:
+def write_rigged_stage(
+    source: str | Path,
+    scene: Scene,
+    out: str | Path,
+    *,
+    moved: Floats | None = None,
+    stands_for: Mapping[str, str] | None = None,
+) -> str:
     """Write a flattened copy of the character's stage with the garment bound to its proxy rig.
 
     The copy keeps the stage's units and axes. Proxies are appended to the skeleton's joints, in place of older ones
@@ -58,6 +66,8 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
         scene: the character, its garment (from the same stage or from another file) and the rig.
         out: the file to write: .usdc, .usd or .usda.
         moved: how far the garment's points are from where its file has them [m], shape (V, 3); None if nowhere.
+        stands_for: for each joint of the character that the garment was made on the one of this character that stands
+            for it, or "": the garment keeps it for bakes of a model that was trained there. None for its own.
 
     Returns:
         What the copy loses: variants that are not selected, and of the garment's look where it is copied or moved;
@@ -80,6 +90,11 @@ def write_rigged_stage(source: str | Path, scene: Scene, out: str | Path, *, mov
     _keep_surface(mesh.GetPrim(), skel, scene.garment, moved)
     proxies = _append_proxies(skel, str(mesh.GetPath()), scene)
     _bind_garment(mesh, to_bind, skel, scene, proxies)
+    if stands_for is not None:
+        for name, values in ((FROM_JOINTS, stands_for.keys()), (ONTO_JOINTS, stands_for.values())):
+            attribute = mesh.GetPrim().CreateAttribute(name, Sdf.ValueTypeNames.TokenArray, False)
+            attribute.SetVariability(Sdf.VariabilityUniform)
+            attribute.Set(Vt.TokenArray(list(values)))
     if wanted is not None:
         _shape_garment(mesh, skel, wanted)
     if look:
