@@ -12,7 +12,7 @@ import torch
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
-from ssilk_core.physics.self_contact import ClothContacts, SelfContact
+from ssilk_core.physics.self_contact import ClothContacts, SelfContact, TouchingCloth
 from ssilk_core.physics.self_contact.neighbours import near_pairs
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
@@ -51,7 +51,7 @@ def layers(scene) -> tuple[Scene, SelfContact]:
     sheet = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]])
     points = np.concatenate([sheet, sheet + [0.0, 0.3, 0.0]])
     worn = dressed(scene, points, np.array([[0, 1, 2], [3, 4, 5]]), np.zeros(6, dtype=bool))
-    return worn, SelfContact(worn, FABRIC, CPU, torch.float64)
+    return worn, SelfContact(TouchingCloth.of(worn, FABRIC), CPU, torch.float64)
 
 
 def stacked(height: float) -> torch.Tensor:
@@ -150,7 +150,7 @@ def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
 def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
     worn, _ = layers
     held = dressed(worn, worn.garment.mesh.points, worn.garment.mesh.faces, np.ones(6, dtype=bool))
-    contact = SelfContact(held, FABRIC, CPU, torch.float64)
+    contact = SelfContact(TouchingCloth.of(held, FABRIC), CPU, torch.float64)
     x = stacked(0.003)
     assert not len(contact.contacts(x, contact.neighbours(x, x)).frame)
 
@@ -165,7 +165,11 @@ def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np
         folded = points.copy()
         folded[:, 1], folded[:, 2] = -0.008 * (1 + 0.1 * n) * rows, np.where(rows % 2, 0.049, 0.0)
         found.append(folded)
-    return SelfContact(worn, FABRIC, CPU, torch.float64), torch.as_tensor(np.stack(found, axis=-1)), faces
+    return (
+        SelfContact(TouchingCloth.of(worn, FABRIC), CPU, torch.float64),
+        torch.as_tensor(np.stack(found, axis=-1)),
+        faces,
+    )
 
 
 def test_no_step_passes_through_folds(scene, toy_grid):
