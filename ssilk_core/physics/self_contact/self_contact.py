@@ -155,13 +155,22 @@ class PairKind:
     first_stiffness: Tensor | None
     second_stiffness: Tensor | None
 
-    def near(self, at: Tensor, reach: float) -> KnownPairs:
-        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0."""
+    def near(self, at: Tensor, reach: float, garment: Tensor | None = None) -> KnownPairs:
+        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0.
+
+        Args:
+            garment: of each vertex, where only those of two garments are pairs, shape (V,).
+        """
         middles = at[self.first].mean(1), at[self.second].mean(1)
-        frame, first, second = near_pairs(middles[0], self.first_reach + reach, middles[1], self.second_reach)
+        frame, first, second = near_pairs(
+            middles[0],
+            self.first_reach + reach,
+            middles[1],
+            self.second_reach,
+            groups=None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]]),
+            ascending=self.first is self.second,
+        )
         apart = (self.first[first][:, :, None] != self.second[second][:, None]).flatten(1).all(1)
-        if self.first is self.second:
-            apart &= first < second
         none = at.new_zeros(len(frame))
         return KnownPairs(frame, first, second, none, none).kept(apart)
 
@@ -282,7 +291,7 @@ class SelfContact:
 
     def _sided(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
         """Return the pairs of a kind that `neighbours` tells of."""
-        pairs = kind.near(at, self.reach)
+        pairs = kind.near(at, self.reach, None if self._own else self._garment)
         pairs = pairs.kept(self._can_touch(kind, pairs))
         pairs = pairs.kept(kind.at(at, pairs).distance < self.reach)
         most = _mean(kind.first_start, kind.second_start, pairs)
@@ -302,7 +311,7 @@ class SelfContact:
         beside = other & ~loose & ~self._pinned[vertices].all(0)
         rows = beside.nonzero()[:, 0]
         beside[rows] = kind.at(self.rest, pairs.kept(rows)).distance < self.reach
-        return (loose & other if not self._own else loose) | beside
+        return loose | beside  # of one garment alone, none is known where it may not touch itself
 
 
 def _mean(first: Tensor, second: Tensor, pairs: KnownPairs) -> Tensor:

@@ -15,6 +15,7 @@ so that the gradient vanishes at minima there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -245,6 +246,15 @@ class IncrementalPotential:
         if neighbours is None:
             return rubbing
         return Friction.joined(rubbing, Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+
+    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
+        """Return for each frame the start (V, 3, N) with the least energy."""
+        energies = [self.energy(x, inputs, self.body_distance(x, inputs)) for x in starts]
+        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
+        best = starts[0]
+        for number, start in enumerate(starts[1:], start=1):
+            best = torch.where(chosen == number, start, best)
+        return best
 
     def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""

@@ -186,6 +186,12 @@ class OutfitPotential(IncrementalPotential):
             found.append(Friction.of_contacts(contacts, x, self._friction, dt))
         return Friction.joined(*found)
 
+    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
+        """Return for each frame, and each garment by itself, the start (V, 3, N) with the least energy."""
+        return torch.cat(
+            [part.best_start([x[rows] for x in starts], own) for part, rows, own, _ in self._split(inputs)]
+        )
+
     def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""
         if body_distance is None:

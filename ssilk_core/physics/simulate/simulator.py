@@ -433,7 +433,7 @@ class Simulator:
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
-        start = self.best_start(self.starts(poses, past, inputs), inputs)
+        start = self.potential.best_start(self.starts(poses, past, inputs), inputs)
         x, inputs = self._carried(past.local, start, inputs, past.neighbours)
         return self.solve(self.apply_pins(x, poses), inputs)
 
@@ -450,16 +450,6 @@ class Simulator:
         """Return positions (V, 3, N) with all vertices but the free ones set to linear blend skinning."""
         free = self.potential.free
         return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
-
-    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
-        """Return for each frame the start with the least energy."""
-        potential = self.potential
-        energies = [potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in starts]
-        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
-        best = starts[0]
-        for number, start in enumerate(starts[1:], start=1):
-            best = torch.where(chosen == number, start, best)
-        return best
 
 
 def _surrounded(

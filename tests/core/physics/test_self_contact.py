@@ -61,13 +61,20 @@ def stacked(height: float) -> torch.Tensor:
     return frames(np.concatenate([first, second]))
 
 
-def test_near_pairs_are_those_of_all_distances():
+@pytest.mark.parametrize("compiled", [True, False])
+def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr("ssilk_core.physics.loops.available", lambda device: False)
     points, others = random(40, 3, 3), random(60, 3, 3, seed=1)
     reach, other_reach = 0.2 * random(40, seed=2), 0.2 * random(60, seed=3)
     far = (points[:, None] - others[None]).square().sum(2).sqrt()
     expected = (far <= (reach[:, None] + other_reach)[..., None]).permute(2, 0, 1).nonzero().T
     assert len(expected[0]) > 50
     assert torch.equal(near_pairs(points, reach, others, other_reach), expected)
+    groups = torch.arange(40) % 3, torch.arange(60) % 3
+    kept = expected[:, (groups[0][expected[1]] != groups[1][expected[2]]) & (expected[1] < expected[2])]
+    found = near_pairs(points, reach, others, other_reach, groups=groups, ascending=True)
+    assert 10 < len(kept[0]) < len(expected[0]) and torch.equal(found, kept)
 
 
 @pytest.mark.parametrize("shape", [over_faces, between_edges])
