@@ -77,6 +77,33 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     assert not any("trained over" in text for text in told(together))
 
 
+def test_the_stage_of_a_shot_says_how_its_garments_lie_while_their_layers_are_as_counted(copy, capsys):
+    stage = Path("layers/shots/walk/shot.usda")
+    baked(capsys, "skirt.safetensors coat.safetensors", "layers")
+    pair = read_provenance(stage)["layers"]["coat"]["skirt"]
+    layers = [sha256(Path("layers/shots/walk", name, "anim.usdc")) for name in ("coat", "skirt")]
+    assert pair["counted_in"].split() == layers and pair["frames"] == 3
+    capsys.readouterr()
+    assert main(shlex.split("report layers/shots/walk/shot.usda -o page.html --json")) == 0
+    page = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["garments"]
+    (told,) = page["layers"]["coat"]
+    assert told == {name: value for name, value in pair.items() if name != "counted_in"}
+    assert main(shlex.split("verify layers/shots/walk/shot.usda --json")) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert any(event["event"] == "result" and event["detail"].get("over") == "skirt" for event in events)
+    assert not any("something else" in event.get("text", "") for event in events)
+    before = stage.read_text()
+    stage.write_text(before.replace(f"double mean = {pair['mean']:g}", "double mean = 0.123"))
+    assert stage.read_text() != before
+    assert main(shlex.split("verify layers/shots/walk/shot.usda")) == 0
+    assert "it says something else of coat over skirt" in capsys.readouterr().err
+    stage.write_text(before)
+    baked(capsys, "tights.safetensors", "layers")  # another garment of the shot leaves the pair as it is
+    assert read_provenance(stage)["layers"]["coat"]["skirt"] == pair
+    assert main(shlex.split("remove layers walk/skirt")) == 0
+    assert "skirt" not in read_provenance(stage)["layers"].get("coat", {})
+
+
 LIST = """
 [defaults]
 stage = "rigged.usda"

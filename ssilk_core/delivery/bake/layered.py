@@ -15,7 +15,8 @@ from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
 from ...scene.assets import Floats
 from .record import TaskRecord
-from .shots import finished
+from .shots import STAGE, finished, write_shot_stage
+from .stated_layers import layer_facts, stated_layers
 from .task import BakeTask
 
 if TYPE_CHECKING:
@@ -55,12 +56,12 @@ def over_others(name: str, models: Mapping[str, tuple[str, Mapping[str, str]]]) 
 
 
 def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -> list[LayerFigures]:
-    """Count how garments of a shot that one character wears lie over one another, and report it.
+    """Count how garments of a shot that one character wears lie over one another; the stage says it, and a report.
 
     Of two, the outer is the one that was trained over the other; else the one that covers more of it.
 
     Args:
-        verb: the work whose result this is.
+        verb: the work whose result this is. "verify" writes nothing, and warns where the stage says otherwise.
 
     Returns:
         The figures of each pair that could touch: one covers some of the other, or crosses it. None without libigl,
@@ -79,6 +80,16 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
     for each in touching:
         named = {"shot": shot, "garment": each.outer, "over": each.inner}
         report(Result(verb, {**named, **each.summary("time code")}))
+    stage = folder / "shots" / shot / STAGE
+    if verb != "verify":
+        if stage.is_file():
+            write_shot_stage(folder, shot, facts=layer_facts(touching, found))
+        return touching
+    said = {(each.outer, each.inner): each.to_metadata() for each in stated_layers(stage, found)}
+    for each in touching:
+        if said.get((each.outer, each.inner), each.to_metadata()) != each.to_metadata():
+            text = f"{stage}: it says something else of {each.outer} over {each.inner} than was counted in its layers"
+            report(Message(f"{text}; bake one of the two again", "warning"))
     return touching
 
 
