@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import fail
 from ..events import Message, Reporter
-from ..physics.simulate.outfit import WornGarment
+from ..physics.simulate import WornGarment
 from ..training.wardrobe.listing import WardrobeEntry, read_list
 from . import options as shared
 

@@ -271,6 +271,56 @@ def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file
     assert not any(len(intersections_between(x, faces, y, faces)) for x, y in zip(points["coat"], points["skirt"]))
 
 
+def test_a_damaged_record_of_inner_cloth_is_told_by_an_outer_certificate(toy, copy, capsys):
+    both = "skirt.safetensors coat.safetensors"
+    baked(capsys, f"{both} --certify", "certified")
+    record = Path("certified/shots/walk/skirt/bake.json")
+    whole = record.read_text()
+    record.write_text(whole[:-20])
+    Path("certified/shots/walk/coat/bake.json").unlink()
+    events = baked(capsys, "coat.safetensors --certify", "certified")
+    (text,) = [text for text in told(events) if "is certified without" in text]
+    assert "walk/coat: certified/shots/walk/skirt/bake.json is damaged" in text
+    assert "over" not in read_provenance("certified/shots/walk/coat/anim.usdc")["certificate"]
+    record.write_text(whole)
+    events = baked(capsys, "coat.safetensors --certify", "certified")  # it is not current any more
+    assert not any("is certified without" in text for text in told(events))
+    assert "over" in read_provenance("certified/shots/walk/coat/anim.usdc")["certificate"]
+
+
+def test_a_farm_certifies_an_outer_garment_over_the_inner_one_of_its_job(toy, copy, capsys):
+    farm = "farm coat.safetensors skirt.safetensors --stage rigged.usda --motion walk.usda --certify -o layers"
+    assert main(shlex.split(f"{farm} --bundle job")) == 0
+    tasks = json.loads(Path("job/job.json").read_text())["tasks"]
+    assert [(task["garment"], task.get("over")) for task in tasks] == [("skirt", None), ("coat", ["skirt"])]
+    steps = json.loads(Path("job/template.json").read_text())["steps"]
+    after = [(step["name"], [each["dependsOn"] for each in step.get("dependencies", [])]) for step in steps]
+    assert after == [("Bake", []), ("BakeOver", ["Bake"]), ("Check", ["BakeOver"])]
+    ranges = [step["parameterSpace"]["taskParameterDefinitions"][0]["range"] for step in steps[:2]]
+    assert ranges == ["0-0", "1-1"]
+    capsys.readouterr()
+    assert main(shlex.split("task job/job.json -o layers --tasks 1")) == 4  # nothing lies beneath it yet
+    assert "walk/coat: skirt beneath it is not finished in this shot" in capsys.readouterr().err
+    for number in (0, 1):
+        assert main(shlex.split(f"task job/job.json -o layers --tasks {number}")) == 0
+    certificate = read_provenance("layers/shots/walk/coat/anim.usdc")["certificate"]
+    assert certificate["over"] == {"skirt": "../skirt/anim.usdc"}
+    assert main(shlex.split("task job/job.json -o layers --check")) == 0
+    assert "skirt" in read_provenance("layers/shots/walk/shot.usda")["layers"]["coat"]
+    written = Path("layers/shots/walk/coat/anim.usdc").stat().st_mtime_ns
+    assert main(shlex.split("task job/job.json -o layers")) == 0
+    assert Path("layers/shots/walk/coat/anim.usdc").stat().st_mtime_ns == written
+    # What lies beneath was certified otherwise: the outer garment is not what its record says any more.
+    assert main(shlex.split("bake skirt.safetensors --stage rigged.usda --motion walk.usda -o layers --replace")) == 0
+    capsys.readouterr()
+    assert main(shlex.split("task job/job.json -o layers --check")) == 3
+    assert main(shlex.split("task job/job.json -o layers")) == 0
+    assert main(shlex.split("task job/job.json -o layers --check")) == 0
+    capsys.readouterr()
+    assert main(shlex.split(f"{farm.replace('skirt.safetensors', '')} --bundle alone")) == 0
+    assert "walk/coat: it was trained over skirt; the job has none of these" in capsys.readouterr().err
+
+
 def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):
     """Nor is any written then: the copy of the coat would be the file of the skirt, which is the inner one."""
     write_outfit(toy)
