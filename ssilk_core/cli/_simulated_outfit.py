@@ -85,7 +85,10 @@ def garments_of(every: Mapping[str, argparse.Namespace], report: Reporter) -> li
         scene = shared.load_scene(options, report)
         fabric = shared.fabric(options, scene.garment, report)
         over = getattr(options, "over", ())
-        inner = [each for each in found if each.name in over]
+        names = set(over)
+        for each in reversed(found):  # and what these are worn over
+            names |= set(each.over) if each.name in names else set()
+        inner = [each for each in found if each.name in names]
         worn = _over(name, WornGarment(scene, fabric), inner, report) if inner else WornGarment(scene, fabric)
         found.append(SimulatedGarment(name, options, worn, tuple(over)))
     return found

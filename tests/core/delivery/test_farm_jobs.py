@@ -290,7 +290,6 @@ def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over()
     assert task_key(tasks[1], CONTENTS) == task_key(replace(tasks[1], over=()), CONTENTS)
 
 
-
 @pytest.mark.parametrize("name", ["memory", "timeout"])
 def test_hosts_and_chunks_need_something(name):
     with pytest.raises(SsilkError, match=f"--{name}: 0; a positive number is needed"):

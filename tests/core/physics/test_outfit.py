@@ -11,6 +11,7 @@ import torch
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.intersections.pairs import intersections_between
+from ssilk_core.physics.self_contact import SelfContact
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, WornGarment
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
@@ -286,6 +287,18 @@ def test_garments_that_are_far_apart_move_as_alone(scene, toy_motion, toy_grid):
     alone = [steps(Simulator(each, own, options)) for each, own in ((inner, HEAVY), (moved, LIGHT))]
     assert np.abs(np.diff(together, axis=0)).max() > 1e-3
     np.testing.assert_allclose(together, np.concatenate(alone, axis=1), rtol=0, atol=1e-6)
+
+
+def test_a_garment_alone_never_looks_for_others(scene, toy_motion, toy_grid, monkeypatch):
+    inner, outer, motion = swept(scene, toy_motion, toy_grid)
+    asked = []
+    monkeypatch.setattr(SelfContact, "neighbours", lambda *given: asked.append(given))
+    alone = Simulator(inner, HEAVY)
+    assert len(list(alone.frames([motion.clip(0, 2)]))) == 2
+    assert not asked and type(alone.potential) is IncrementalPotential
+    with pytest.raises(AttributeError):  # an outfit asks
+        list(Simulator(inner, HEAVY, over=[WornGarment(outer, LIGHT)]).frames([motion.clip(0, 2)]))
+    assert asked
 
 
 def test_tight_cloth_touches_the_tight_cloth_of_another_garment_that_it_lies_on(scene, toy_grid):
