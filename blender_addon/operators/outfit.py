@@ -207,11 +207,11 @@ class BakeOutfit(OutfitOperator, bpy.types.Operator):
 
 
 class HideCoveredByOutfit(OutfitOperator, bpy.types.Operator):
-    """Hide faces of the body that any garment of the character covers in every frame, a last resort"""
+    """Hide faces of the body, and of inner garments, that a garment covers in every frame, a last resort"""
 
     bl_idname = "ssilk.hide_covered_outfit"
-    bl_label = "Hide Skin Under Outfit"
-    what = "Looking for covered skin"
+    bl_label = "Hide Covered by Outfit"
+    what = "Looking for what is covered"
 
     def chosen(self, garments: Sequence[bpy.types.Object]) -> list[bpy.types.Object]:
         return list(garments)

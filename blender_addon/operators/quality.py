@@ -215,7 +215,7 @@ def remove_key() -> None:
 
 
 class HideCoveredSkin(MeasuringOperator, bpy.types.Operator):
-    """Hide faces of the body that the garment covers in every frame, a last resort where skin shows"""
+    """Hide faces of the body, and of garments beneath, that the garment covers in every frame, a last resort"""
 
     bl_idname = "ssilk.hide_covered"
     bl_label = "Hide Covered Skin"
@@ -238,14 +238,15 @@ class HideCoveredSkin(MeasuringOperator, bpy.types.Operator):
                 scene.frame_set(before)
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
-        hidden, total = self.search.hide(found_again(self.garment, self.called))
-        if not hidden:
+        hidden, total, cloth = self.search.hide(found_again(self.garment, self.called))
+        inner = f", and {cloth} of garments beneath" if cloth else ""
+        if not hidden and not cloth:
             return f"'{self.called}' covers no face of the body in every frame; nothing is hidden."
-        return f"{hidden} of {total} faces of the body are hidden under '{self.called}'."
+        return f"{hidden} of {total} faces of the body{inner} are hidden under '{self.called}'."
 
 
 class ShowCoveredSkin(QualityOperator, bpy.types.Operator):
-    """Show the skin under the garment again"""
+    """Show the skin under the garment again, and cloth beneath it"""
 
     bl_idname = "ssilk.show_covered"
     bl_label = "Show Covered Skin"

@@ -148,7 +148,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     certify: BoolProperty(
         name="Certify",
         description="Move baked frames as little as it takes until the garment does not pass through itself and no "
-        "skin shows that it covers; a wrong frame takes seconds",
+        "skin shows that it covers; other garments of an outfit are not looked at. A wrong frame takes seconds",
         override=SHOTS,
     )
     bones: CollectionProperty(

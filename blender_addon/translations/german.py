@@ -31,10 +31,10 @@ WORDS = {
     "Bake all garments of the character over the scene's frames, as bones and shape keys": (
         "Alle Kleidungsstücke der Figur über die Bilder der Szene backen, als Knochen und Formschlüssel"
     ),
-    "Hide Skin Under Outfit": "Haut unter allen verbergen",
-    "Hide faces of the body that any garment of the character covers in every frame, a last resort": (
-        "Flächen des Körpers verbergen, die irgendein Kleidungsstück der Figur in jedem Bild bedeckt, als letzter "
-        "Ausweg"
+    "Hide Covered by Outfit": "Unter allen verbergen",
+    "Hide faces of the body, and of inner garments, that a garment covers in every frame, a last resort": (
+        "Flächen des Körpers und innerer Kleidungsstücke verbergen, die ein Kleidungsstück in jedem Bild bedeckt, "
+        "als letzter Ausweg"
     ),
     "Take no further garment; what was done stays": (
         "Kein weiteres Kleidungsstück mehr nehmen; was getan ist, bleibt"
@@ -369,9 +369,10 @@ WORDS = {
     ),
     "Certify": "Zertifizieren",
     "Move baked frames as little as it takes until the garment does not pass through itself and no skin shows that "
-    "it covers; a wrong frame takes seconds": (
+    "it covers; other garments of an outfit are not looked at. A wrong frame takes seconds": (
         "Gebackene Bilder so wenig wie nötig bewegen, bis das Kleidungsstück sich nicht mehr durchdringt und keine "
-        "Haut durchscheint, die es bedeckt; ein falsches Bild dauert Sekunden"
+        "Haut durchscheint, die es bedeckt; andere Kleidungsstücke der Figur werden nicht betrachtet. Ein falsches "
+        "Bild dauert Sekunden"
     ),
     "Tightness": "Enge",
     "How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, once classes "
@@ -468,12 +469,14 @@ WORDS = {
         "Gebackene oder live gespielte Schlüsselbilder und Formschlüssel entfernen, eigene Gewichte zurückgeben"
     ),
     "Hide Covered Skin": "Verdeckte Haut ausblenden",
-    "Hide faces of the body that the garment covers in every frame, a last resort where skin shows": (
-        "Flächen des Körpers ausblenden, die das Kleidungsstück in jedem Bild bedeckt, als letztes Mittel gegen "
-        "sichtbare Haut"
+    "Hide faces of the body, and of garments beneath, that the garment covers in every frame, a last resort": (
+        "Flächen des Körpers und der Kleidungsstücke darunter ausblenden, die das Kleidungsstück in jedem Bild "
+        "bedeckt, als letztes Mittel"
     ),
     "Show Covered Skin": "Verdeckte Haut zeigen",
-    "Show the skin under the garment again": "Die Haut unter dem Kleidungsstück wieder zeigen",
+    "Show the skin under the garment again, and cloth beneath it": (
+        "Haut und Stoff unter dem Kleidungsstück wieder zeigen"
+    ),
     "Live Playback": "Live-Wiedergabe",
     "What is played live": "Was live gespielt wird",
     "Network": "Netzwerk",

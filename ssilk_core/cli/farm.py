@@ -2,7 +2,8 @@
 """Bake many shots on a farm: write a bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
-task is one garment in one shot, on one body. Running a job again, anywhere, leaves finished tasks alone. With
+task is one garment in one shot, on one body; with --certify outer garments come after those that they were trained
+over, and are certified over these. Running a job again, anywhere, leaves finished tasks alone. With
 --device cuda each host needs a GPU. Both commands take the size of chunks as the job's parameters:
 -p ChunkSize=20 -p ChunkSeconds=600.
 """
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..delivery.bake import BakeTask, LayerFolder, plan_layers
-from ..delivery.bake.layered import tell_layers
+from ..delivery.bake.layered import certified_over, in_levels, tell_layers
 from ..delivery.farm.job import FarmJob, submitted
 from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
@@ -54,6 +55,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if not (options.bundle or options.output):
         fail("--cluster", "no folder for the layers", "-o names one")
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
+    if options.certify:
+        tasks = [task for level in in_levels(certified_over(tasks, report)) for task in level]
     if options.output:
         LayerFolder(options.output).need_names(tasks, complete=not options.bundle)
     job = submitted(tasks, report)
@@ -87,11 +90,12 @@ def _run(tasks: Sequence[BakeTask], options: argparse.Namespace, report: Reporte
     report(Started("farm", len(tasks), {"output": str(options.output)}))
     ended: list[TaskOutcome] = []
     told = Countdown(len(tasks), report)
-    for outcome in run_on_cluster(tasks, options.output, bake_here, address=options.cluster or None):
-        ended.append(outcome)
-        if outcome.error:
-            report(GarmentEvent(outcome.task.name, Failed(outcome.error)))
-        told()
+    for level in in_levels(tasks):
+        for outcome in run_on_cluster(level, options.output, bake_here, address=options.cluster or None):
+            ended.append(outcome)
+            if outcome.error:
+                report(GarmentEvent(outcome.task.name, Failed(outcome.error)))
+            told()
     layers = LayerFolder(options.output)
     layers.remove_unfinished(tasks)
     layers.write_stages([outcome.task for outcome in ended if outcome.result], report)

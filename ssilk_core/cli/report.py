@@ -117,6 +117,7 @@ def _shot(
     from ssilk_usd.writing.body_faces import open_with_full_bodies
 
     from ..delivery.bake.met import props_of
+    from ..delivery.bake.outfit import stated_over
     from ..delivery.bake.stated import stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
@@ -138,7 +139,7 @@ def _shot(
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
     sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
     props = props or props_of(path, report)
-    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props)
+    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props, over=stated_over(path))
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     if isinstance(certificate := said.get("certificate"), Mapping):
         sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a garment over motions without a network: slow and accurate, the reference for models.
+"""Simulate a garment, or an outfit, over motions without a network: slow and accurate, the reference for models.
 
 Every frame minimises, over all vertices, the energy that networks are trained with. The result is a shot with the
 garment on joints and blendshapes of the shot's own, within 1 mm (RMS) and 5 mm (any vertex) of the simulated points,
@@ -7,6 +7,10 @@ beside the moving body. --points writes the points themselves, as references are
 Several motions advance together, each into a file of its own in a folder: a GPU takes about as long for many as for
 one. --range starts at rest in its first frame. Each file appears when its shot is finished. The same command, given
 again after an interruption, simulates only what is missing; delete a file to simulate it again.
+
+A list as 'ssilk wardrobe' takes it (.toml) in place of the stage is simulated as an outfit: its garments move
+together, and push each other with equal forces. Outer garments start settled off those that 'over' names. Each
+garment of each shot gets a file of its own, FOLDER/SHOT/GARMENT.usdc.
 """
 
 from __future__ import annotations
@@ -46,17 +50,19 @@ if TYPE_CHECKING:
     from ..physics.skin.figures import ShownSkin
     from ..physics.world.sunk import SunkCloth
     from ..scene.assets import Floats, Motion, Scene, ShotWorld
+    from ._simulated_outfit import SimulatedGarment
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    shared.add_scene(verb)
+    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=shared.STAGE + ", or a list of garments (.toml)")
+    shared.add_garment(verb)
     verb.add_argument(
         "--motion", type=Path, nargs="+", required=True, metavar="SHOT[:/PRIM]", help="USD files with motions"
     )
     verb.add_argument(
         "-o", "--output", type=Path, required=True,
-        help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions",
+        help="shot to write (.usdc, .usd or .usda), or a folder where there are several motions, or garments",
     )  # fmt: skip
     verb.add_argument("--shot-name", metavar="PATTERN",
                       help="name of each file in a folder, such as '{parent}_{stem}' (default: the motion file's, "
@@ -72,7 +78,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--iterations", type=shared.NumberRange(1, 10**6, int), default=100, metavar="N",
                       help="most iterations of the solver in each frame, or part of one (default 100)")  # fmt: skip
     verb.add_argument("--self-contact", action="store_true",
-                      help="keep loose cloth from passing through the garment; takes longer")  # fmt: skip
+                      help="keep loose cloth from passing through its own garment; takes longer")  # fmt: skip
     verb.add_argument(
         "--batch",
         type=shared.NumberRange(1, 10**6, int),
@@ -96,16 +102,22 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..devices import select_device
     from ..physics.simulate import SimulationOptions
     from ..physics.simulate.newton import SolverOptions
+    from ._simulated_outfit import garments_of, outfit_options
 
     frames = parse_range(options.range or "all")
     asked = asked_world(options.collider, options.wind, options.gusts, options.gravity)
-    outputs = _outputs(options.output, list(map(str, options.motion)), options.shot_name)
-    for output in outputs:
-        shared.check_output(output, options.stage, *motion_files(options.motion))
+    is_list = options.stage.suffix == shared.LIST
+    every = outfit_options(options) if is_list else {"": options}
+    outputs = {
+        name: _outputs(options.output, list(map(str, options.motion)), options.shot_name, name) for name in every
+    }
+    stage, worn = next(iter(every.values())).stage, [shared.wardrobe(own)[0] for own in every.values()]
+    for output in (output for each in outputs.values() for output in each):
+        shared.check_output(output, stage, *worn, *motion_files(options.motion))
     device = select_device(options.device)
-    shared.asked_fabric(options)
-    scene = shared.load_scene(options, report)
-    fabric = shared.fabric(options, scene.garment, report)
+    for own in every.values():
+        shared.asked_fabric(own)
+    garments = garments_of(every, report)
     settings = SimulationOptions(
         fps=options.fps,
         batch=options.batch,
@@ -114,20 +126,27 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         solver=SolverOptions(tolerance=options.tolerance, iterations=options.iterations),
         quasi_static_solver=SolverOptions(tolerance=options.tolerance, iterations=150),
     )
-    read = [read_in_range(str(path), scene.character.skeleton, frames) for path in options.motion]
-    shared.tell_shapes(options, read, report)
-    motions = [shared.with_shapes(options, each, path, scene.character) for each, path in zip(read, options.motion)]
+    character, first = garments[0].worn.scene.character, garments[0].options
+    read = [read_in_range(str(path), character.skeleton, frames) for path in options.motion]
+    shared.tell_shapes(first, read, report)
+    motions = [shared.with_shapes(first, each, path, character) for each, path in zip(read, options.motion)]
     for motion in motions:
-        if moved := reshaped(scene.character, motion):
+        if moved := reshaped(character, motion):
             report(Message(f"{motion.path}: {'; '.join(map(str, moved))}; cloth meets it so, and it is written so"))
+    together = _together(garments)
     shots = [
-        _Shot(output, motion, _provenance(options, path, fabric), str(path), asked)
-        for output, motion, path in zip(outputs, motions, options.motion)
+        [
+            _Shot(output, motion, {**_provenance(each.options, path, each.worn.fabric), **together}, str(path), asked)
+            for output, motion, path in zip(outputs[each.name], motions, options.motion)
+        ]
+        for each in garments
     ]
-    missing = [shot for shot in shots if outputs == [options.output] or not shot.is_done]
-    found = _written(options, missing, scene, fabric, settings, device, report) if missing else {}
-    left = {"current": len(shots) - len(missing)} if len(missing) < len(shots) else {}
-    report(Result("simulate", {"shots": ", ".join(map(str, outputs)), **left, **found}))
+    named = not is_list and outputs[""] == [options.output]
+    rows = [row for row in zip(*shots) if named or not all(shot.is_done for shot in row)]
+    found = _written(garments, [list(each) for each in zip(*rows)], settings, device, report) if rows else {}
+    left = {"current": len(motions) - len(rows)} if len(rows) < len(motions) else {}
+    files = ", ".join(str(output) for each in outputs.values() for output in each)
+    report(Result("simulate", {"shots": files, **left, **found}))
     return EXIT_OK
 
 
@@ -160,10 +179,16 @@ class _Shot:
         return found == self.provenance
 
 
-def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[Path]:
-    """Return the file that each motion's shot is written to."""
+def _outputs(output: Path, motions: Sequence[str], pattern: str | None, garment: str = "") -> list[Path]:
+    """Return the file that each motion's shot is written to.
+
+    Args:
+        garment: its name in an outfit; "" for a garment that is no part of a list.
+    """
     from ssilk_usd.opening.stage import LAYER_SUFFIXES
 
+    if output.suffix in LAYER_SUFFIXES and garment:
+        fail(str(output), "one file for a list of garments", "each is a file of its own", "name a folder")
     if output.suffix in LAYER_SUFFIXES:
         if len(motions) != 1:
             fail(
@@ -175,7 +200,7 @@ def _outputs(output: Path, motions: Sequence[str], pattern: str | None) -> list[
             fail("--motion", f"'{motion}' is named twice", "a shot is simulated once")
     names = [_name(motion, pattern) for motion in motions]
     naming.need_unique(zip(names, motions, strict=True), "--motion", "shot", "--shot-name")
-    return [output / f"{name}.usdc" for name in names]
+    return [output / name / f"{garment}.usdc" if garment else output / f"{name}.usdc" for name in names]
 
 
 def _name(motion: str, pattern: str | None) -> str:
@@ -184,35 +209,46 @@ def _name(motion: str, pattern: str | None) -> str:
 
 
 def _written(
-    options: argparse.Namespace,
-    shots: Sequence[_Shot],
-    scene: Scene,
-    fabric: Fabric,
+    garments: Sequence[SimulatedGarment],
+    shots: Sequence[Sequence[_Shot]],
     settings: SimulationOptions,
     device: torch.device,
     report: Reporter,
 ) -> dict[str, object]:
-    """Simulate into open files, frame by frame; return figures for people."""
+    """Simulate the shots of each garment into open files, frame by frame; return figures for people."""
     from ..physics.simulate import Simulator, shots_of
+    from ._simulated_outfit import OutfitCounter
 
-    simulator = Simulator(scene, fabric, settings, device=device, report=report)
-    motions = [shot.motion for shot in shots]
-    stage = str(options.stage)
-    around = [ShotSurroundings(shot.source, stage, scene, shot.motion, shot.asked) for shot in shots]
+    first, *others = (each.worn for each in garments)
+    simulator = Simulator(first.scene, first.fabric, settings, over=others, device=device, report=report)
+    motions = [shot.motion for shot in shots[0]]
+    stage = str(garments[0].options.stage)
+    around = [ShotSurroundings(shot.source, stage, first.scene, shot.motion, shot.asked) for shot in shots[0]]
     worlds = [each.read(report) for each in around]
-    played = shots_of(motions, scene.character.skeleton, settings)
+    played = shots_of(motions, first.scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
-    report(Started("simulate", total, {"outputs": [str(shot.output) for shot in shots]}))
+    report(Started("simulate", total, {"outputs": [str(shot.output) for own in shots for shot in own]}))
     figures, start = _Figures(settings.solver.tolerance), time.monotonic()
     with ExitStack() as stack:
-        caches = _Caches(stack, options, shots, scene, played, worlds, report)
+        caches = [
+            _Caches(stack, each.options, own, each.worn.scene, played, worlds, report)
+            for each, own in zip(garments, shots)
+        ]
+        counter = OutfitCounter(garments, [Path(split_location(shot.source)[0]).stem for shot in shots[0]])
         told = Countdown(total, report)
         for frame in simulator.frames(motions, worlds):
-            caches.write(frame.shot, frame.number, frame.points)
-            figures.add(frame)
+            rows = [rows for rows, _ in simulator.potential.garments]
+            points = [frame.points[own] for own in rows]
+            for cache, own in zip(caches, points):
+                cache.write(frame.shot, frame.number, own)
+            counter.add(frame.shot, frame.number, points)
             told()
-    fits = caches.figures()
-    return {**figures.of_all(total, time.monotonic() - start), **fits}
+    fits = {
+        f"{each.name}: {what}" if each.name else what: value
+        for each, cache in zip(garments, caches)
+        for what, value in cache.figures().items()
+    }
+    return {**figures.of_all(total, time.monotonic() - start), **fits, **counter.figures()}
 
 
 class _Caches:
@@ -398,6 +434,20 @@ def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> di
         **{name: getattr(options, name) for name in names},
         **{name: ", ".join(getattr(options, name)) for name in lists},
     }  # fmt: skip
+
+
+def _together(garments: Sequence[SimulatedGarment]) -> dict[str, str | float]:
+    """Return what decides how garments move together; nothing of one alone."""
+    from ..delivery.bake.inputs import stage_contents
+
+    if len(garments) == 1:
+        return {}
+    told = [
+        f"{each.name} {stage_contents(str(shared.wardrobe(each.options)[0])).digest} {each.worn.fabric} "
+        f"over {','.join(each.over)}"
+        for each in garments
+    ]
+    return {"outfit": "; ".join(told)}
 
 
 class _Figures:

@@ -24,11 +24,11 @@ from ..network.checkpoint import ModelFile, load_model, network
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel
 from ..physics.collision import Contacts, PosedBody, reachable_cloth
-from ..physics.collision.inner_cloth import DEEPEST, InnerCloth, Planes
+from ..physics.collision.inner_cloth import InnerCloth, Planes, loosened_over
 from ..physics.collision.samples import ContactSamples
 from ..physics.intersections.layers import ClothLayers, LayerCounts
 from ..physics.intersections.pairs import need_predicates
-from ..scene.assets import PINNED, TIGHT, Motion, Scene, Skeleton
+from ..scene.assets import PINNED, Motion, Scene, Skeleton
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .motion_bank import MotionBank, build_bank, roll_states
 from .obstacles import Near, ObstacleDrawer, Obstacles
@@ -76,30 +76,14 @@ class InnerModel:
 
 
 def loosened(scene: Scene, inner: Sequence[InnerModel]) -> Scene:
-    """Return the scene of an outer garment that is tight where it was pinned over cloth that moves.
-
-    Pinned cloth follows the body alone, and nothing moves it out of a hood or a sleeve that does not. It lies over a
-    garment where it is at most `DEEPEST` from it in the bind pose. Over cloth that is pinned itself it stays pinned.
+    """Return the scene of an outer garment that is tight where it was pinned over cloth that moves (`loosened_over`).
 
     Raises:
         SsilkError: libigl is missing.
     """
-    pinned = np.flatnonzero(scene.classes == PINNED)
-    if not len(pinned):
-        return scene
-    need_predicates()
-    import igl
-
-    classes = scene.classes.copy()
-    points = np.ascontiguousarray(scene.garment.mesh.points[pinned])
-    for each in inner:
-        garment = each.file.scene.garment
-        square, face, _ = igl.point_mesh_squared_distance(points, garment.mesh.points, garment.mesh.faces)
-        moves = (each.file.scene.classes[garment.mesh.faces] != PINNED).any(axis=1)
-        classes[pinned[(square < DEEPEST**2) & moves[face]]] = TIGHT
-    if np.array_equal(classes, scene.classes):
-        return scene
-    return replace(scene, garment=replace(scene.garment, classes=classes))
+    if (scene.classes == PINNED).any():
+        need_predicates()
+    return loosened_over(scene, [each.file.scene for each in inner])
 
 
 def need_wearable(inner: Sequence[InnerModel], scene: Scene, fps: float) -> None:

@@ -73,6 +73,39 @@ def test_skin_under_a_renamed_garment_is_found_again(bpy, skirt, pillar):
     assert shown_faces(bpy, pillar) == whole and not [key for key in pillar.keys() if "Under" in key]  # noqa: SIM118
 
 
+def test_inner_cloth_is_hidden_under_an_outer_garment_and_shown_again(bpy, skirt, pillar):
+    """Where the outer garment covers its outside, and the body its inside; training and baking read all of it."""
+    from blender_addon.scene.garment import put_in_order
+    from blender_addon.scene.gather import gather
+
+    tight = add_mesh(bpy, "Tights", *tube(24, 41, (0.5, 1.5), (0.16, 0.16)))
+    for name, low, high in zip(BONES, (0.0, *HEIGHTS[1:]), (*HEIGHTS[1:], 9.0)):
+        inside = [vertex.index for vertex in tight.data.vertices if low <= vertex.co.z < high]
+        tight.vertex_groups.new(name=name).add(inside, 1.0, "REPLACE")
+    tight.modifiers.new("Armature", "ARMATURE").object = bpy.data.objects["Rig"]
+    tight.ssilk.armature = skirt.ssilk.armature = bpy.data.objects["Rig"]
+    put_in_order([tight, skirt])
+    whole, faces = shown_faces(bpy, tight), len(tight.data.polygons)
+    activate(bpy, skirt)
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}
+    hidden = whole - shown_faces(bpy, tight)
+    heights = np.array(sorted(hidden))[:, 2]
+    assert len(hidden) > 20 and heights.min() > 0.92 and heights.max() < 1.27
+    assert len(tight.data.polygons) == faces and tight.modifiers[-1].name == NAME
+    assert len(gather(tight, classes=False, proxies=False).garment.mesh.polygon_counts) == faces
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}  # in place of what was hidden
+    assert whole - shown_faces(bpy, tight) == hidden and len(tight.modifiers) == 2
+    assert bpy.ops.ssilk.show_covered() == {"FINISHED"}
+    assert shown_faces(bpy, tight) == whole and len(tight.modifiers) == 1
+    tight.hide_set(True)
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}  # a hidden garment needs none
+    assert len(tight.modifiers) == 1
+    put_in_order([skirt, tight])
+    tight.hide_set(False)
+    assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}  # nothing beneath
+    assert len(tight.modifiers) == 1
+
+
 def test_hiding_is_one_step_to_undo(bpy, skirt, pillar):
     bpy.ops.ed.undo_push(message="before")
     assert bpy.ops.ssilk.hide_covered() == {"FINISHED"}

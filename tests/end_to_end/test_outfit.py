@@ -77,6 +77,33 @@ def test_what_lies_beneath_is_what_was_trained_over(copy, capsys):
     assert not any("trained over" in text for text in told(together))
 
 
+def test_the_stage_of_a_shot_says_how_its_garments_lie_while_their_layers_are_as_counted(copy, capsys):
+    stage = Path("layers/shots/walk/shot.usda")
+    baked(capsys, "skirt.safetensors coat.safetensors", "layers")
+    pair = read_provenance(stage)["layers"]["coat"]["skirt"]
+    layers = [sha256(Path("layers/shots/walk", name, "anim.usdc")) for name in ("coat", "skirt")]
+    assert pair["counted_in"].split() == layers and pair["frames"] == 3
+    capsys.readouterr()
+    assert main(shlex.split("report layers/shots/walk/shot.usda -o page.html --json")) == 0
+    page = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]["garments"]
+    (told,) = page["layers"]["coat"]
+    assert told == {name: value for name, value in pair.items() if name != "counted_in"}
+    assert main(shlex.split("verify layers/shots/walk/shot.usda --json")) == 0
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert any(event["event"] == "result" and event["detail"].get("over") == "skirt" for event in events)
+    assert not any("something else" in event.get("text", "") for event in events)
+    before = stage.read_text()
+    stage.write_text(before.replace(f"double mean = {pair['mean']:g}", "double mean = 0.123"))
+    assert stage.read_text() != before
+    assert main(shlex.split("verify layers/shots/walk/shot.usda")) == 0
+    assert "it says something else of coat over skirt" in capsys.readouterr().err
+    stage.write_text(before)
+    baked(capsys, "tights.safetensors", "layers")  # another garment of the shot leaves the pair as it is
+    assert read_provenance(stage)["layers"]["coat"]["skirt"] == pair
+    assert main(shlex.split("remove layers walk/skirt")) == 0
+    assert "skirt" not in read_provenance(stage)["layers"].get("coat", {})
+
+
 LIST = """
 [defaults]
 stage = "rigged.usda"
@@ -242,6 +269,56 @@ def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file
             points[name] = [np.float64(reader.skinned(mesh["name"], frame)) for frame in range(9)]
     faces = load_model("coat.safetensors").scene.garment.mesh.faces
     assert not any(len(intersections_between(x, faces, y, faces)) for x, y in zip(points["coat"], points["skirt"]))
+
+
+def test_a_damaged_record_of_inner_cloth_is_told_by_an_outer_certificate(toy, copy, capsys):
+    both = "skirt.safetensors coat.safetensors"
+    baked(capsys, f"{both} --certify", "certified")
+    record = Path("certified/shots/walk/skirt/bake.json")
+    whole = record.read_text()
+    record.write_text(whole[:-20])
+    Path("certified/shots/walk/coat/bake.json").unlink()
+    events = baked(capsys, "coat.safetensors --certify", "certified")
+    (text,) = [text for text in told(events) if "is certified without" in text]
+    assert "walk/coat: certified/shots/walk/skirt/bake.json is damaged" in text
+    assert "over" not in read_provenance("certified/shots/walk/coat/anim.usdc")["certificate"]
+    record.write_text(whole)
+    events = baked(capsys, "coat.safetensors --certify", "certified")  # it is not current any more
+    assert not any("is certified without" in text for text in told(events))
+    assert "over" in read_provenance("certified/shots/walk/coat/anim.usdc")["certificate"]
+
+
+def test_a_farm_certifies_an_outer_garment_over_the_inner_one_of_its_job(toy, copy, capsys):
+    farm = "farm coat.safetensors skirt.safetensors --stage rigged.usda --motion walk.usda --certify -o layers"
+    assert main(shlex.split(f"{farm} --bundle job")) == 0
+    tasks = json.loads(Path("job/job.json").read_text())["tasks"]
+    assert [(task["garment"], task.get("over")) for task in tasks] == [("skirt", None), ("coat", ["skirt"])]
+    steps = json.loads(Path("job/template.json").read_text())["steps"]
+    after = [(step["name"], [each["dependsOn"] for each in step.get("dependencies", [])]) for step in steps]
+    assert after == [("Bake", []), ("BakeOver", ["Bake"]), ("Check", ["BakeOver"])]
+    ranges = [step["parameterSpace"]["taskParameterDefinitions"][0]["range"] for step in steps[:2]]
+    assert ranges == ["0-0", "1-1"]
+    capsys.readouterr()
+    assert main(shlex.split("task job/job.json -o layers --tasks 1")) == 4  # nothing lies beneath it yet
+    assert "walk/coat: skirt beneath it is not finished in this shot" in capsys.readouterr().err
+    for number in (0, 1):
+        assert main(shlex.split(f"task job/job.json -o layers --tasks {number}")) == 0
+    certificate = read_provenance("layers/shots/walk/coat/anim.usdc")["certificate"]
+    assert certificate["over"] == {"skirt": "../skirt/anim.usdc"}
+    assert main(shlex.split("task job/job.json -o layers --check")) == 0
+    assert "skirt" in read_provenance("layers/shots/walk/shot.usda")["layers"]["coat"]
+    written = Path("layers/shots/walk/coat/anim.usdc").stat().st_mtime_ns
+    assert main(shlex.split("task job/job.json -o layers")) == 0
+    assert Path("layers/shots/walk/coat/anim.usdc").stat().st_mtime_ns == written
+    # What lies beneath was certified otherwise: the outer garment is not what its record says any more.
+    assert main(shlex.split("bake skirt.safetensors --stage rigged.usda --motion walk.usda -o layers --replace")) == 0
+    capsys.readouterr()
+    assert main(shlex.split("task job/job.json -o layers --check")) == 3
+    assert main(shlex.split("task job/job.json -o layers")) == 0
+    assert main(shlex.split("task job/job.json -o layers --check")) == 0
+    capsys.readouterr()
+    assert main(shlex.split(f"{farm.replace('skirt.safetensors', '')} --bundle alone")) == 0
+    assert "walk/coat: it was trained over skirt; the job has none of these" in capsys.readouterr().err
 
 
 def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +16,8 @@ from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
 from ...scene.assets import Floats
 from .record import TaskRecord
-from .shots import finished
+from .shots import STAGE, finished, write_shot_stage
+from .stated_layers import layer_facts, stated_layers
 from .task import BakeTask
 
 if TYPE_CHECKING:
@@ -55,12 +57,12 @@ def over_others(name: str, models: Mapping[str, tuple[str, Mapping[str, str]]]) 
 
 
 def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -> list[LayerFigures]:
-    """Count how garments of a shot that one character wears lie over one another, and report it.
+    """Count how garments of a shot that one character wears lie over one another; the stage says it, and a report.
 
     Of two, the outer is the one that was trained over the other; else the one that covers more of it.
 
     Args:
-        verb: the work whose result this is.
+        verb: the work whose result this is. "verify" writes nothing, and warns where the stage says otherwise.
 
     Returns:
         The figures of each pair that could touch: one covers some of the other, or crosses it. None without libigl,
@@ -79,6 +81,16 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
     for each in touching:
         named = {"shot": shot, "garment": each.outer, "over": each.inner}
         report(Result(verb, {**named, **each.summary("time code")}))
+    stage = folder / "shots" / shot / STAGE
+    if verb != "verify":
+        if stage.is_file():
+            write_shot_stage(folder, shot, facts=layer_facts(touching, found))
+        return touching
+    said = {(each.outer, each.inner): each.to_metadata() for each in stated_layers(stage, found)}
+    for each in touching:
+        if said.get((each.outer, each.inner), each.to_metadata()) != each.to_metadata():
+            text = f"{stage}: it says something else of {each.outer} over {each.inner} than was counted in its layers"
+            report(Message(f"{text}; bake one of the two again", "warning"))
     return touching
 
 
@@ -90,6 +102,51 @@ def inner_first(tasks: Sequence[BakeTask]) -> list[BakeTask]:
     """
     over = trained_over({task.request.model for task in tasks})
     return sorted(tasks, key=lambda task: depth(task.request.model, over))
+
+
+def certified_over(tasks: Sequence[BakeTask], report: Reporter) -> list[BakeTask]:
+    """Return tasks as `inner_first` does, each with those of its shot and character that it is certified over.
+
+    One whose model was trained over another one that is not among them is certified without that, with a warning.
+
+    Raises:
+        SsilkError: a model cannot be read.
+    """
+    over = trained_over({task.request.model for task in tasks})
+    digests = {model: load_model(Path(model)).provenance.get("over") or {} for model in over}
+    worn: dict[object, list[BakeTask]] = {}
+    for task in tasks:
+        worn.setdefault(_worn_in(task), []).append(task)
+    found = []
+    for task in inner_first(tasks):
+        model, names = str(task.request.model), tuple[str, ...]()
+        if task.request.certify:
+            together = [other for other in worn[_worn_in(task)] if not other.level_of]
+            names = tuple(other.garment for other in together if str(other.request.model) in over[model])
+            if len(names) < len(digests[model]):
+                text = f"it was trained over {', '.join(digests[model])}; the job has {', '.join(names) or 'none'}"
+                told = f"{task.name}: {text} of these in its shot, and certifies it over no others"
+                report(Message(told, "warning"))
+        found.append(replace(task, over=names))
+    return found
+
+
+def _worn_in(task: BakeTask) -> tuple[str | None, ...]:
+    """Return what garments of one character in one shot share."""
+    return task.shot, task.request.stage, task.request.motion, task.request.root
+
+
+def in_levels(tasks: Sequence[BakeTask]) -> list[list[BakeTask]]:
+    """Return tasks in groups, each of which is certified over garments of groups before it alone."""
+    left, levels = list(tasks), list[list[BakeTask]]()
+    while left:
+        waiting = {(task.shot, task.garment) for task in left}
+        blocked = [any((task.shot, name) in waiting for name in task.over) for task in left]
+        if all(blocked):  # a damaged job, whose tasks name each other: each fails with a sentence
+            return [*levels, left]
+        levels.append([task for task, waits in zip(left, blocked) if not waits])
+        left = [task for task, waits in zip(left, blocked) if waits]
+    return levels
 
 
 def trained_over(models: Iterable[str | Path]) -> dict[str, list[str]]:

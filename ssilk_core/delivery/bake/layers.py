@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ...errors import SsilkError
+from ...errors import SsilkError, fail
 from ...events import Message, Reporter, Result, Started, silent
 from ...files import FileHashes, remove_unfinished_in, replacing, sha256
 from ...scene.riders import RiderJoints
@@ -156,7 +156,13 @@ class LayerFolder:
         """Return the record of a task that is done, with an asset that says of itself what the task asks for."""
         if not (has_possible_names(task) and says(self.path, task) and self.layout(task).info.is_file()):
             return None
-        return current_record(self._home(task), task_key(task, contents), self._files.sha256)
+        record = current_record(self._home(task), task_key(task, contents), self._files.sha256)
+        met = {self._met_path(task, name) for name in task.over}
+        return record if record is not None and met <= record.files.keys() else None
+
+    def _met_path(self, task: BakeTask, garment: str) -> str:
+        """Return the layer of another garment of a task's shot, as the record of the task names it."""
+        return os.path.relpath(self.layout(replace(task, garment=garment)).animation, self._home(task))
 
     def need_names(self, tasks: Iterable[BakeTask], *, complete: bool = True) -> None:
         """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
@@ -186,18 +192,24 @@ class LayerFolder:
         is of what the inputs held while they were read.
 
         Args:
-            together: certify it over what it was trained over and lies finished in the shot; otherwise by itself, so
-                that it does not depend on which tasks are done.
+            together: certify it over what it was trained over and lies finished in the shot; otherwise over what the
+                task names alone, so that it does not depend on which tasks are done.
 
         Raises:
-            SsilkError: an input is missing or bad, or not what the task's job was submitted with, or a file cannot be
-                written.
+            SsilkError: an input is missing or bad, or not what the task's job was submitted with, a garment that it
+                is certified over is not finished, or a file cannot be written.
             VerificationError: the written layer is not what was computed; it is not kept.
         """
         need_possible_names(task)
         layout, home = self.layout(task), self._home(task)
         wanted = task.pinned or self.inputs.hashes(task.request)
-        beneath = self._beneath(task) if together and task.request.certify else {}
+        beneath = self._beneath(task, report) if task.request.certify and (together or task.over) else {}
+        if missing := [name for name in task.over if name not in beneath]:
+            found = f"{', '.join(missing)} beneath it is not finished in this shot"
+            allowed = "an outer garment is certified over inner ones as their files have them"
+            fail(f"{self.path}: {task.name}", found, allowed, "bake what lies beneath first, and this again")
+        if not together:
+            beneath = {name: path for name, path in beneath.items() if name in task.over}
         met = {os.path.relpath(path, home): sha256(path) for path in beneath.values()}
         if not again and (record := self._done(task, wanted)) and met.items() <= record.files.items():
             return replace(record.result, current=True)
@@ -226,16 +238,26 @@ class LayerFolder:
         write_record(home, record)
         return result
 
-    def _beneath(self, task: BakeTask) -> dict[str, Path]:
-        """Return the layers of garments that a task's was trained over, finished on the same character, by name."""
+    def _beneath(self, task: BakeTask, report: Reporter) -> dict[str, Path]:
+        """Return the layers of garments that a task's was trained over, finished on the same character, by name.
+
+        Where some of these are missing, and the record of a garment of the shot is damaged, it is warned of.
+        """
         over, request = self.garment(task).over_models.values(), task.request
         wearer = portable(request.motion, self.path), request.root
-        found = whole(finished(self.path, task.shot)) if over else {}
-        return {
+        there = finished(self.path, task.shot) if over else {}
+        found = {
             name: self.layout(replace(task, garment=name)).animation
-            for name, record in found.items()
+            for name, record in whole(there).items()
             if name != task.garment and record.wearer == wearer and record.inputs["model"].sha256 in over
         }
+        damaged = [name for name, record in there.items() if not record and name != task.garment]
+        if damaged and len(found) < len(set(over)):
+            records = ", ".join(str(self._home(replace(task, garment=name)) / RECORD) for name in damaged)
+            text = f"{records} is damaged, and nothing tells whether '{task.garment}' was trained over that garment"
+            todo = "it is certified without; bake what is damaged again with --replace, then this"
+            report(Message(f"{task.name}: {text}; {todo}", "warning"))
+        return found
 
     def _home(self, task: BakeTask) -> Path:
         """Return the folder of the files that a task alone writes."""

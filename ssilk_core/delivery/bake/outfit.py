@@ -29,6 +29,7 @@ from .origin import read_origin
 from .request import BakeRequest
 from .result import BakeResult, Verification
 from .shots import finished, is_stage, place_of
+from .stated_layers import stated_layers
 from .task import garment_name
 from .verification import verify
 from .write import bake
@@ -121,6 +122,15 @@ def verify_garments(
             proven[name] = verify(alone, device=device, report=_without_results(report), **origin.request.inputs)
             report(Result("verify", {"shot": str(shot), "garment": name, **proven[name].figures()}))
     return proven, []
+
+
+def stated_over(shot: Path) -> list[LayerFigures]:
+    """Return what the stage of a shot in layers says of how its garments lie over one another; none of other files.
+
+    Raises:
+        SsilkError: it cannot be read.
+    """
+    return stated_layers(shot, finished(*place_of(shot))) if shot.suffix != GLB and is_stage(shot) else []
 
 
 def holds_several(shot: Path) -> bool:

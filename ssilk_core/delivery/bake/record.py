@@ -66,7 +66,7 @@ def task_key(task: BakeTask, contents: InputHashes) -> str:
         contents: what the request's inputs hold.
     """
     options = asdict(task)
-    for name in ("pinned", "replace", *OF_ASSET):
+    for name in ("pinned", "replace", "over", *OF_ASSET):  # what it lies over is among the record's files
         del options[name]
     for name in INPUTS:
         del options["request"][name]

@@ -13,6 +13,7 @@ from ...errors import fail
 from ...events import Message, Reporter, silent
 from .names_used import forget_use
 from .record import RECORD, TaskRecord, read_record
+from .stated_layers import current_facts
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.layers import Layout
@@ -27,6 +28,7 @@ def write_shot_stage(
     *,
     needed: Container[str] = frozenset(),
     replaced: Collection[str] = (),
+    facts: Mapping[str, object] | None = None,
 ) -> None:
     """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read.
 
@@ -34,13 +36,15 @@ def write_shot_stage(
         needed: garments that have to be in it.
         replaced: garments whose motion may be another than that of the shot before; others of their characters that
             follow another motion are told.
+        facts: what the stage is to say, as `layer_facts` has it; what it says by default. What is not about the
+            layers that are there is left out.
 
     Raises:
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
             written.
     """
     from ssilk_usd.shots.layers import Layout
-    from ssilk_usd.shots.layers_stage import write_stage
+    from ssilk_usd.shots.layers_stage import stage_facts, write_stage
 
     # Several processes may finish at once. Each writes its record, then the stage from all records that it finds, and
     # does so again until it finds what it wrote the stage from. The last to rename its stage therefore sees every
@@ -51,9 +55,11 @@ def write_shot_stage(
         found = finished(folder, shot)
         layouts = {Layout(folder, name, shot): wearer for name, wearer in _wearers(found).items()}
         levels = {name: record.level_of for name, record in found.items() if record and record.level_of}
-        written = write_stage(layouts, needed, levels)
+        stage = Layout(folder, "", shot).stage
+        told = current_facts(stage_facts(stage) if facts is None else facts, found)
+        written = write_stage(layouts, needed, levels, told)
         if not layouts:
-            Layout(folder, "", shot).stage.unlink(missing_ok=True)
+            stage.unlink(missing_ok=True)
         if finished(folder, shot) == found:
             break
     for text in written.unreadable.values():

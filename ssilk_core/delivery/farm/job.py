@@ -119,7 +119,7 @@ def _json(path: Path, allowed: str) -> dict[str, Any]:
 
 def _checked(task: BakeTask) -> BakeTask:
     """Return a task; raise `TypeError` where its names would lead to files elsewhere."""
-    names = (task.garment, task.level_of or task.garment)
+    names = (task.garment, task.level_of or task.garment, *task.over)
     if not all(re.fullmatch(r"[A-Za-z_]\w*/[\w-]+", f"{name}/{task.shot}", flags=re.ASCII) for name in names):
         raise TypeError(f"{task.name!r} names no files")
     return task

@@ -15,6 +15,7 @@ from ...errors import fail
 from ...events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
 from ...files import replacing, split_location
 from ..bake import BakeTask
+from ..bake.layered import in_levels
 from .job import NAME, FarmJob, write_job
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
@@ -80,7 +81,7 @@ def template(tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any
         "name": "SSILK bake",
         "parameterDefinitions": _parameters(),
         "jobEnvironments": [_environment()],
-        "steps": [_bake_step(tasks, options), _check_step(options)],
+        "steps": _steps(tasks, options),
     }
 
 
@@ -107,25 +108,36 @@ def _environment() -> dict[str, Any]:
     }
 
 
-def _bake_step(tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any]:
+def _steps(tasks: Sequence[BakeTask], options: BundleOptions) -> list[dict[str, Any]]:
+    """Return the steps: outer garments are certified over inner ones, which are baked in a step before."""
+    steps, first = list[dict[str, Any]](), 0
+    for number, level in enumerate(in_levels(tasks)):
+        name = "BakeOver" + (str(number) if number > 1 else "") if number else "Bake"
+        step = _bake_step(name, range(first, first + len(level)), tasks, options)
+        steps.append({**step, "dependencies": [{"dependsOn": steps[-1]["name"]}]} if steps else step)
+        first += len(level)
+    return [*steps, _check_step(steps[-1]["name"], options)]
+
+
+def _bake_step(name: str, numbers: range, tasks: Sequence[BakeTask], options: BundleOptions) -> dict[str, Any]:
     chunks = {
         "defaultTaskCount": "{{Param.ChunkSize}}",
         "targetRuntimeSeconds": "{{Param.ChunkSeconds}}",
         "rangeConstraint": "CONTIGUOUS",
     }
-    shots = {"name": "Shots", "type": "CHUNK[INT]", "range": f"0-{len(tasks) - 1}", "chunks": chunks}
+    shots = {"name": "Shots", "type": "CHUNK[INT]", "range": f"{numbers[0]}-{numbers[-1]}", "chunks": chunks}
     return {
-        "name": "Bake",
+        "name": name,
         "parameterSpace": {"taskParameterDefinitions": [shots]},
         "hostRequirements": _host(tasks, options),
         "script": _script(options, "--tasks", "{{Task.Param.Shots}}"),
     }
 
 
-def _check_step(options: BundleOptions) -> dict[str, Any]:
+def _check_step(after: str, options: BundleOptions) -> dict[str, Any]:
     return {
         "name": "Check",
-        "dependencies": [{"dependsOn": "Bake"}],
+        "dependencies": [{"dependsOn": after}],
         "script": _script(options, "--check"),
     }
 

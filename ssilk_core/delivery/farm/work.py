@@ -11,6 +11,9 @@ from ...errors import SsilkError, VerificationError
 from ...events import Event, Failed, GarmentEvent, Message, Progress, Reporter, Result, Started
 from ..bake import BakeTask, LayerFolder
 from ..bake.inputs import InputFiles, InputHashes, need_pinned
+from ..bake.layered import tell_layers
+from ..bake.shots import STAGE, finished
+from ..bake.stated_layers import stated_layers
 from .job import FarmJob
 
 READERS = 16  # threads that read files for a check
@@ -44,7 +47,7 @@ def _part(report: Reporter, index: int, count: int) -> Reporter:
 
 
 def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
-    """Remove what killed workers left half written, and write the stage of each shot.
+    """Remove what killed workers left half written, and write the stage of each shot; count its garments over others.
 
     Raises:
         VerificationError: a task is not done, an input is not what the job was submitted with, files are not as they
@@ -72,6 +75,9 @@ def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
         )
     if fault:
         raise VerificationError(fault)
+    for shot in dict.fromkeys(task.shot for task in tasks):
+        if not stated_layers(folder / "shots" / shot / STAGE, finished(folder, shot)):
+            tell_layers(folder, shot, report, "check")
     report(Result("check", {"tasks": len(tasks), "output": str(folder)}))
 
 

@@ -10,6 +10,7 @@ from html import escape
 import numpy as np
 
 from ...events import Countdown, Message, Reporter, silent
+from ...physics.intersections.figures import LayerFigures
 from ...physics.world.sunk import SunkCloth
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
@@ -60,6 +61,7 @@ def shot_sections(
     *,
     sunk: Mapping[int, SunkCloth] | None = None,
     props: ShotProps | None = None,
+    over: Sequence[LayerFigures] = (),
 ) -> list[Section]:
     """Return the sections about a shot.
 
@@ -69,11 +71,12 @@ def shot_sections(
         bodies: the meshes that garments collide with, at rest, by their index in the player.
         sunk: what bakes counted inside colliders, of garments that had any, likewise.
         props: these colliders.
+        over: what bakes counted of garments over one another; counted here where there is none.
     """
     whole = joined(list(bodies.values()))
     meters = [TermsMeter(each.mesh, whole, each.fabric, player.fps, each.sewn) for each in garments]
     named = {each.index: (player.meshes[each.index].name, each.mesh) for each in garments}
-    layers = LayersMeter(named, whole)
+    layers = LayersMeter({} if over else named, whole)
     told = Countdown(len(player.frame_times), report)
     for time in player.frame_times:
         points = player.points(time)
@@ -87,8 +90,8 @@ def shot_sections(
         for each, meter in zip(garments, meters)
         for part in _sections(player, each, meter, (sunk or {}).get(each.index), props)
     ]
-    over = layers.figures("the shot")
-    between = [layers_section(over)] if over else []
+    pairs = over or layers.figures("the shot")
+    between = [layers_section(pairs)] if pairs else []
     return [first, Section("The shot", _playing(player, props, report), plays=True), *between, *others]
 
 

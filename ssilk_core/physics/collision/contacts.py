@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene.assets import PINNED, TIGHT, Ints, Scene
@@ -54,6 +55,7 @@ class Contacts:
         vertices: the body vertices that are posed, all by default.
         pinned: whether pinned cloth collides too. Training, which cannot move them, leaves them out.
         patches: whether tight cloth touches its patches alone; all of the body otherwise.
+        limbs: as `Piercing` takes them.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class Contacts:
         vertices: Ints | None = None,
         pinned: bool = True,
         patches: bool = True,
+        limbs: NDArray[np.bool_] | None = None,
         device: torch.device,
     ) -> None:
         body = scene.character.merged_body().mesh
@@ -81,7 +84,8 @@ class Contacts:
         def group(rows: Ints, found: Patches | None = None) -> _Group:
             return _Group(tensor(rows), tensor(compact_blocks(points[rows], GARMENT_BLOCK)), found)
 
-        self._piercing = Piercing(scene, samples, device=device) if len(loose_faces(scene)) else None
+        can = len(loose_faces(scene)) > 0
+        self._piercing = Piercing(scene, samples, limbs=limbs, device=device) if can else None
         self._groups = [group(np.flatnonzero(elsewhere))] if elsewhere.any() else []
         if covered.any():
             vertices = beneath[covered]

@@ -17,12 +17,15 @@ one obstacle.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ...scene.assets import PINNED, Floats, Ints, Mesh, Scene
+from ...scene.assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ...scene.mesh import topology
 from ...scene.mesh.blocks import compact_blocks
 from .. import kernels
@@ -157,6 +160,32 @@ class InnerCloth:
     def distance(self, x: Tensor, y: Tensor) -> Tensor:
         """Return likewise the distance (S, N) [m] from the middle of the cloth, negative beneath it."""
         return self.contact_distance(x, y) + self.half
+
+
+def loosened_over(scene: Scene, inner: Sequence[Scene]) -> Scene:
+    """Return the scene of an outer garment that is tight where it was pinned over cloth that moves.
+
+    Pinned cloth follows the body alone, and nothing moves it out of a hood or a sleeve that does not. It lies over a
+    garment where it is at most `DEEPEST` from it in the bind pose. Over cloth that is pinned itself it stays pinned.
+
+    Args:
+        inner: of the garments beneath, on the same character.
+    """
+    pinned = np.flatnonzero(scene.classes == PINNED)
+    if not len(pinned):
+        return scene
+    import igl
+
+    classes = scene.classes.copy()
+    points = np.ascontiguousarray(scene.garment.mesh.points[pinned])
+    for each in inner:
+        mesh = each.garment.mesh
+        square, face, _ = igl.point_mesh_squared_distance(points, mesh.points, mesh.faces)
+        moves = (each.classes[mesh.faces] != PINNED).any(axis=1)
+        classes[pinned[(square < DEEPEST**2) & moves[face]]] = TIGHT
+    if np.array_equal(classes, scene.classes):
+        return scene
+    return replace(scene, garment=replace(scene.garment, classes=classes))
 
 
 def turned_away(inner: Mesh, body: Mesh) -> Ints:

@@ -11,10 +11,12 @@ keep apart.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene.assets import LOOSE, Body, Floats, Ints, Mesh, Scene, Skeleton
@@ -61,19 +63,45 @@ class LimbAxes:
         """The joint at the tip of each limb, shape (L,)."""
         return self.joints[self.last, 0]
 
+    def chosen(self, limbs: NDArray[np.bool_]) -> LimbAxes | None:
+        """Return those of some limbs (L,); None where there are none."""
+        return replace(self, paths=self.paths[limbs], beyond=self.beyond[limbs]) if limbs.any() else None
+
 
 def limb_axes(scene: Scene) -> LimbAxes | None:
     """Return the axes that the garment's loose cloth must not cross; None where there are none."""
-    faces, mesh = loose_faces(scene), scene.garment.mesh
-    if not scene.character.bodies or not len(faces):
+    if not scene.character.bodies or not len(loose_faces(scene)):
         return None
     axes = body_axes(scene.character.merged_body(), scene.character.skeleton)
+    return axes.chosen(clear_limbs(scene, axes))
+
+
+def outfit_axes(scenes: Sequence[Scene]) -> tuple[LimbAxes | None, list[NDArray[np.bool_]]]:
+    """Return the axes that some of an outfit's garments must not cross, and which of these each may not, bool (L,).
+
+    Args:
+        scenes: of the garments, on one character.
+    """
+    none = np.zeros(0, dtype=bool)
+    if not scenes[0].character.bodies or not any(len(loose_faces(scene)) for scene in scenes):
+        return None, [none] * len(scenes)
+    axes = body_axes(scenes[0].character.merged_body(), scenes[0].character.skeleton)
+    clear = [clear_limbs(scene, axes) for scene in scenes]
+    kept = np.any(clear, axis=0)
+    return axes.chosen(kept), [each[kept] for each in clear]
+
+
+def clear_limbs(scene: Scene, axes: LimbAxes) -> NDArray[np.bool_]:
+    """Tell which limbs of a body do not cross the garment's loose cloth in the bind pose, shape (L,)."""
+    faces, mesh = loose_faces(scene), scene.garment.mesh
+    if not len(faces):
+        return np.zeros(len(axes.paths), dtype=bool)
     caster = RayCaster(replace(mesh, faces=faces), device=torch.device("cpu"))
     start, end = torch.tensor(axes.ends, dtype=torch.float32).unbind(1)
     points = torch.tensor(mesh.points, dtype=torch.float32)
     counts, *_ = caster.crossings(start[..., None], end[..., None], points[..., None])
-    clear = (along_paths(counts, torch.as_tensor(axes.paths)).sum(1) % 2 == 0)[:, 0].numpy()
-    return replace(axes, paths=axes.paths[clear], beyond=axes.beyond[clear]) if clear.any() else None
+    clear: NDArray[np.bool_] = (along_paths(counts, torch.as_tensor(axes.paths)).sum(1) % 2 == 0)[:, 0].numpy()
+    return clear
 
 
 def loose_faces(scene: Scene) -> Ints:

@@ -15,7 +15,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene.assets import LOOSE, Scene
@@ -66,17 +68,46 @@ class PiercedCloth:
         return PiercedCloth(*(getattr(self, name)[..., frames] for name in vars(self)))
 
 
+@dataclass(frozen=True, eq=False)
+class PiercedOutfit:
+    """That of several garments, which are posed together; None for those that no limb can pierce."""
+
+    parts: tuple[PiercedCloth | None, ...]
+
+    @property
+    def radius(self) -> Tensor:
+        """Those of all, shape (M, N)."""
+        return torch.cat([part.radius for part in self.parts if part is not None])
+
+    def on(self, limbs: PosedLimbs) -> PiercedOutfit:
+        """Return the same cloth, as `PiercedCloth.on` does."""
+        return PiercedOutfit(tuple(part and part.on(limbs) for part in self.parts))
+
+    def select(self, frames: Tensor) -> PiercedOutfit:
+        """Return that of the frames with indices (M,)."""
+        return PiercedOutfit(tuple(part and part.select(frames) for part in self.parts))
+
+
 class Piercing:
     """Finds where limbs pierce the loose cloth of a garment.
 
     Args:
         samples: of the garment, which are pushed.
+        limbs: which of those that are posed must not cross this garment, bool (L,); all by default.
     """
 
-    def __init__(self, scene: Scene, samples: ContactSamples, *, device: torch.device) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        samples: ContactSamples,
+        *,
+        limbs: NDArray[np.bool_] | None = None,
+        device: torch.device,
+    ) -> None:
         mesh, faces = scene.garment.mesh, loose_faces(scene)
         self.count = mesh.vertex_count
         self._caster = RayCaster(replace(mesh, faces=faces), device=device)
+        self._limbs = None if limbs is None else torch.as_tensor(limbs, device=device)[:, None]
         self._loose = torch.as_tensor(samples.classes(scene.classes) == LOOSE, device=device)
         self._rest, self._middles = (
             torch.tensor(points, dtype=torch.float32, device=device)
@@ -99,6 +130,8 @@ class Piercing:
         paths = limbs.paths
         counts = along_paths(counts, paths)
         pierced = (counts.sum(1) % 2 == 1) & ~limbs.buried
+        if self._limbs is not None:
+            pierced &= self._limbs
         place = torch.arange(1, paths.shape[1] + 1, device=x.device)[:, None]
         step = (place * (counts > 0)).amax(1).sub(1).clamp_min(0)  # the last bone of the path that is crossed
         bone = paths.gather(1, step).clamp_max(len(limbs.start) - 1)

@@ -278,7 +278,7 @@ class Refiner:
             need_finite(before)  # the best of several starts may be finite where it is not
             corrected = self.simulator.apply_pins(world + tail.correction - poses.root, poses)
             starts = [start, corrected, *self.simulator.starts(poses, past, inputs)]
-            start = self.simulator.best_start(starts, inputs)
+            start = self.simulator.potential.best_start(starts, inputs)
         return minimise_from(self.potential, start, inputs, solver).x
 
     def _history(self, tail: _Tail | None, world: Tensor, poses: PosedCharacters) -> StepHistory | None:

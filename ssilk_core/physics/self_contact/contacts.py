@@ -88,13 +88,15 @@ class ClothContacts:
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy of each frame [J], shape (N,)."""
-        energy = self.area * self.law.energy(self._relative(x))
-        return energy.new_zeros(self.frames).index_put_((self.frame,), energy, accumulate=True)
+        own = self.pressing(x)
+        energy = own.area * self.law.energy(own._relative(x))
+        return energy.new_zeros(self.frames).index_put_((own.frame,), energy, accumulate=True)
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
-        force = (-self.pressure(x) * self.coefficients)[:, None] * self.direction
-        return at_vertices(force, self.vertices, self.frame, x)
+        own = self.pressing(x)
+        force = (-own.pressure(x) * own.coefficients)[:, None] * own.direction
+        return at_vertices(force, own.vertices, own.frame, x)
 
     def stiffness(self, x: Tensor) -> Tensor:
         """Return the second derivative of each contact's energy by its gap [N/m], shape (P,)."""
@@ -120,9 +122,7 @@ class ClothContacts:
         along = self.along(step)
         first = along.masked_fill(self.second, torch.inf).amin(0)
         closing = along.masked_fill(~self.second, -torch.inf).amax(0) - first
-        near = SLACK * (self.law.start - self.start)
-        most = torch.maximum(CLOSING * self.gap(x), near.clamp_min(yielding))
-        share = (most / closing.clamp_min(TINY)).clamp_max(1).expand(4, -1)
+        share = (self._most(x, yielding) / closing.clamp_min(TINY)).clamp_max(1).expand(4, -1)
         found = torch.ones_like(step[:, 0]).flatten()
         at = self.vertices * self.frames + self.frame
         return found.scatter_reduce_(0, at.flatten(), share.flatten(), "amin").view_as(step[:, 0])
@@ -138,13 +138,26 @@ class ClothContacts:
         longest = (step - step.mean(0)).norm(dim=1).amax(0).clamp_min(TINY)
         step = step * (0.5 * CLOSING * self.known / longest).clamp_max(1)
         done = torch.zeros_like(longest, dtype=torch.bool)
+        near = self._meeting(x, step, yielding)
         for _ in range(SLOWED):
-            share = self.allowed(x, step, yielding)
+            share = near.allowed(x, step, yielding)
             step = torch.where(done, step, share[:, None] * step)
             done = done | (share > UNSLOWED).all(0)
             if bool(done.all()):
                 return step
-        return torch.where(done, step, self.allowed(x, step, yielding).amin(0) * step)
+        return torch.where(done, step, near.allowed(x, step, yielding).amin(0) * step)
+
+    def _meeting(self, x: Tensor, step: Tensor, yielding: float) -> ClothContacts:
+        """Return those that may slow a step, or one in which some vertices are slower; no other changes `allowed`."""
+        along = self.along(step)
+        first = along.masked_fill(self.second, 0.0).clamp_max(0).amin(0)
+        closing = along.masked_fill(~self.second, 0.0).clamp_min(0).amax(0) - first
+        return self._kept(closing > self._most(x, yielding), self.frame, self.frames)
+
+    def _most(self, x: Tensor, yielding: float) -> Tensor:
+        """Return by how much each pair may come nearer in a step [m], shape (P,)."""
+        near = SLACK * (self.law.start - self.start)
+        return torch.maximum(CLOSING * self.gap(x), near.clamp_min(yielding))
 
     def select(self, frames: Tensor) -> ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""

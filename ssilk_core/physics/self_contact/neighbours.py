@@ -6,11 +6,21 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from .. import loops
+
 AT_ONCE = 1 << 24  # pairs in memory before distances are compared
 MOST_CELLS = 1 << 16  # of the grid along an axis, so that cells of many frames have numbers of 64 bits
 
 
-def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tensor) -> Tensor:
+def near_pairs(
+    points: Tensor,
+    reach: Tensor,
+    others: Tensor,
+    other_reach: Tensor,
+    *,
+    groups: tuple[Tensor, Tensor] | None = None,
+    ascending: bool = False,
+) -> Tensor:
     """Return all pairs whose distance is at most the sum of both reaches, by frame, point and other.
 
     The cost grows with the number of points times the pairs within the largest reach.
@@ -18,6 +28,8 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
     Args:
         points, others: finite positions [m], shapes (A, 3, N) and (B, 3, N).
         reach, other_reach: of each [m], shapes (A,) and (B,).
+        groups: numbers (A,) and (B,); what has the same one is no pair.
+        ascending: whether the other of a pair has the greater index, as where both lists are one.
 
     Returns:
         Frame, point and other of each pair, shape (3, P).
@@ -33,7 +45,13 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
     rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
     row = (own[..., None] + rows).contiguous()
     starts = torch.searchsorted(key, row - 1)
-    counts = torch.searchsorted(key, row + 1, right=True) - starts
+    ends = torch.searchsorted(key, row + 1, right=True)
+    if loops.available(points.device):
+        from ..loops.near_pairs import near_pairs_loop
+
+        parts = order, starts.flatten(0, 1), ends.flatten(0, 1)
+        return near_pairs_loop(points, reach, others, other_reach, *parts, groups, ascending)
+    counts = ends - starts
     starts, counts = starts.flatten(), counts.flatten()
     found, first, total = [], 0, counts.cumsum(0)
     while first < len(counts):
@@ -46,6 +64,10 @@ def near_pairs(points: Tensor, reach: Tensor, others: Tensor, other_reach: Tenso
         far = points[point, :, frame] - others[other[at], :, other_frame[at]]
         limit = reach[point] + other_reach[other[at]]
         near = (far * far).sum(1) <= limit * limit
+        if groups is not None:
+            near &= groups[0][point] != groups[1][other[at]]
+        if ascending:
+            near &= other[at] > point
         found.append(torch.stack([frame[near], point[near], other[at][near]]))
         first = last
     pairs = torch.cat(found, dim=1)

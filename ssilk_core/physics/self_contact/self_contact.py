@@ -6,7 +6,11 @@ positions it has moved to. There a pair that has no side takes the one on which 
 no more loses it. In positions that are only tried, and after the body has moved, cloth may have passed through: the
 pair then still belongs to its side, and is pushed back, in later steps too.
 
-Pinned and tight cloth does not touch itself: it follows skin, which leaves no room between it where it folds.
+Pinned and tight cloth does not touch itself: it follows skin, which leaves no room between it where it folds. Tight
+cloth of two garments touches where one lies on the other in the bind pose.
+
+Cloth of two kinds touches at the mean of the distances and with the mean of the stiffnesses that each has with its
+own kind.
 """
 
 from __future__ import annotations
@@ -19,10 +23,9 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
-from ...scene.assets import LOOSE, Scene
-from ...scene.fabrics import Fabric
 from ...scene.mesh import topology
 from ..energy.collision import ContactLaw
+from .cloth import TouchingCloth
 from .contacts import ClothContacts
 from .neighbours import near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
@@ -135,6 +138,9 @@ class PairKind:
             the same tensor where both are of one sort.
         first_reach, second_reach: distance of vertices from the middle, at most [m], shapes (A,) and (B,).
         first_area, second_area: of which the smaller one counts for a pair [m2], shapes (A,) and (B,).
+        first_start, second_start: gaps at which contact with its own kind begins [m], shapes (A,) and (B,).
+        first_stiffness, second_stiffness: of contact with its own kind, relative to the law's, likewise; None where
+            all have the law's.
     """
 
     measure: Callable[[Tensor], Separations]
@@ -144,14 +150,27 @@ class PairKind:
     second_reach: Tensor
     first_area: Tensor
     second_area: Tensor
+    first_start: Tensor
+    second_start: Tensor
+    first_stiffness: Tensor | None
+    second_stiffness: Tensor | None
 
-    def near(self, at: Tensor, reach: float) -> KnownPairs:
-        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0."""
+    def near(self, at: Tensor, reach: float, garment: Tensor | None = None) -> KnownPairs:
+        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0.
+
+        Args:
+            garment: of each vertex, where only those of two garments are pairs, shape (V,).
+        """
         middles = at[self.first].mean(1), at[self.second].mean(1)
-        frame, first, second = near_pairs(middles[0], self.first_reach + reach, middles[1], self.second_reach)
+        frame, first, second = near_pairs(
+            middles[0],
+            self.first_reach + reach,
+            middles[1],
+            self.second_reach,
+            groups=None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]]),
+            ascending=self.first is self.second,
+        )
         apart = (self.first[first][:, :, None] != self.second[second][:, None]).flatten(1).all(1)
-        if self.first is self.second:
-            apart &= first < second
         none = at.new_zeros(len(frame))
         return KnownPairs(frame, first, second, none, none).kept(apart)
 
@@ -172,35 +191,46 @@ class PairKind:
         vertices = self.vertices(pairs)
         second = (torch.arange(4, device=gap.device) >= self.first.shape[1])[:, None].expand_as(vertices)
         area = torch.minimum(self.first_area[pairs.first], self.second_area[pairs.second])
+        if self.first_stiffness is not None and self.second_stiffness is not None:
+            area = area * _mean(self.first_stiffness, self.second_stiffness, pairs)
         return pairs.frame, vertices, now.coefficients[:, kept], second, direction[:, kept], pairs.start, area
 
 
 class SelfContact:
-    """Contact of a garment with itself; positions are (V, 3, N).
+    """Contact of cloth with cloth; positions are (V, 3, N).
 
     Attributes:
-        law: how pressure depends on the gap.
+        law: how pressure depends on the gap, for the cloth that is thickest and stiffest.
         reach: distance within which pairs are known [m].
-        rest: the garment in the bind pose, shape (V, 3, 1).
+        rest: the cloth in the bind pose, shape (V, 3, 1).
+
+    Args:
+        own: whether garments touch themselves; each other alone otherwise.
     """
 
-    def __init__(self, scene: Scene, fabric: Fabric, device: torch.device, dtype: torch.dtype) -> None:
+    def __init__(self, cloth: TouchingCloth, device: torch.device, dtype: torch.dtype, own: bool = True) -> None:
         def tensor(values: np.ndarray, kind: torch.dtype = dtype) -> Tensor:
             return torch.as_tensor(np.array(values), dtype=kind, device=device)
 
-        points, faces = scene.garment.mesh.points, scene.garment.mesh.faces
+        points, faces = cloth.points, cloth.faces
         edges, half = topology.edges(faces), topology.half_edges(faces)
-        gap = 0.5 * fabric.margin
-        self.law = ContactLaw(fabric.loose_contact, fabric.thickness + gap, gap)
+        stiffest = float(cloth.stiffness.max())
+        self.law = ContactLaw(stiffest, float(cloth.start.max()), cloth.ramp)
         self.reach = self.law.start + REACH
         self.rest = tensor(points)[:, :, None]
-        self._loose = tensor(scene.classes == LOOSE, torch.bool)
-        own = np.searchsorted(topology.edge_keys(edges), topology.edge_keys(half))
-        of_edges = np.bincount(own, np.repeat(topology.face_areas(points, faces) / 3, 3), len(edges))
+        self._loose, self._pinned = tensor(cloth.loose, torch.bool), tensor(cloth.pinned, torch.bool)
+        self._garment = tensor(cloth.garment, torch.long) if cloth.garment.any() else None
+        self._own = own
+        named = np.searchsorted(topology.edge_keys(edges), topology.edge_keys(half))
+        of_edges = np.bincount(named, np.repeat(topology.face_areas(points, faces) / 3, 3), len(edges))
         vertices, corners, ends = (
             tensor(rows, torch.long) for rows in (np.arange(len(points))[:, None], faces, edges)
         )
         reach, area = tensor(STRETCH * _radii(points[edges])), EDGE_SHARE * tensor(of_edges)
+
+        share = cloth.stiffness / stiffest if stiffest else np.ones(len(points))
+        shares = None if (share == 1).all() else tensor(share)
+        starts, of_faces, of_ends = tensor(cloth.start), corners[:, 0], ends[:, 0]
         self._faces = PairKind(
             over_faces,
             vertices,
@@ -209,8 +239,13 @@ class SelfContact:
             tensor(STRETCH * _radii(points[faces])),
             VERTEX_SHARE * tensor(topology.vertex_areas(points, faces)),
             tensor(np.full(len(faces), np.inf)),
+            starts,
+            starts[of_faces],
+            shares,
+            None if shares is None else shares[of_faces],
         )
-        self._edges = PairKind(between_edges, ends, ends, reach, reach, area, area)
+        start, share_of = starts[of_ends], None if shares is None else shares[of_ends]
+        self._edges = PairKind(between_edges, ends, ends, reach, reach, area, area, start, start, share_of, share_of)
 
     def neighbours(self, last: Tensor, at: Tensor, before: ClothNeighbours | None = None) -> ClothNeighbours:
         """Return what may touch around positions `at`, on the sides of the positions `last`, or older ones."""
@@ -256,14 +291,32 @@ class SelfContact:
 
     def _sided(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
         """Return the pairs of a kind that `neighbours` tells of."""
-        pairs = kind.near(at, self.reach)
-        pairs = pairs.kept(self._loose[kind.vertices(pairs)].any(0))
+        pairs = kind.near(at, self.reach, None if self._own else self._garment)
+        pairs = pairs.kept(self._can_touch(kind, pairs))
         pairs = pairs.kept(kind.at(at, pairs).distance < self.reach)
-        start = (CLOSER * kind.at(self.rest, pairs).distance).clamp_max(self.law.start)
+        most = _mean(kind.first_start, kind.second_start, pairs)
+        start = torch.minimum(CLOSER * kind.at(self.rest, pairs).distance, most)
         then = kind.at(last, pairs)
         side = torch.where(then.facing, then.height.sign(), 0)
         older = torch.zeros_like(side) if before is None else before.sides_of(pairs)
         return replace(pairs, start=start, side=torch.where(older == 0, side, older))
+
+    def _can_touch(self, kind: PairKind, pairs: KnownPairs) -> Tensor:
+        """Tell which pairs of a kind may touch at all, bool (P,)."""
+        vertices = kind.vertices(pairs)
+        loose = self._loose[vertices].any(0)
+        if self._garment is None:
+            return loose
+        other = self._garment[vertices[0]] != self._garment[vertices[-1]]
+        beside = other & ~loose & ~self._pinned[vertices].all(0)
+        rows = beside.nonzero()[:, 0]
+        beside[rows] = kind.at(self.rest, pairs.kept(rows)).distance < self.reach
+        return loose | beside  # of one garment alone, none is known where it may not touch itself
+
+
+def _mean(first: Tensor, second: Tensor, pairs: KnownPairs) -> Tensor:
+    """Return the means of what both of each pair have, shape (P,)."""
+    return 0.5 * (first[pairs.first] + second[pairs.second])
 
 
 def _drift(x: Tensor, known: ClothNeighbours) -> Tensor:

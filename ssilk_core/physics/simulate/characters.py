@@ -25,7 +25,7 @@ from ...scene.kinematics import (
     split_at_cuts,
     world_transforms,
 )
-from ..collision import CollisionBody, PosedBody, limb_axes
+from ..collision import CollisionBody, LimbAxes, PosedBody
 from ..skinning import blend_matrices, transform_points
 from ..world.surroundings import PosedWorld
 
@@ -114,14 +114,26 @@ class PosedCharacters:
 
 
 class CharacterPoser:
-    """Poses the character of a scene, and its garment under linear blend skinning."""
+    """Poses the character of a scene, and its garments under linear blend skinning.
 
-    def __init__(self, scene: Scene, device: torch.device, dtype: torch.dtype) -> None:
+    Args:
+        scenes: of the garments, whose vertices follow each other, on one character.
+        limbs: axes that loose cloth must not cross.
+    """
+
+    def __init__(
+        self, scenes: Sequence[Scene], limbs: LimbAxes | None, device: torch.device, dtype: torch.dtype
+    ) -> None:
+        scene = scenes[0]
         self.skeleton, self.dtype = scene.character.skeleton, dtype
         joints = self.skeleton.joint_count
-        self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limb_axes(scene), device=device)
-        self.weights = torch.as_tensor(scene.lbs_skin.dense(joints), dtype=dtype, device=device)
-        self.rest = torch.as_tensor(np.array(scene.garment.mesh.points), dtype=dtype, device=device)[:, :, None]
+        self.body = CollisionBody(scene.character.merged_body(), joints, limbs=limbs, device=device)
+        weights, points = (
+            np.concatenate(rows)
+            for rows in zip(*((each.lbs_skin.dense(joints), each.garment.mesh.points) for each in scenes))
+        )
+        self.weights = torch.as_tensor(weights, dtype=dtype, device=device)
+        self.rest = torch.as_tensor(points, dtype=dtype, device=device)[:, :, None]
         self.starts = np.cumsum([0, *(body.mesh.vertex_count for body in scene.character.bodies)])
 
     def only(self, vertices: Ints) -> CharacterPoser:

@@ -52,15 +52,21 @@ class Friction:
     held: Tensor
 
     @classmethod
-    def joined(cls, on_body: Friction, on_cloth: Friction) -> Friction:
-        """Return both together."""
-        parts = [torch.cat(pair, dim=-1) for pair in zip(on_body._rows(), on_cloth._rows(), strict=True)]
-        return cls(on_body.frames, on_body.creep, *parts)
+    def joined(cls, *parts: Friction) -> Friction:
+        """Return all together, of the same frames."""
+        rows = [torch.cat(each, dim=-1) for each in zip(*(part._rows() for part in parts), strict=True)]
+        return cls(parts[0].frames, parts[0].creep, *rows)
 
     @classmethod
-    def of_contacts(cls, contacts: ClothContacts, x: Tensor, mu: float, dt: float) -> Friction:
-        """Return that of contacts of cloth with cloth at positions x (V, 3, N)."""
+    def of_contacts(cls, contacts: ClothContacts, x: Tensor, mu: float | Tensor, dt: float) -> Friction:
+        """Return that of contacts of cloth with cloth at positions x (V, 3, N).
+
+        Args:
+            mu: the coefficient, or that of the cloth at each vertex (V,): two kinds of cloth rub with their mean.
+        """
         own = contacts.pressing(x)
+        if isinstance(mu, Tensor):
+            mu = 0.5 * (mu[own.vertices[0]] + mu[own.vertices[-1]])
         none = torch.zeros(3, len(own.frame), dtype=torch.long, device=x.device)
         held = _combined(own.coefficients, x, own.vertices, own.frame)
         rows = own.vertices, own.coefficients, none, none.to(x.dtype), own.direction, mu * own.pressure(x), held

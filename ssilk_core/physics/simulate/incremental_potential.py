@@ -15,21 +15,24 @@ so that the gradient vanishes at minima there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
 from ..collision import Contacts, PosedBody, SmoothedDistance
-from ..collision.pierced import PiercedCloth
+from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
 from ..kernels.corners import ElasticTables, elastic_tables
-from ..self_contact import ClothContacts, ClothNeighbours, SelfContact
+from ..self_contact import ClothContacts, ClothNeighbours, SelfContact, TouchingCloth
 from ..self_contact.contacts import Slopes
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
@@ -49,7 +52,8 @@ class StepInputs:
 
     Attributes:
         body: in the coordinates of the positions, float32.
-        gravity: acceleration [m/s2], shape (3, N).
+        gravity: acceleration [m/s2], shape (3, N), or of each vertex, (V, 3, N), where wind pushes an outfit's
+            garments differently.
         predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
         advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
         dt: time step [s]. For a quasi-static state it only damps the solver's steps.
@@ -70,7 +74,7 @@ class StepInputs:
     neighbours: ClothNeighbours | None = None
     contacts: ClothContacts | None = None
     friction: Friction | None = None
-    pierced: PiercedCloth | None = None
+    pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
 
     def select(self, frames: Tensor) -> StepInputs:
@@ -98,10 +102,17 @@ class IncrementalPotential:
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
+        limbs: which of the limbs that are posed must not cross the garment, bool (L,); all by default.
     """
 
     def __init__(
-        self, scene: Scene, fabric: Fabric, *, device: torch.device, dtype: torch.dtype = torch.float64
+        self,
+        scene: Scene,
+        fabric: Fabric,
+        *,
+        device: torch.device,
+        dtype: torch.dtype = torch.float64,
+        limbs: NDArray[np.bool_] | None = None,
     ) -> None:
         mesh = scene.garment.mesh
         energy = GarmentEnergy(scene.garment.rest_mesh, fabric, scene.classes, device=device, dtype=dtype)
@@ -111,8 +122,8 @@ class IncrementalPotential:
         self.tether[energy.tethered, 0] = energy.tether_stiffness
         self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
-        self.contacts = Contacts(scene, self.cloth.samples, device=device)
-        self._self_contact = partial(SelfContact, scene, fabric, device, dtype)
+        self.contacts = Contacts(scene, self.cloth.samples, limbs=limbs, device=device)
+        self._self_contact = partial(SelfContact, TouchingCloth.of(scene, fabric), device, dtype)
         self.use(Hessian.of(scene, energy))
 
     def use(self, hessian: Hessian) -> None:
@@ -120,6 +131,11 @@ class IncrementalPotential:
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
         self.__dict__.pop("_elastic_tables", None)
+
+    @property
+    def garments(self) -> list[tuple[slice, Fabric]]:
+        """The rows of each garment among the vertices, with its fabric: of one, all."""
+        return [(slice(None), self.fabric)]
 
     @cached_property
     def self_contact(self) -> SelfContact:
@@ -131,6 +147,10 @@ class IncrementalPotential:
         """The sparsity pattern of its Hessian."""
         return self._hessian.pattern
 
+    def pierced(self, x: Tensor, body: PosedBody) -> PiercedCloth | PiercedOutfit | None:
+        """Return where limbs pierce the cloth at x; None where none ever can."""
+        return self.contacts.pierced(self.cloth.positions(x), body)
+
     def body_distance(self, x: Tensor, inputs: StepInputs, allowance: float = math.inf) -> SmoothedDistance | None:
         """Return the distances of the samples of x to the body, to second order.
 
@@ -139,6 +159,7 @@ class IncrementalPotential:
         """
         if inputs.body is None:
             return None
+        assert not isinstance(inputs.pierced, PiercedOutfit)
         within = self.law.start + allowance
         return self.contacts.smoothed(self.cloth.positions(x), inputs.body, within, inputs.pierced)
 
@@ -225,6 +246,15 @@ class IncrementalPotential:
         if neighbours is None:
             return rubbing
         return Friction.joined(rubbing, Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+
+    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
+        """Return for each frame the start (V, 3, N) with the least energy."""
+        energies = [self.energy(x, inputs, self.body_distance(x, inputs)) for x in starts]
+        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
+        best = starts[0]
+        for number, start in enumerate(starts[1:], start=1):
+            best = torch.where(chosen == number, start, best)
+        return best
 
     def inside(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
         """Return the share of vertices inside the part of the body that they can touch, shape (N,)."""

@@ -29,7 +29,8 @@ from ...events import Countdown, Message, Reporter, silent
 from ...scene.assets import Floats, Motion, Scene, ShotWorld, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
-from ..collision.pierced import PiercedCloth
+from ..collision import limb_axes
+from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
 from ..world.surroundings import PosedWorld, Surroundings
@@ -38,6 +39,7 @@ from .cubature import Cubature, sampled_potential
 from .friction import Friction
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Solution, SolverOptions, minimise_from
+from .outfit import OutfitPotential, WornGarment
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
@@ -134,7 +136,7 @@ class StepHistory:
     neighbours: ClothNeighbours | None = None
     friction: Friction | None = None
     matrices: Tensor | None = None
-    pierced: PiercedCloth | None = None
+    pierced: PiercedCloth | PiercedOutfit | None = None
     moves: Tensor | None = None
 
     def first(self, count: int) -> StepHistory:
@@ -163,7 +165,12 @@ class StepHistory:
 
 
 class Simulator:
-    """Simulates one garment for any motions of its character."""
+    """Simulates one garment, or an outfit, for any motions of the character.
+
+    Where garments are worn over it, all are one system, and positions (V, 3) are those of the first garment, then
+    those of the others. They never pass through each other; `SimulationOptions.self_contact` says whether one passes
+    through itself.
+    """
 
     def __init__(
         self,
@@ -171,15 +178,29 @@ class Simulator:
         fabric: Fabric,
         options: SimulationOptions | None = None,
         *,
+        over: Sequence[WornGarment] = (),
         device: torch.device | str = "cpu",
         report: Reporter = silent,
     ) -> None:
-        """Prepare the energies of a garment; `report` hears when shots start, with their quasi-static states."""
+        """Prepare the energies of garments; `report` hears when shots start, with their quasi-static states.
+
+        Args:
+            over: garments that are worn with the scene's, outer ones last.
+        """
         self.report = report
         self.options, device = options or SimulationOptions(), torch.device(device)
         dtype = PRECISIONS[self.options.precision]
-        self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
-        self.poser = CharacterPoser(scene, device, dtype)
+        scenes = [scene, *(each.scene for each in over)]
+        self.potential: IncrementalPotential
+        self._offsets: Tensor | None = None
+        if over:
+            worn = [WornGarment(scene, fabric), *over]
+            outfit = OutfitPotential(worn, own=self.options.self_contact, device=device, dtype=dtype)
+            self.potential, limbs, self._offsets = outfit, outfit.limbs, outfit.offsets
+        else:
+            self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
+            limbs = limb_axes(scene)
+        self.poser = CharacterPoser(scenes, limbs, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
         self.dt, self.splits = 1 / (self.options.fps * self.options.substeps), SPLITS
 
@@ -213,11 +234,15 @@ class Simulator:
         if worlds is None or all(world is None or world.is_usual for world in worlds):
             return None
         for world in worlds:
-            if world and world.air and not self.potential.fabric.drag:
-                name = self.potential.fabric.name
-                found, allowed = f"wind, and the fabric '{name}' has no drag", "air moves cloth by its drag"
-                fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
-        if self.potential.fabric.friction and any(world and world.colliders for world in worlds):
+            for _, fabric in self.potential.garments if world and world.air else ():
+                if not fabric.drag:
+                    found, allowed = (
+                        f"wind, and the fabric '{fabric.name}' has no drag",
+                        "air moves cloth by its drag",
+                    )
+                    fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
+        rubs = any(fabric.friction for _, fabric in self.potential.garments)
+        if rubs and any(world and world.colliders for world in worlds):
             self.report(Message("friction is that of body and cloth; on floors and props cloth slides", "warning"))
         return Surroundings(worlds, np.array(self.options.gravity))
 
@@ -283,8 +308,8 @@ class Simulator:
         found = replace(found, residual=residual.amax(0), iterations=iterations.sum(0), cg_iterations=spent)
         return replace(past, before=past.last - PARTS * (past.last - past.before)), found
 
-    def _pierced(self, x: Tensor, poses: PosedCharacters) -> PiercedCloth | None:
-        return self.potential.contacts.pierced(self.potential.cloth.positions(x), poses.body)
+    def _pierced(self, x: Tensor, poses: PosedCharacters) -> PiercedCloth | PiercedOutfit | None:
+        return self.potential.pierced(x, poses.body)
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
@@ -330,6 +355,8 @@ class Simulator:
         turned, placed = bind_pose(self.poser.skeleton)
         poses = self.poser.pose(np.broadcast_to(turned, rotations.shape), np.broadcast_to(placed, translations.shape))
         x, last = poses.lbs, self.options.quasi_static_solver
+        if self._offsets is not None:
+            x = self.apply_pins(x + self._offsets, poses)
         known: ClothNeighbours | None = None
         for share in np.arange(1, POSES + 1) / POSES:
             lbs = poses.lbs
@@ -347,7 +374,8 @@ class Simulator:
         self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
     ) -> tuple[Tensor, StepInputs]:
         """Return a target (V, 3, N), or how far the garment comes towards it past itself, and the inputs there."""
-        return self.potential.approach(x, target, inputs, known) if self.options.self_contact else (target, inputs)
+        apart = self.options.self_contact or len(self.potential.garments) > 1
+        return self.potential.approach(x, target, inputs, known) if apart else (target, inputs)
 
     def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
@@ -382,20 +410,30 @@ class Simulator:
         return carried
 
     def _pushed_by_wind(self, world: PosedWorld, lbs: Tensor) -> Tensor:
-        """Return the mean acceleration by which wind pushes resting cloth [m/s2], shape (3, N)."""
+        """Return the mean acceleration by which wind pushes resting cloth [m/s2], shape (3, N).
+
+        For several garments it is that of each at its vertices, shape (V, 3, N).
+        """
+        garments = self.potential.garments
+        parts = [self._pushed(world, lbs[rows], fabric) for rows, fabric in garments]
+        if len(parts) == 1:
+            return parts[0]
+        return torch.cat([part.expand(rows.stop - rows.start, -1, -1) for part, (rows, _) in zip(parts, garments)])
+
+    def _pushed(self, world: PosedWorld, lbs: Tensor, fabric: Fabric) -> Tensor:
+        """Return that of one garment, shape (3, N)."""
         pushed = torch.zeros_like(world.gravity)
         points = lbs.double().cpu().numpy()
         for frame, (air, seconds) in enumerate(zip(world.air, world.seconds, strict=True)):
             if air is not None:
                 blown = air.velocity(points[..., frame] + world.roots[frame], seconds).mean(axis=0)
                 pushed[:, frame] = torch.as_tensor(blown).to(pushed)
-        fabric = self.potential.fabric
         return fabric.drag / fabric.density * pushed
 
     def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
         """Return the states one step after `past`, relative to the roots."""
         inputs = self.inputs(poses, past)
-        start = self.best_start(self.starts(poses, past, inputs), inputs)
+        start = self.potential.best_start(self.starts(poses, past, inputs), inputs)
         x, inputs = self._carried(past.local, start, inputs, past.neighbours)
         return self.solve(self.apply_pins(x, poses), inputs)
 
@@ -412,16 +450,6 @@ class Simulator:
         """Return positions (V, 3, N) with all vertices but the free ones set to linear blend skinning."""
         free = self.potential.free
         return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
-
-    def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
-        """Return for each frame the start with the least energy."""
-        potential = self.potential
-        energies = [potential.energy(x, inputs, potential.body_distance(x, inputs)) for x in starts]
-        chosen = torch.stack(energies).nan_to_num(nan=torch.inf).argmin(0)
-        best = starts[0]
-        for number, start in enumerate(starts[1:], start=1):
-            best = torch.where(chosen == number, start, best)
-        return best
 
 
 def _surrounded(

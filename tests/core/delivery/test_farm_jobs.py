@@ -17,6 +17,7 @@ from pxr import Tf
 
 from ssilk_core.delivery.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
 from ssilk_core.delivery.bake.inputs import InputHashes
+from ssilk_core.delivery.bake.layered import in_levels
 from ssilk_core.delivery.bake.naming import file_name, pattern_name, prim_name
 from ssilk_core.delivery.bake.record import (
     RECORD,
@@ -267,6 +268,26 @@ def test_a_template_passes_the_specification(device, gpu):
     assert bake.parameterSpace.taskParameterDefinitions["Shots"].range == IntRangeExpr.from_str("0-1")
     assert bake.script.actions.onRun.timeout == 60
     assert [dependency.dependsOn for dependency in check.dependencies] == ["Bake"]
+
+
+def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over():
+    over = {"vest": (), "coat": ("vest",), "cape": ("vest", "coat"), "hat": ()}
+    tasks = [
+        replace(TASK, garment=name, shot=shot, over=names) for shot in ("walk", "run") for name, names in over.items()
+    ]
+    levels = in_levels(tasks)
+    assert [[task.garment for task in level] for level in levels] == [["vest", "hat"] * 2, ["coat"] * 2, ["cape"] * 2]
+    decoded = decode_job_template(
+        template=template([task for level in levels for task in level], BundleOptions()),
+        supported_extensions=["TASK_CHUNKING"],
+    )
+    names = [(step.name, [each.dependsOn for each in step.dependencies or ()]) for step in decoded.steps]
+    assert names == [
+        ("Bake", []), ("BakeOver", ["Bake"]), ("BakeOver2", ["BakeOver"]), ("Check", ["BakeOver2"])
+    ]  # fmt: skip
+    circle = [replace(TASK, garment="a", over=("b",)), replace(TASK, garment="b", over=("a",))]
+    assert in_levels(circle) == [circle]  # each fails with a sentence
+    assert task_key(tasks[1], CONTENTS) == task_key(replace(tasks[1], over=()), CONTENTS)
 
 
 @pytest.mark.parametrize("name", ["memory", "timeout"])

@@ -12,7 +12,7 @@ import torch
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
-from ssilk_core.physics.self_contact import ClothContacts, SelfContact
+from ssilk_core.physics.self_contact import ClothContacts, SelfContact, TouchingCloth
 from ssilk_core.physics.self_contact.neighbours import near_pairs
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
@@ -51,7 +51,7 @@ def layers(scene) -> tuple[Scene, SelfContact]:
     sheet = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0, 0.1]])
     points = np.concatenate([sheet, sheet + [0.0, 0.3, 0.0]])
     worn = dressed(scene, points, np.array([[0, 1, 2], [3, 4, 5]]), np.zeros(6, dtype=bool))
-    return worn, SelfContact(worn, FABRIC, CPU, torch.float64)
+    return worn, SelfContact(TouchingCloth.of(worn, FABRIC), CPU, torch.float64)
 
 
 def stacked(height: float) -> torch.Tensor:
@@ -61,13 +61,20 @@ def stacked(height: float) -> torch.Tensor:
     return frames(np.concatenate([first, second]))
 
 
-def test_near_pairs_are_those_of_all_distances():
+@pytest.mark.parametrize("compiled", [True, False])
+def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
+    if not compiled:
+        monkeypatch.setattr("ssilk_core.physics.loops.available", lambda device: False)
     points, others = random(40, 3, 3), random(60, 3, 3, seed=1)
     reach, other_reach = 0.2 * random(40, seed=2), 0.2 * random(60, seed=3)
     far = (points[:, None] - others[None]).square().sum(2).sqrt()
     expected = (far <= (reach[:, None] + other_reach)[..., None]).permute(2, 0, 1).nonzero().T
     assert len(expected[0]) > 50
     assert torch.equal(near_pairs(points, reach, others, other_reach), expected)
+    groups = torch.arange(40) % 3, torch.arange(60) % 3
+    kept = expected[:, (groups[0][expected[1]] != groups[1][expected[2]]) & (expected[1] < expected[2])]
+    found = near_pairs(points, reach, others, other_reach, groups=groups, ascending=True)
+    assert 10 < len(kept[0]) < len(expected[0]) and torch.equal(found, kept)
 
 
 @pytest.mark.parametrize("shape", [over_faces, between_edges])
@@ -150,7 +157,7 @@ def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
 def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
     worn, _ = layers
     held = dressed(worn, worn.garment.mesh.points, worn.garment.mesh.faces, np.ones(6, dtype=bool))
-    contact = SelfContact(held, FABRIC, CPU, torch.float64)
+    contact = SelfContact(TouchingCloth.of(held, FABRIC), CPU, torch.float64)
     x = stacked(0.003)
     assert not len(contact.contacts(x, contact.neighbours(x, x)).frame)
 
@@ -165,7 +172,11 @@ def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np
         folded = points.copy()
         folded[:, 1], folded[:, 2] = -0.008 * (1 + 0.1 * n) * rows, np.where(rows % 2, 0.049, 0.0)
         found.append(folded)
-    return SelfContact(worn, FABRIC, CPU, torch.float64), torch.as_tensor(np.stack(found, axis=-1)), faces
+    return (
+        SelfContact(TouchingCloth.of(worn, FABRIC), CPU, torch.float64),
+        torch.as_tensor(np.stack(found, axis=-1)),
+        faces,
+    )
 
 
 def test_no_step_passes_through_folds(scene, toy_grid):

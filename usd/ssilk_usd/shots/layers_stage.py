@@ -6,8 +6,10 @@ from __future__ import annotations
 import os
 from collections.abc import Container, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from pxr import Kind, Sdf, Usd, UsdGeom
+from pxr import Kind, Sdf, Tf, Usd, UsdGeom
 
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import replacing
@@ -19,6 +21,7 @@ from ..units import StageUnits
 from ..writing.export import new_stage, save
 from .layers import LEVEL, Layout, variant
 from .layers_hidden import Masks, hidden_in, hide_together
+from .shot import metadata_of
 
 OWN_LEVEL = "default"  # the level that a garment with others is itself
 
@@ -44,6 +47,7 @@ def write_stage(
     garments: Mapping[Layout, Hashable],
     needed: Container[str] = frozenset(),
     levels: Mapping[str, str] | None = None,
+    facts: Mapping[str, object] | None = None,
 ) -> WrittenStage:
     """Write the stage of a shot, which references each garment and spans all frames; keep an identical file.
 
@@ -54,6 +58,7 @@ def write_stage(
             its garments that has one in all its levels, else in some. If none can be read, no stage is written.
         needed: names of garments that have to be in it; others are left out where they cannot be read.
         levels: names of garments that are levels of another one, by their own.
+        facts: what the stage says of what is in it, kept as the layer's `customLayerData["ssilk"]`.
 
     Raises:
         SsilkError: a needed garment cannot be read, the garments have different units or axes, or the file cannot be
@@ -91,11 +96,24 @@ def write_stage(
         hidden = {garment: hidden_in(stages[garment], bodies[garment]) for garment in stages if bodies[garment]}
         uncovered = _hide_covered(stage, shot, grouped, garments, hidden, shown)
         free_when_closed(stage.GetUsedLayers())
+        if facts:
+            stage.GetRootLayer().customLayerData = {"ssilk": metadata_of(facts)}
         save(stage.GetRootLayer(), layout.stage)
         del stage, shot, prim
     showing = {name: grouped[name] for name in shown.values()}
     bodiless = {each.garment: name for name, group in showing.items() for each in group if not bodies[each]}
     return WrittenStage(unreadable, others, frozenset(uncovered), bodiless)
+
+
+def stage_facts(path: Path) -> dict[str, Any]:
+    """Return the facts that a stage was written with; none where there is no stage, or it is damaged."""
+    if not path.is_file():
+        return {}
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path), metadataOnly=True)
+    except Tf.ErrorException:  # whoever writes the stage again mends it
+        return {}
+    return dict(layer.customLayerData.get("ssilk", {}))
 
 
 def _shown_with(

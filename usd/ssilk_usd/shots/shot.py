@@ -121,7 +121,7 @@ def write_samples(
         samples.append(pose)
         if samples.unsaved_count >= FRAMES_PER_SAVE:
             samples.save(path)
-    samples.layer.customLayerData = {"ssilk": _metadata(provenance or {})}
+    samples.layer.customLayerData = {"ssilk": metadata_of(provenance or {})}
     samples.save(path)
 
 
@@ -133,7 +133,7 @@ def add_provenance(path: str | Path, facts: Mapping[str, object]) -> None:
     """
     layer = Sdf.Layer.FindOrOpen(str(path))
     said = dict(layer.customLayerData)
-    said["ssilk"] = {**said.get("ssilk", {}), **{name: _metadata(value) for name, value in facts.items()}}
+    said["ssilk"] = {**said.get("ssilk", {}), **{name: metadata_of(value) for name, value in facts.items()}}
     layer.customLayerData = said
     save(layer, path)
 
@@ -188,11 +188,13 @@ def set_visibility(stage: Usd.Stage, root: Sdf.Path, span: TimeSpan, hidden: Seq
         visibility.Set(token, span.start + span.step * frame)
 
 
-def _metadata(value: object) -> object:
+def metadata_of(value: object) -> object:
     """Return nested mappings and lists as USD's metadata can hold them: lists become strings, empty ones nothing."""
     if isinstance(value, Mapping):
         return {
-            str(key): _metadata(item) for key, item in value.items() if item is not None and item != [] and item != {}
+            str(key): metadata_of(item)
+            for key, item in value.items()
+            if item is not None and item != [] and item != {}
         }
     if isinstance(value, list | tuple):
         return Vt.StringArray([str(item) for item in value])

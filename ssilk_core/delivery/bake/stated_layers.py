@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the stage of a shot says of garments over one another, while their layers are as they were counted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ...physics.intersections.figures import LAYERS, LayerFigures
+from ...scene.plain import from_plain
+from .record import TaskRecord
+
+ANIMATION = "anim.usdc"  # of a garment's layers, by its path in their record
+COUNTED_IN = "counted_in"  # SHA-256 of the outer and of the inner garment's layer
+
+Records = Mapping[str, TaskRecord | None]
+
+
+def layer_facts(figures: Sequence[LayerFigures], found: Records) -> dict[str, object]:
+    """Return figures as the stage of a shot holds them: by the outer garment's name, then by the inner one's.
+
+    Args:
+        found: records of the shot's garments, by name.
+    """
+    facts: dict[str, dict[str, object]] = {}
+    for each in figures:
+        own = {**each.to_metadata(), COUNTED_IN: _layers(found, each.outer, each.inner)}
+        facts.setdefault(each.outer, {})[each.inner] = own
+    return {LAYERS: facts} if facts else {}
+
+
+def current_facts(said: Mapping[str, Any], found: Records) -> dict[str, object]:
+    """Return what of such facts is about pairs whose layers are as they were counted.
+
+    Args:
+        said: what a stage says, or is to say.
+    """
+    kept: dict[str, dict[str, Any]] = {}
+    for outer, pairs in said.get(LAYERS, {}).items():
+        for inner, pair in pairs.items():
+            layers = _layers(found, outer, inner)
+            if layers and pair.get(COUNTED_IN) == layers:
+                kept.setdefault(outer, {})[inner] = dict(pair)
+    return {LAYERS: kept} if kept else {}
+
+
+def stated_layers(stage: Path, found: Records) -> list[LayerFigures]:
+    """Return the figures of these pairs in a stage; none where one is told otherwise than this version does."""
+    from ssilk_usd.shots.layers_stage import stage_facts
+
+    said: Any = current_facts(stage_facts(stage), found).get(LAYERS, {})
+    pairs = [pair for own in said.values() for pair in own.values()]
+    try:
+        return [
+            from_plain(LayerFigures, {name: value for name, value in pair.items() if name != COUNTED_IN})
+            for pair in pairs
+        ]
+    except (TypeError, ValueError):  # of another version: whoever asks counts for itself
+        return []
+
+
+def _layers(found: Records, *names: str) -> str:
+    """Return the SHA-256 of the layers of garments; empty where one is not known."""
+    records = [found.get(name) for name in names]
+    digests = [record.files.get(ANIMATION, "") if record else "" for record in records]
+    return " ".join(digests) if all(digests) else ""
