@@ -213,7 +213,12 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
     with tempfile.TemporaryDirectory() as folder:
         shot = Path(folder) / f"{options.subject.stem}.usdc"
         write_shot(
-            shot, rollout.deformer, rollout.motion, rollout.poses(), units=rollout.units, record=rollout.record
+            shot,
+            rollout.deformer,
+            rollout.motion,
+            rollout.poses(),
+            units=rollout.units,
+            record=rollout.played or rollout.record,
         )
         rollout.warn(report)
         state_rollout_counts(shot, rollout)

@@ -21,6 +21,7 @@ CHANGED = BakeRequest(
     keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk",
     range="1001-1100", handles=8, level_of="coat", asset_version="v012", asset_identifier="studio:/cape",
     colliders=("/Floor", "/Wall"), wind="0,0,5", gusts="2", gravity="0,-3,0", hold=2, loop=True,
+    fabric="silk", material=("bending=2x", "drag=0.1"), start_cloth="before.usdc@1000",
 )  # fmt: skip
 
 
@@ -63,6 +64,7 @@ def test_what_is_no_request_is_not_read(document):
         ({"samples_per_frame": 0}, "--samples-per-frame: 0 samples in each frame; 1 to 64 are allowed"),
         ({"pre_roll": float("nan")}, "--pre-roll: nan seconds; 0 to 600 are allowed"),
         ({"asset_version": "v\n1"}, "--asset-version: 'v.*'; 1 to 1000 printable characters are allowed"),
+        ({"lbs": True, "fabric": "silk"}, "linear blend skinning has no fabric"),
         ({"hold": 101}, "--hold: 101 frames; 1 to 100 are allowed"),
         ({"asset_identifier": ""}, "--asset-identifier: ''; 1 to 1000 printable characters are allowed"),
         ({"refined_output": "voxels"}, "--refined-output: 'voxels'; it is one of joints, points"),
@@ -85,3 +87,10 @@ def test_paths_are_as_good_as_text():
 def test_inputs_can_lie_elsewhere():
     moved = CHANGED.relocated(lambda path: f"/farm/{path}")
     assert moved.inputs == {name: f"/farm/{path}" for name, path in INPUTS.items()} and moved.fps == CHANGED.fps
+
+
+def test_a_start_is_relocated_as_inputs_are():
+    moved = CHANGED.relocated(lambda path: f"/there/{path}")
+    assert moved.start_cloth == "/there/before.usdc@1000" and moved.model == "/there/cape.safetensors"
+    plain = BakeRequest(**INPUTS, start_cloth="a@b.usdc").relocated(lambda path: f"/there/{path}")
+    assert plain.start_cloth == "/there/a@b.usdc"

@@ -22,6 +22,7 @@ from ssilk_core.network.settings import ModelConfig
 from ssilk_core.physics.collision import CollisionBody, limb_axes
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import Collider, ShotWorld
+from ssilk_core.scene.fabric_range import FabricRange, fabric_with, factors_of, inputs_of
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.scene.kinematics import motion_transforms
@@ -495,3 +496,36 @@ def test_colliders_are_seen_on_a_body_as_in_training(scene, members, family, toy
         replace(its, proximity=seen), file.scene.character.skeleton, parts.model.joints
     ).proximity
     np.testing.assert_allclose(features, told, atol=2e-3)
+
+
+def test_a_model_may_know_bodies_and_fabrics(scene, members, family, toy_motion, tmp_path):
+    """Put on both, in either order, it is what it is when it sees both."""
+    motion, own = toy_motion(scene, 24), Fabric("toy")
+    fabrics = FabricRange.of(own, ["4"])
+    base = model_file(GarmentModel(scene, CONFIG, np.arange(3), 0), own, {})
+    job = family_job(scene, family, motion, tmp_path / "m.safetensors", base=base, whole=True, fabrics=fabrics)
+    parts = build_parts(job, CPU)
+    stepper = parts.stepper(job.train, 0)
+    for iteration in range(3):
+        stepper.run(iteration)
+    with torch.no_grad():
+        generator = torch.Generator().manual_seed(1)
+        for value in parts.model.parameters():
+            value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    save_model(tmp_path / "both.safetensors", model_file(parts.model, own, {}, fabrics))
+    file, place = load_model(tmp_path / "both.safetensors"), family.bodies.members[1]
+    fabric = fabric_with(own, np.array([2, 1, 0.5, 3, 1.0]), "odd")
+    one, other = file.on_body(place).on_fabric(fabric), file.on_fabric(fabric).on_body(place)
+    for name, value in one.parameters.items():
+        np.testing.assert_allclose(other.parameters[name], value, atol=1e-6)
+    its = motion_on(motion, members[0].skeleton, members[1].skeleton, 1 + float(family.bodies.taller @ place))
+    with torch.no_grad():
+        parts.model.wear(torch.tensor(place, dtype=torch.float32))
+        parts.model.fabric.copy_(torch.tensor(inputs_of(factors_of(own, fabric)), dtype=torch.float32))
+        unfolded = frames_of(parts.model, its, members[1].skeleton)
+        torch.testing.assert_close(frames_of(network(one), its, members[1].skeleton), unfolded, atol=1e-4, rtol=1e-3)
+    parts.model.wear(torch.zeros(family.bodies.size))
+    parts.model.fabric.zero_()
+    assert [each.name for each in parts.validator.score(parts.model).bodies][-2:] == [
+        "fabric softest", "fabric stiffest",
+    ]  # fmt: skip
