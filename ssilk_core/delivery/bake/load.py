@@ -117,7 +117,7 @@ class LoadedGarment:
         around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
         start = None
         if request.start_cloth:
-            need_startable(request)
+            need_startable(request, loops=read.loop is not None)
             read = replace(read, whole=read.sampled, lead=0)  # nothing is rolled out before it
             start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
@@ -129,6 +129,7 @@ class LoadedGarment:
             **({"reduced": reduction.to_metadata()} if reduction else {}),
             "request": request.to_metadata(),
             "motion_sha256": held.first,
+            **({} if start is None else {"start_cloth_sha256": start.digest}),
         }
         return BakeRollout(
             request=request,
