@@ -22,7 +22,7 @@ from ssilk_core.physics.intersections.layers import ClothLayers
 from ssilk_core.scene.kinematics import bind_pose
 
 from .test_skeletons import JOINTS as OTHER_JOINTS
-from .test_skeletons import put_on, write_clip, write_other
+from .test_skeletons import put_on, stretch_in, write_clip, write_other
 
 TRAIN = "train rigged.usda --motions clip.usda"
 
@@ -384,12 +384,6 @@ def save_graded(model: str, output: str) -> None:
     file = load_model(model)
     garment = replace(file.scene.garment, graded=True)
     save_model(output, replace(file, scene=replace(file.scene, garment=garment)))
-
-
-def stretch_in(page: str) -> float:
-    """The mean of the energy of stretch on a page."""
-    row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
-    return float(row.partition(">")[2].partition("<")[0])
 
 
 def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_trained(world, capsys):
