@@ -86,7 +86,7 @@ def open_subject(path: Path, stage: Path, device: str) -> Subject:
     if file.bodies:
         on = worn(file, open_stage(stage), None)
         dressed = EvaluationScene(on.scene, file.fabric, file.config.fps, select_device(device))
-        base = base_of(file, on.body)
+        base = base_of(file, on.member)
         return Subject(path.stem, on.file, network(on.file, on.scene).to(dressed.device), dressed, base)
     dressed = dressed_in(file, stage, device)
     return Subject(path.stem, file, network(file, dressed.scene).to(dressed.device), dressed)

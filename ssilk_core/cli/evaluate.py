@@ -144,7 +144,7 @@ def open_model(
     for event in (*on.told, *told):
         report(event)
     build = partial(Network, network(file).to(device))
-    return OpenedModel(path, file, "ssilk", build, base_of(whole, on.body))
+    return OpenedModel(path, file, "ssilk", build, base_of(whole, on.member))
 
 
 def evaluated(

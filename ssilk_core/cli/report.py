@@ -157,7 +157,10 @@ def _sewn(
     file = file or model_of(path, said, part.record.model_hash)
     if file is not None:
         sewn = sewn_mesh(part.mesh, file)
-        how = "The garment is one for all bodies of its model: stretch counts from its shape on the first of them."
+        where, body = "was put onto another skeleton", "the body of its training"
+        if file.bodies is not None:
+            where, body = "is one for all bodies of its model", "the first of them"
+        how = f"The garment {where}: stretch counts from its shape on {body}."
         graded = "The garment is graded to this body: stretch counts from where it lies on it."
         return sewn, how if sewn is not part.mesh else graded if file.scene.garment.graded else ""
     name = part.mesh.path.rpartition("/")[2]

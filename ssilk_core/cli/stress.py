@@ -108,7 +108,7 @@ def _subject(options: argparse.Namespace, stage: Path, report: Reporter) -> Stre
         report(Message(f"{on.scene.character.path}: the first body of the model's family"))
     for event in on.told:
         report(event)
-    skeleton, base = on.scene.character.skeleton, base_of(whole, on.body)
+    skeleton, base = on.scene.character.skeleton, base_of(whole, on.member)
     clip = read_motion(str(options.motion), skeleton) if options.motion else None
     if clip and base and has_bones(clip, base[0]) and not has_bones(clip, skeleton):
         clip = motion_on(clip, base[0], skeleton, base[1])

@@ -56,7 +56,6 @@ class TrainJob:
             moves becomes tight in `scene` (`inner_garments.loosened`).
         family: bodies to train for, the scene's as the base; None for that one alone. The garment in `scene` says
             whether it is graded to them.
-        family: bodies to train for, the scene's as the base; None for that one alone.
         fabrics: range of fabrics to train for, as factors of `fabric`; None for that one alone.
         loosened: how many vertices become tight.
     """

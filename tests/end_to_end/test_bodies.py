@@ -21,6 +21,9 @@ from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.layers import ClothLayers
 from ssilk_core.scene.kinematics import bind_pose
 
+from .test_skeletons import JOINTS as OTHER_JOINTS
+from .test_skeletons import put_on, stretch_in, write_clip, write_other
+
 TRAIN = "train rigged.usda --motions clip.usda"
 
 
@@ -383,12 +386,6 @@ def save_graded(model: str, output: str) -> None:
     save_model(output, replace(file, scene=replace(file.scene, garment=garment)))
 
 
-def stretch_in(page: str) -> float:
-    """The mean of the energy of stretch on a page."""
-    row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
-    return float(row.partition(">")[2].partition("<")[0])
-
-
 def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_trained(world, capsys):
     from ssilk_core.physics.energy import GarmentEnergy
 
@@ -670,3 +667,22 @@ def test_clips_that_were_made_for_a_body_are_played_as_they_are(world, toy, caps
     for motion, stage, warned in cases:
         assert run(f"bake family.safetensors --stage {stage}.usda --motion {motion} -o {stage}_shot.usda") == EXIT_OK
         assert capsys.readouterr().err.count("retarget it to the bones of this body") == warned
+
+
+def test_a_family_is_measured_on_a_character_with_more_joints(world):
+    """Its joints are no coordinates of the family, and its motions are none of the family's first body."""
+    axes = write_other(world / "other.usda")
+    write_clip(world / "other_clip.usda", axes)
+    stage = Usd.Stage.Open("other.usda")
+    rig = UsdSkel.Skeleton(stage.GetPrimAtPath("/Hero/Rig"))
+    binds, rests = rig.GetBindTransformsAttr(), rig.GetRestTransformsAttr()
+    rig.GetJointsAttr().Set([*OTHER_JOINTS, f"{OTHER_JOINTS[1]}/tail"])
+    binds.Set([*binds.Get(), binds.Get()[1]])
+    rests.Set([*rests.Get(), Gf.Matrix4d(1)])
+    stage.Save()
+    put_on()
+    (world / "clips").mkdir()
+    shutil.copy("other_clip.usda", "clips")
+    asked = "family.safetensors --stage other_skirt.usda"
+    assert run(f"evaluate {asked} --motions clips --no-probes -o figures.json") == EXIT_OK
+    assert run(f"stress {asked} --motion other_clip.usda --quick --only 'rate: 60'") == EXIT_OK

@@ -3,6 +3,7 @@
 
 import json
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -316,6 +317,14 @@ def test_a_farm_certifies_an_outer_garment_over_the_inner_one_of_its_job(toy, co
     assert main(shlex.split("task job/job.json -o layers --check")) == 3
     assert main(shlex.split("task job/job.json -o layers")) == 0
     assert main(shlex.split("task job/job.json -o layers --check")) == 0
+    # Another job brings another garment into the shot: the last step counts its pairs, too.
+    shutil.copy("coat.safetensors", "cape.safetensors")
+    more = "farm cape.safetensors --stage rigged.usda --motion walk.usda -o layers --bundle more"
+    assert main(shlex.split(more)) == 0
+    assert main(shlex.split("task more/job.json -o layers")) == 0
+    assert main(shlex.split("task more/job.json -o layers --check")) == 0
+    said = read_provenance("layers/shots/walk/shot.usda")["layers"]
+    assert "skirt" in said["cape"] and "skirt" in said["coat"]
     capsys.readouterr()
     assert main(shlex.split(f"{farm.replace('skirt.safetensors', '')} --bundle alone")) == 0
     assert "walk/coat: it was trained over skirt; the job has none of these" in capsys.readouterr().err

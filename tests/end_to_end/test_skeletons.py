@@ -10,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
 
 from ssilk_core.cli import main
+from ssilk_core.network.checkpoint import load_model
+from ssilk_core.physics.energy import GarmentEnergy
 
 JOINTS = ("root_x", "root_x/spine_01", "root_x/spine_01/skull")
 NAMES = {"Hips": "root_x", "Spine": "spine_01", "Head": "skull"}
@@ -107,6 +110,12 @@ def shown(path: str, frame: float) -> dict[str, np.ndarray]:
             points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(frame))
             found[prim.GetName()] = points @ to_world[:3, :3] + to_world[3, :3]
     return found
+
+
+def stretch_in(page: str) -> float:
+    """The mean of the energy of stretch on a page."""
+    row = Path(page).read_text().partition("<td>stretch [J]</td>")[2]
+    return float(row.partition(">")[2].partition("<")[0])
 
 
 def test_a_map_is_proposed_to_be_edited_and_an_edited_one_is_kept_and_checked(world, capsys):
@@ -228,3 +237,19 @@ def test_a_larger_character_is_told(world, capsys):
     capsys.readouterr()
     run("bake model.safetensors --stage other_skirt.usda --motion other_clip.usda -o out.usda")
     assert "20% taller than the body of the training" in capsys.readouterr().err
+
+
+def test_a_page_counts_stretch_from_the_body_of_the_training(world):
+    """The cloth of a small model lies on a character that is a quarter larger: it is stretched there, at rest too."""
+    write_clip(world / "large_clip.usda", write_other(world / "large.usda", 1.25))
+    put_on("large.usda", "large_skirt.usda")
+    assert run("bake model.safetensors --stage large_skirt.usda --motion large_clip.usda -o large_shot.usda") == 0
+    assert run("report large_shot.usda -o page.html") == 0
+    page = Path("page.html").read_text()
+    assert "put onto another skeleton: stretch counts from its shape on the body of its training" in page
+    file, found = load_model("model.safetensors"), []
+    energy = GarmentEnergy(file.scene.garment.mesh, file.fabric)
+    for frame in range(40):
+        points = shown("large_shot.usda", frame)["Skirt"]
+        found.append(float(energy.stretch(torch.tensor(points[:, :, None], dtype=torch.float32))))
+    assert stretch_in("page.html") == pytest.approx(np.mean(found), rel=0.02)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom, Vt
 
 from .conftest import define_mesh, run
-from .test_direction import lively, points_of
+from .test_direction import direct, lively, points_of
+from .test_loops import write_cycle
 
 BAKE = "bake lively.safetensors --stage rigged.usda --motion clip.usda"
 
@@ -74,10 +75,16 @@ def write_cache(path: str, frames: list[np.ndarray], first: int) -> None:
     stage.GetRootLayer().Save()
 
 
-def test_what_latents_miss_fades_from_the_first_frame_on(copy, capsys):
+def write_bumps(path: str) -> np.ndarray:
+    """Write a cache whose bumps no latents have; return how far they are from the whole shot (F, V, 3)."""
     whole = points_of("whole.usdc")
     bumps = 0.004 * np.sin(40 * whole[:, :, :1]) * np.array([1.0, 0.5, -1.0])
-    write_cache("other.usdc", list((whole + bumps)[12:15]), 12)
+    write_cache(path, list((whole + bumps)[12:15]), 12)
+    return bumps
+
+
+def test_what_latents_miss_fades_from_the_first_frame_on(copy, capsys):
+    whole, bumps = points_of("whole.usdc"), write_bumps("other.usdc")
     assert run(f"{BAKE} --range 14-29 --start-cloth other.usdc -o second.usdc") == 0
     assert "a blendshape that fades in 0.5 s makes up for the rest" in capsys.readouterr().err
     second, free = points_of("second.usdc"), ~pinned()
@@ -134,3 +141,47 @@ def test_a_start_far_from_the_character_is_refused(copy, capsys):
 def test_layers_refuse_a_start(copy, capsys):
     assert run(f"{BAKE} --start-cloth first.usdc -o layers") == 2
     assert "in a folder of layers or a job" in capsys.readouterr().err and not Path("layers").exists()
+
+
+def test_what_latents_miss_is_gone_where_the_garment_is_held(copy):
+    """It would fade until frame 29; skinning holds the garment from frame 22 on."""
+    bumps = write_bumps("other.usdc")
+    direct("clip.usda", free={18: 1.0, 22: 0.0})
+    assert run(f"{BAKE} --range 14-29 -o plain.usdc") == 0
+    assert run(f"{BAKE} --range 14-29 --start-cloth other.usdc -o second.usdc") == 0
+    plain, second, free = points_of("plain.usdc"), points_of("second.usdc"), ~pinned()
+    np.testing.assert_allclose(second[8:], plain[8:], atol=1e-5)
+    assert np.abs(second[0] - (points_of("whole.usdc") + bumps)[14])[free].max() < 2e-5
+    assert run("verify second.usdc") == 0
+
+
+def test_a_shot_that_its_stage_calls_a_loop_has_no_start(copy, capsys):
+    write_cycle("cycle.usda")
+    words = BAKE.replace("clip.usda", "cycle.usda")
+    assert run(f"{words} -o first.usdc") == 0
+    shot = Usd.Stage.Open("cycle.usda")
+    shot.OverridePrim("/Hero/Skirt").CreateAttribute("ssilk:loop", Sdf.ValueTypeNames.Bool).Set(True)
+    shot.GetRootLayer().Save()
+    capsys.readouterr()
+    assert run(f"{words} --start-cloth first.usdc@0 -o shot.usdc") == 2
+    assert "a start and a loop; one of both; leave --loop out, and ssilk:loop" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("start", ["first.usdc", "first.usdc@14"])
+def test_the_cloth_that_a_shot_begins_with_is_not_overwritten(copy, capsys, start):
+    before = Path("first.usdc").read_bytes()
+    assert run(f"{BAKE} --range 14-29 --start-cloth {start} -o first.usdc") == 2
+    assert "first.usdc: the output is also an input" in capsys.readouterr().err
+    assert Path("first.usdc").read_bytes() == before
+
+
+def test_verify_finds_a_start_in_layers_and_tells_that_it_has_changed(copy, capsys):
+    layer = "layers/shots/clip/lively/anim.usdc"
+    assert run(f"{BAKE} --range 0-14 -o layers") == 0
+    assert run(f"{BAKE} --range 14-29 --start-cloth {layer} -o second.usdc") == 0
+    capsys.readouterr()
+    assert run("verify second.usdc") == 0
+    assert "has changed" not in capsys.readouterr().err
+    assert run(f"{BAKE} --range 0-14 --pre-roll 1 -o layers") == 0
+    assert run("verify second.usdc") in (0, 3)
+    assert f"{layer}: the start cloth has changed since the shot was baked" in capsys.readouterr().err

@@ -37,13 +37,19 @@ class WornModel:
         scene: its garment there.
         told: what there is to say of the body.
         body: what tells it from other bodies of the model's family: its coordinates, then where its joints are
-            bound and how far off the family its points are [m]; None for the body that the model is of.
+            bound and how far off the family its points are [m]; on another skeleton where the joints are bound that
+            the network sees [m]; None for the body that the model is of.
     """
 
     file: ModelFile
     scene: Scene
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
+
+    @property
+    def member(self) -> tuple[float, ...] | None:
+        """`body` of a body of the model's family; None for the first of these, and on another skeleton."""
+        return None if self.scene.character.skeleton.seen else self.body
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:

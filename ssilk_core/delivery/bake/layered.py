@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +16,7 @@ from ...physics.intersections.pairs import can_find
 from ...scene.assets import Floats
 from .record import TaskRecord
 from .shots import STAGE, finished, write_shot_stage
-from .stated_layers import layer_facts, stated_layers
+from .stated_layers import layer_facts, stated_layers, worn_pairs
 from .task import BakeTask
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
         SsilkError: a layer cannot be read.
     """
     found = whole(finished(folder, shot))
-    pairs = [pair for pair in combinations(found, 2) if found[pair[0]].wearer == found[pair[1]].wearer]
+    pairs = worn_pairs(found)
     if pairs and not can_find():
         report(Message(f"{folder / 'shots' / shot}: cloth through other garments is {NOT_COUNTED}", "warning"))
         return []

@@ -16,7 +16,7 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Scene, Skeleton
+from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Skeleton
 from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.posed_alike import shaped_as_in_stage
@@ -79,8 +79,8 @@ class LoadedGarment:
         info: of the garment as an asset.
         riders: what rides on it.
         told: what was found about the body and riders, to be reported.
-        body: which of the model's family it lies on (`bodies.WornModel.body`).
-        first: the skeleton of the first body of that family; None where it lies on that one.
+        body: which body it lies on (`bodies.WornModel.body`).
+        first: the skeleton of the first body of the model's family; None where it lies on no other one of that.
     """
 
     request: BakeRequest
@@ -117,7 +117,7 @@ class LoadedGarment:
         around = ShotSurroundings(motion, request.stage, self.deformer.scene, read.source, asked)
         start = None
         if request.start_cloth:
-            need_startable(request)
+            need_startable(request, loops=read.loop is not None)
             read = replace(read, whole=read.sampled, lead=0)  # nothing is rolled out before it
             start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
@@ -129,6 +129,7 @@ class LoadedGarment:
             **({"reduced": reduction.to_metadata()} if reduction else {}),
             "request": request.to_metadata(),
             "motion_sha256": held.first,
+            **({} if start is None else {"start_cloth_sha256": start.digest}),
         }
         return BakeRollout(
             request=request,
@@ -336,12 +337,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=(*told, *in_words),
         body=on.body,
-        first=first.scene.character.skeleton if on.body and _same_joints(first.scene, scene) else None,
+        first=first.scene.character.skeleton if on.member else None,
     )
-
-
-def _same_joints(one: Scene, other: Scene) -> bool:
-    return one.character.skeleton.joint_count == other.character.skeleton.joint_count
 
 
 def _on_stage(

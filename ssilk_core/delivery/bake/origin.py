@@ -89,7 +89,7 @@ class ShotOrigin:
 
     Attributes:
         request: what was baked, with the present paths of its inputs.
-        hashes: SHA-256 of "model" and "motion" when the shot was baked.
+        hashes: SHA-256 of "model", "motion" and, where it has one, "start_cloth" when the shot was baked.
     """
 
     request: BakeRequest
@@ -132,7 +132,8 @@ def read_origin(
     start = stored.start_cloth
     if start is not None:
         place, code = split_start(start)
-        if (there := _existing(shot, place, None)) is None:
+        hashes["start_cloth"] = held = provenance.get("start_cloth_sha256")
+        if (there := _existing(shot, place, held, baked=True)) is None:
             fail(
                 str(shot),
                 f"the cloth that it begins with is not at {place}",
@@ -143,20 +144,25 @@ def read_origin(
     return ShotOrigin(moved, hashes)
 
 
-def _existing(shot: Path, near: str, held: object) -> Path | None:
+def _existing(shot: Path, near: str, held: object, *, baked: bool = False) -> Path | None:
     """Return the place of an input where there is a file; None where there is none.
 
     It is looked for where it lay as seen from the shot, then in the same place as seen from the working folder and
     from each folder above the shot, because some inputs may have stayed where they were. Of several files the first
-    that holds what the input held is taken. What bakes wrote is no input.
+    that holds what the input held is taken. What bakes wrote is no input, unless it is cloth to begin with.
 
     Args:
         held: SHA-256 of the input when the shot was baked, where the shot says it.
+        baked: whether a layer that a bake wrote is one.
     """
     parts = Path(near).parts
     tail = Path(*parts[next((at for at, part in enumerate(parts) if part != ".."), 0) :])
     places = [shot.parent / near, Path(near), Path(tail), *(above / tail for above in shot.absolute().parents)]
-    there = [path for path in places if _file(path).is_file() and not _is_baked(_file(path), shot)]
+    there = [
+        path
+        for path in places
+        if _file(path).is_file() and not (_file(path).samefile(shot) if baked else _is_baked(_file(path), shot))
+    ]
     if len({_file(path).resolve() for path in there}) == 1:
         return there[0]
     return next((path for path in there if sha256(_file(path)) == held), next(iter(there), None))

@@ -29,7 +29,7 @@ from .origin import read_origin
 from .request import BakeRequest
 from .result import BakeResult, Verification
 from .shots import finished, is_stage, place_of
-from .stated_layers import stated_layers
+from .stated_layers import all_stated
 from .task import garment_name
 from .verification import verify
 from .write import bake
@@ -125,12 +125,14 @@ def verify_garments(
 
 
 def stated_over(shot: Path) -> list[LayerFigures]:
-    """Return what the stage of a shot in layers says of how its garments lie over one another; none of other files.
+    """Return what the stage of a shot in layers says of how its garments lie over one another.
+
+    There is none of other files, and none where the stage does not tell of all pairs.
 
     Raises:
         SsilkError: it cannot be read.
     """
-    return stated_layers(shot, finished(*place_of(shot))) if shot.suffix != GLB and is_stage(shot) else []
+    return all_stated(shot, finished(*place_of(shot))) if shot.suffix != GLB and is_stage(shot) else []
 
 
 def holds_several(shot: Path) -> bool:

@@ -221,7 +221,7 @@ class BakeRollout:
         """Yield the poses of samples of `whole`, counted from `start`, and list where the rollout was lost."""
         rolled = partial(self._rolled, roller=roller, lost=lost, start=start)
         if self.direction is not None:
-            directed = DirectedPoses(self.direction, self.deformer, rolled)
+            directed = DirectedPoses(self.direction, self._unfaded, rolled)
             for pose in directed.poses(start, stop):
                 self.held_off[:] = directed.off  # now: a loop may ask for no more
                 yield pose
@@ -323,9 +323,18 @@ class BakeRollout:
         begun.__dict__["_given"] = self._given
         return begun
 
+    @property
+    def _unfaded(self) -> Deformer:
+        """The garment without the blendshape that fades, which no pose of the network has."""
+        own = self.deformer
+        return replace(own, shapes=own.shapes[:-1]) if self.is_fading else own
+
     def _faded(self, pose: GarmentPose) -> GarmentPose:
-        """Return poses with the weight of what the first frame lacks."""
-        weights = fading(range(pose.start, pose.start + pose.frame_count), self.motion.fps)
+        """Return poses with the weight of what the first frame lacks: none where skinning holds the garment."""
+        frames = range(pose.start, pose.start + pose.frame_count)
+        weights = fading(frames, self.motion.fps)
+        if self.direction is not None:
+            weights = weights * self.direction.free[frames.start : frames.stop]
         return replace(pose, weights=np.concatenate([pose.weights, weights[:, None]], axis=1))
 
     def _fading(self, pose: GarmentPose) -> Floats:

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from ...errors import fail
+from ...files import sha256, split_location
 from ...scene.assets import Floats, Garment
 from .request import BakeRequest, split_start
 
@@ -25,11 +27,13 @@ class StartCloth:
         points: one step of the model before the first frame, and in it, in world space [m], shape (2, V, 3).
         moves: whether the first was read: otherwise it is as the second.
         where: file, prim and time code, for messages.
+        digest: SHA-256 of the file.
     """
 
     points: Floats
     moves: bool
     where: str
+    digest: str
 
 
 def read_start(text: str, garment: Garment, fps: float) -> StartCloth:
@@ -58,7 +62,7 @@ def read_start(text: str, garment: Garment, fps: float) -> StartCloth:
     points = np.stack([cache.at(max(earlier, first)) if moves else now, now])
     if not np.isfinite(points).all():
         fail(place, "points that are not finite", "all must be finite", "write it again")
-    return StartCloth(points, moves, f"{place} at {code:.9g}")
+    return StartCloth(points, moves, f"{place} at {code:.9g}", sha256(Path(split_location(place)[0])))
 
 
 def fading(frames: range, fps: float) -> Floats:
@@ -67,12 +71,16 @@ def fading(frames: range, fps: float) -> Floats:
     return np.asarray(1 - done**2 * (3 - 2 * done), np.float64)
 
 
-def need_startable(request: BakeRequest) -> None:
-    """Raise `SsilkError` where a start is asked for together with what it does not go with."""
+def need_startable(request: BakeRequest, loops: bool) -> None:
+    """Raise `SsilkError` where a start is asked for together with what it does not go with.
+
+    Args:
+        loops: whether the shot is a loop, as the request or its stage says.
+    """
     for found, there, todo in (
         ("linear blend skinning", request.lbs, "leave --lbs out"),
         ("a run-up", request.pre_roll > 0, "leave --pre-roll out"),
-        ("a loop", request.loop, "leave --loop out"),
+        ("a loop", loops, "leave --loop out, and ssilk:loop of the garment in the shot"),
         ("a solver in latents, which starts by itself", request.latent_iterations > 0, "leave --quality latent out"),
         ("poses that are held", request.hold > 1, "leave --hold out"),
     ):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,21 @@ def current_facts(said: Mapping[str, Any], found: Records) -> dict[str, object]:
             if layers and pair.get(COUNTED_IN) == layers:
                 kept.setdefault(outer, {})[inner] = dict(pair)
     return {LAYERS: kept} if kept else {}
+
+
+def worn_pairs(found: Records) -> list[tuple[str, str]]:
+    """Return the pairs of garments that one character wears, without levels of quality of other garments."""
+    wearers = {name: record.wearer for name, record in found.items() if record and not record.level_of}
+    return [(one, other) for one, other in combinations(wearers, 2) if wearers[one] == wearers[other]]
+
+
+def all_stated(stage: Path, found: Records) -> list[LayerFigures]:
+    """Return what `stated_layers` does where a stage tells of each pair that one character wears; else none.
+
+    A garment that was baked since is in no figures, and pairs that do not touch are not, so that these are counted.
+    """
+    stated = stated_layers(stage, found)
+    return stated if len(stated) == len(worn_pairs(found)) else []
 
 
 def stated_layers(stage: Path, found: Records) -> list[LayerFigures]:

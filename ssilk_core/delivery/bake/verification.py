@@ -71,7 +71,8 @@ def verify(
     rollout = load_rollout(replace(origin.request, device=device or origin.request.device))
     for name, then in origin.hashes.items():
         if then != rollout.provenance[f"{name}_sha256"]:
-            text = f"{getattr(origin.request, name)}: the {name} has changed since the shot was baked from it"
+            what = name.replace("_", " ")
+            text = f"{getattr(origin.request, name)}: the {what} has changed since the shot was baked from it"
             report(Message(text, "warning"))
     report(Started("verify", rollout.motion.frame_count, {"shot": str(path)}))
     found = verify_file(rollout, path, report)

@@ -22,7 +22,7 @@ from .hiding import hidden_polygons_of
 from .latents import solved
 from .origin import shot_metadata
 from .refinement import refined
-from .request import BakeRequest, need_body
+from .request import BakeRequest, need_body, split_start
 from .result import BakeResult, Verification
 from .riders import need_joints
 from .rollout import BakeRollout
@@ -129,7 +129,8 @@ def _check_output(request: BakeRequest, path: Path) -> None:
     if path.suffix == GLB and request.writes_points:
         fail(str(path), "refined points", "a glb holds joints and morph targets", "use --refined-output joints")
     need_writable(path)
-    need_not_input(path, request.model, request.stage, split_location(request.motion)[0])
+    start = request.start_cloth and split_location(split_start(request.start_cloth)[0])[0]
+    need_not_input(path, request.model, request.stage, split_location(request.motion)[0], start)
 
 
 def _write_verified(

@@ -13,7 +13,7 @@ from ..bake import BakeTask, LayerFolder
 from ..bake.inputs import InputFiles, InputHashes, need_pinned
 from ..bake.layered import tell_layers
 from ..bake.shots import STAGE, finished
-from ..bake.stated_layers import stated_layers
+from ..bake.stated_layers import all_stated
 from .job import FarmJob
 
 READERS = 16  # threads that read files for a check
@@ -76,7 +76,7 @@ def check_tasks(job: FarmJob, folder: Path, report: Reporter) -> None:
     if fault:
         raise VerificationError(fault)
     for shot in dict.fromkeys(task.shot for task in tasks):
-        if not stated_layers(folder / "shots" / shot / STAGE, finished(folder, shot)):
+        if not all_stated(folder / "shots" / shot / STAGE, finished(folder, shot)):
             tell_layers(folder, shot, report, "check")
     report(Result("check", {"tasks": len(tasks), "output": str(folder)}))
 

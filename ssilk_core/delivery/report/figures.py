@@ -147,7 +147,7 @@ def bodies_of(file: ModelFile) -> list[Section]:
 def learning(document: Mapping[str, Any]) -> Section:
     """Return the section of the learning curve that a training writes beside its model."""
     points, lbs = document["points"], document["lbs"]
-    bodies = [point["validation"].get("bodies", []) for point in points]  # of a family, its first one left out
+    bodies = [point["validation"].get("bodies", []) for point in points]  # of a family, and fabrics of a range
     best = min(range(len(points)), key=lambda number: judged(points[number]["validation"]))
     times = [point["seconds"] for point in points]
     totals, inside = ([point["validation"][name] for point in points] for name in ("total", "collisions"))
@@ -167,7 +167,9 @@ def learning(document: Mapping[str, Any]) -> Section:
     if all(bodies):
         names = [each["name"] for each in bodies[best]]
         curves = {name: (times, [found[row]["total"] for found in bodies]) for row, name in enumerate(names)}
-        panel = ChartPanel(title="total on other bodies", x="training time [s]", y="J", curves=curves)
+        panel = ChartPanel(
+            title="total on other bodies and of other fabrics", x="training time [s]", y="J", curves=curves
+        )
         rows.insert(1, [panel])
     words = (
         f"Best: {totals[best]:.4g} J at {times[best]:.0f} s. "

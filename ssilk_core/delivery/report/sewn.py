@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rest shape of a shot's garments, which on another body of a model's family need not be where they lie.
+"""The rest shape of a shot's garments, which on another body or skeleton need not be where they lie.
 
 A shot has a garment where it lies on its body, and says which model moves it. Whether that model keeps the rest shape
-of the first body is in the model's file alone.
+of the body of its training is in the model's file alone.
 """
 
 from __future__ import annotations
@@ -12,10 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import SsilkError
 from ...files import sha256
 from ...network.checkpoint import ModelFile, load_model
 from ...scene.assets import Mesh
+
+SAME = 1e-4  # [m] between points of a garment that lies where it was trained
 
 
 def model_of(shot: Path, said: Mapping[str, Any], digest: str) -> ModelFile | None:
@@ -38,10 +42,12 @@ def model_of(shot: Path, said: Mapping[str, Any], digest: str) -> ModelFile | No
 def sewn_mesh(mesh: Mesh, file: ModelFile) -> Mesh:
     """Return a garment of a shot in the rest shape that its model trained it with."""
     garment = file.scene.garment
-    one_for_all = file.bodies is not None and not garment.graded
-    if not one_for_all or garment.mesh.vertex_count != mesh.vertex_count:
+    if garment.graded or garment.mesh.vertex_count != mesh.vertex_count:
         return mesh
-    return replace(mesh, points=garment.sewn_mesh.points)
+    sewn = garment.sewn_mesh.points
+    if file.bodies is None and np.abs(mesh.points - sewn).max(initial=0) < SAME:
+        return mesh
+    return replace(mesh, points=sewn)
 
 
 def _models(said: Mapping[str, Any]) -> Iterator[str]:

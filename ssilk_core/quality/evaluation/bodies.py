@@ -25,7 +25,7 @@ def base_of(file: ModelFile, body: Sequence[float] | None) -> tuple[Skeleton, fl
 
     Args:
         file: the model for the family.
-        body: which it lies on (`bodies.WornModel.body`).
+        body: which of the family it lies on (`bodies.WornModel.member`).
     """
     if not (file.bodies and body):
         return None
