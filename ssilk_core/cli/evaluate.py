@@ -140,7 +140,7 @@ def open_model(
     for event in on.told:
         report(event)
     build = partial(Network, network(on.file).to(device))
-    return OpenedModel(path, on.file, "ssilk", build, base_of(whole, on.body))
+    return OpenedModel(path, on.file, "ssilk", build, base_of(whole, on.of_family))
 
 
 def evaluated(

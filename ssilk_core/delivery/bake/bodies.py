@@ -13,6 +13,7 @@ from ...events import Event, Message
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyPlace, has_bones, names_of
+from ...scene.posed_alike import turned
 from .character import BIND_TOLERANCE, TODO, in_order_of
 from .onto import put_onto
 
@@ -33,14 +34,20 @@ class WornModel:
         file: as a model for that body.
         scene: its garment there.
         told: what there is to say of the body.
-        body: what tells it from other bodies of the model's family: its coordinates, then where its joints are
-            bound and how far off the family its points are [m]; None for the body that the model is of.
+        body: what tells it from other bodies. Of the model's family these are its coordinates, then where its joints
+            are bound and how far off the family its points are [m]; of another skeleton, where the model's joints are
+            on it [m]. None for the body that the model is of.
     """
 
     file: ModelFile
     scene: Scene
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
+
+    @property
+    def of_family(self) -> tuple[float, ...] | None:
+        """`body`, where it is another one of the model's family, and none with another skeleton."""
+        return self.body if self.scene.character.skeleton.seen is None else None
 
 
 def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
@@ -52,6 +59,10 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
+    own = file.scene.character.skeleton
+    if own.seen is not None:  # it was put on this character already
+        again = in_order_of(own, turned(character, own.seen.turn))
+        return WornModel(file, replace(file.scene, character=again))
     if not _is_own(file, character) and (put := put_onto(file, stage, character)):
         return WornModel(put.file, put.file.scene, put.told, put.identity)
     names = file.bodies.family.bodies.meshes if file.bodies else ()

@@ -16,7 +16,7 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Scene, Skeleton
+from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Skeleton
 from ...scene.cycles import rounds
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.posed_alike import shaped_as_in_stage
@@ -323,12 +323,8 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         riders=riders,
         told=told,
         body=on.body,
-        first=first.scene.character.skeleton if on.body and _same_joints(first.scene, scene) else None,
+        first=first.scene.character.skeleton if on.of_family else None,
     )
-
-
-def _same_joints(one: Scene, other: Scene) -> bool:
-    return one.character.skeleton.joint_count == other.character.skeleton.joint_count
 
 
 def _on_stage(
