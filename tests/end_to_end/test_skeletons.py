@@ -179,6 +179,20 @@ def test_what_is_refined_and_what_is_skinned_alone_is_the_other_characters(world
     np.testing.assert_allclose(shown("lbs.usda", 9)["Skirt"], shown("own.usda", 9)["Skirt"], atol=2e-4)
 
 
+def test_it_is_evaluated_where_it_was_put(world, capsys):
+    put_on()
+    Path("motions").mkdir()
+    shutil.copy("other_clip.usda", "motions")
+    assert run("evaluate model.safetensors --stage other_skirt.usda --motions motions --no-probes -o its.json") == 0
+    shutil.copy("clip.usda", "motions/other_clip.usda")
+    assert run("evaluate model.safetensors --stage rigged.usda --motions motions --no-probes -o own.json") == 0
+    its, own = (
+        {row["method"]: row["figures"]["total"] for row in json.loads(Path(name).read_text())["figures"]}
+        for name in ("its.json", "own.json")
+    )
+    assert its == pytest.approx(own, rel=0.02) and its["ssilk"] != its["LBS"]
+
+
 def test_it_is_trained_anew_on_the_stage_that_was_written(world, toy):
     put_on()
     code = run("train other_skirt.usda --motions other_clip.usda -o other.safetensors", *toy.training)

@@ -15,6 +15,7 @@ from ...files import split_location
 from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyFamily, BodyPlace, has_bones, names_of
+from ...scene.posed_alike import turned
 from .character import BIND_TOLERANCE, TODO, in_order_of
 from .onto import put_onto
 
@@ -61,6 +62,10 @@ def worn(file: ModelFile, stage: Usd.Stage, root: str | None) -> WornModel:
     from ssilk_usd.reading.character import has_meshes, read_character
 
     character = read_character(stage, root=root, garment=None)
+    own = file.scene.character.skeleton
+    if own.seen is not None:  # it was put on this character already
+        again = in_order_of(own, turned(character, own.seen.turn))
+        return WornModel(file, replace(file.scene, character=again))
     if not _is_own(file, character) and (put := put_onto(file, stage, character)):
         return WornModel(put.file, put.file.scene, put.told, put.identity)
     names = file.bodies.family.bodies.meshes if file.bodies else ()
