@@ -36,7 +36,7 @@ from precision import (
 
 from ssilk_core.demo.garments import build_garment
 from ssilk_core.demo.motions import demo_shot
-from ssilk_core.demo.shipped import FAMILY_SUFFIX, need_trained_on, shipped_path
+from ssilk_core.demo.shipped import garment_of, need_trained_on, shipped_path
 from ssilk_core.errors import SsilkError, fail
 from ssilk_core.files import split_location
 from ssilk_core.network.checkpoint import ModelFile, load_model, save_model
@@ -56,7 +56,7 @@ def ship(path: Path, options: Namespace) -> tuple[list[str], dict[str, Any]]:
     subject, whole = open_subject(path, options.stage, options.device), load_model(path)
     if "shipped" in subject.file.provenance:
         fail(str(path), "packed already", "'ssilk train' writes what is needed")
-    garment = subject.name.removesuffix(FAMILY_SUFFIX)
+    garment = garment_of(subject.name)
     need_trained_on(build_garment(garment, subject.scene.character).mesh, subject.file, path)
     motions = held_out(options, subject, HELD_OUT)
     found = bearable(path, subject, options, motions)

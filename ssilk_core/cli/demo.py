@@ -2,9 +2,9 @@
 """Film a garment that ships beside linear blend skinning, then train a draft of it and film all three.
 
 The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
-Two choices train nothing: --garment cape_over_dress films an outfit, a cape that was trained over the hooded dress,
-and the dress; --garment cape_family films one model of the cape on three bodies side by side. The list outfit.toml,
-to inspect and train the outfit anew, is written beside it.
+Three choices train nothing: --garment cape_over_dress films an outfit, a cape that was trained over the hooded dress,
+and the dress; --garment cape_family films one model of the cape on three bodies side by side, and --garment
+cape_fabrics one in three fabrics. The list outfit.toml, to inspect and train the outfit anew, is written beside it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ from ..events import Message, Reporter, Result
 if TYPE_CHECKING:
     from ..scene.assets import Mesh
 
-FAMILY_GARMENT = "cape"  # of which a model for a family of bodies ships
-FAMILY = "cape_family"  # that model
+RANGED_GARMENT = "cape"  # of which models for a family of bodies and for a range of fabrics ship
+FAMILY, FABRICS = "cape_family", "cape_fabrics"  # these models
+FILMED_FABRICS = ("silk", "default", "leather")
 FILMED_BODIES = {"neutral": "", "tall": "tall", "heavy": "heavy"}  # by their captions
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
 
@@ -34,8 +35,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="folder for everything that the demo writes (default demo_out)",
     )  # fmt: skip
     verb.add_argument(
-        "--garment", choices=("cape", "fringe_skirt", "hooded_dress", "cape_over_dress", FAMILY), default="cape",
-        help="garment, an outfit of two, or one on a family of bodies (default cape)",
+        "--garment", choices=("cape", "fringe_skirt", "hooded_dress", "cape_over_dress", FAMILY, FABRICS),
+        default="cape", help="garment, an outfit of two, one on three bodies or in three fabrics (default cape)",
     )  # fmt: skip
     verb.add_argument("--pretrained", action="store_true", help="show the shipped model only")
     verb.add_argument(
@@ -50,15 +51,18 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     outfit = OVER.get(options.garment, ())
     wardrobe = _make_inputs(options, report)
-    garment = FAMILY_GARMENT if options.garment == FAMILY else options.garment
+    ranged = options.garment in (FAMILY, FABRICS)
+    garment = RANGED_GARMENT if ranged else options.garment
     shipped = open_shipped(options.garment, wardrobe[garment])
     report(Message(f"shipped {options.garment}: {origin(shipped)}"))
     if options.garment == FAMILY:
         _make_shots(options.output, report)
         commands = _on_bodies(options)
+    elif options.garment == FABRICS:
+        commands = _in_fabrics(options)
     else:
         commands = _outfit(options, outfit[1:]) if outfit else _shipped(options)
-    trains = not (outfit or options.pretrained or options.garment == FAMILY)
+    trains = not (outfit or options.pretrained or ranged)
     if trains:
         commands += _trained(options)
     for command in commands:
@@ -113,12 +117,28 @@ def _on_bodies(options: argparse.Namespace) -> list[list[str]]:
     from ..demo.shipped import shipped_path
 
     out, model = options.output, str(shipped_path(FAMILY))
-    shots = {caption: str(out / f"{FAMILY_GARMENT}_{caption}.usdc") for caption in FILMED_BODIES}
+    shots = {caption: str(out / f"{RANGED_GARMENT}_{caption}.usdc") for caption in FILMED_BODIES}
     return [
         *(
             ["bake", model, "--stage", str(demo_body_path(name)), "--motion", str(out / f"shot_{caption}.usdc"),
              "-o", shots[caption]]
             for caption, name in FILMED_BODIES.items()
+        ),
+        *_views(out / "shipped", shots, fps=30),
+    ]  # fmt: skip
+
+
+def _in_fabrics(options: argparse.Namespace) -> list[list[str]]:
+    """Return the commands that bake one model in three fabrics, and film them."""
+    from ..demo.shipped import shipped_path
+
+    out, stage = options.output, str(_body())
+    shots = {fabric: str(out / f"{RANGED_GARMENT}_{fabric}.usdc") for fabric in FILMED_FABRICS}
+    return [
+        *(
+            ["bake", str(shipped_path(FABRICS)), "--stage", stage, "--motion", str(out / "shot.usdc"),
+             "--fabric", fabric, "-o", shots[fabric]]
+            for fabric in FILMED_FABRICS
         ),
         *_views(out / "shipped", shots, fps=30),
     ]  # fmt: skip

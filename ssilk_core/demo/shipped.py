@@ -12,13 +12,20 @@ from ..network.checkpoint import ModelFile, load_model
 from ..scene.assets import Mesh
 
 FOLDER = Path(__file__).with_name("models")
-FAMILY_SUFFIX = "_family"  # of a garment's name, for its model for a family of bodies
+RANGES = ("_family", "_fabrics")  # behind a garment's name: its models for a family of bodies, a range of fabrics
 TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here
 
 
 def shipped_path(garment: str) -> Path:
     """Return where the shipped model of a garment of the wardrobe lies."""
     return FOLDER / f"{garment}.safetensors"
+
+
+def garment_of(name: str) -> str:
+    """Return the garment of the wardrobe that a shipped model is of."""
+    for suffix in RANGES:
+        name = name.removesuffix(suffix)
+    return name
 
 
 def open_shipped(garment: str, mesh: Mesh) -> ModelFile:

@@ -35,7 +35,7 @@ from ssilk_core.scene.assets import PINNED, Garment, Motion, Scene, Skeleton
 from ssilk_core.training.wardrobe.listing import read_list
 
 BUILT = (*garments.GARMENTS, *garments.OVER)
-SHIPPED = (*BUILT, demo.FAMILY)
+SHIPPED = (*BUILT, demo.FAMILY, demo.FABRICS)
 SHORT = shlex.split(
     "--set iterations=2 --set static_fraction=0.5 --set validate_every=2 --set valid_frames=4 --set batch=1 --set "
     "pretraining_batch=4 "
@@ -91,10 +91,10 @@ def rigged(garment: str, folder: Path) -> Scene:
     return load_scene(parser().parse_args(["rig", rig[-1], "-o", "unused"]), silent)
 
 
-@pytest.mark.parametrize("name", (*garments.GARMENTS, demo.FAMILY))
+@pytest.mark.parametrize("name", (*garments.GARMENTS, demo.FAMILY, demo.FABRICS))
 def test_shipped_models_fit_what_the_demo_builds(name, drafted, tmp_path):
     """The garment and its classes; a model keeps its own weights and rig. Settling may move the garment."""
-    garment = name.removesuffix(shipped.FAMILY_SUFFIX)
+    garment = shipped.garment_of(name)
     folder = drafted[0] if garment == "cape" else tmp_path
     built, model = rigged(garment, folder), load_model(shipped.shipped_path(name))
     mine, theirs = model.scene, replace(built, character=replace(built.character, bodies=()))
@@ -183,6 +183,17 @@ def test_one_model_is_filmed_on_three_bodies(tmp_path, capsys):
     assert high[1] > 1.1 * high[0] and abs(high[2] - high[0]) < 0.1 * high[0]
     assert all(shot["Mesh"][:, 1].min() == pytest.approx(0, abs=0.03) for shot in (neutral, tall, heavy))
     assert min(np.abs(shot["Cape"] - neutral["Cape"]).max() for shot in (tall, heavy)) > 0.03
+
+
+@pytest.mark.usefixtures("brief")
+def test_one_model_is_filmed_in_three_fabrics(tmp_path, capsys):
+    assert main(["demo", "--garment", "cape_fabrics", "-o", str(tmp_path)]) == 0
+    commands = typed(capsys.readouterr().err)
+    assert [command[0] for command in commands] == ["bake", "bake", "bake", "view", "view"]
+    names = [command[command.index("--fabric") + 1] for command in commands[:3]]
+    assert names == ["silk", "default", "leather"]
+    silk, own, leather = (first_points(tmp_path / f"cape_{name}.usdc")["Cape"] for name in names)
+    assert 1e-3 < np.abs(leather - own).max() < 0.2 and 1e-3 < np.abs(leather - silk).max() < 0.2
 
 
 def test_the_draft_is_trained_and_filmed_beside_what_ships(drafted):
