@@ -36,12 +36,22 @@ class TouchingCloth:
     ramp: float
 
     @classmethod
-    def of(cls, scene: Scene, fabric: Fabric, points: Floats | None = None) -> TouchingCloth:
-        """Return that of a scene's garment, at other points of the bind pose (V, 3) where they are given."""
+    def of(
+        cls, scene: Scene, fabric: Fabric, points: Floats | None = None, *, beside_others: bool = False
+    ) -> TouchingCloth:
+        """Return that of a scene's garment.
+
+        Args:
+            points: other points of the bind pose (V, 3).
+            beside_others: tight and pinned cloth has the stiffness that it has on skin: its tether presses it
+                harder on other cloth than its weight does.
+        """
         mesh, gap = scene.garment.mesh, 0.5 * fabric.margin
         at = mesh.points if points is None else points
         start, stiffness = (np.full(len(at), value) for value in (fabric.thickness + gap, fabric.loose_contact))
         classes, one = scene.classes, np.zeros(len(at), dtype=np.int64)
+        if beside_others:
+            stiffness = np.where(classes == LOOSE, fabric.loose_contact, max(fabric.contact, fabric.loose_contact))
         return cls(at, mesh.faces, one, classes == LOOSE, classes == PINNED, start, stiffness, gap)
 
     @classmethod

@@ -96,7 +96,9 @@ class OutfitPotential(IncrementalPotential):
         self.offsets = torch.as_tensor(offsets, dtype=dtype, device=device)[..., None]
         self._friction = torch.cat([torch.full_like(part.mass[:, 0], part.fabric.friction) for part in self.parts])
         self.cloth = SampledCloth(_joined([part.cloth.samples for part in self.parts]), device, dtype)
-        worn = TouchingCloth.joined([TouchingCloth.of(each.scene, each.fabric, each.start) for each in garments])
+        worn = TouchingCloth.joined(
+            [TouchingCloth.of(each.scene, each.fabric, each.start, beside_others=True) for each in garments]
+        )
         self._self_contact = partial(SelfContact, worn, device, dtype, own)
 
     def _each(self) -> list[tuple[IncrementalPotential, slice]]:
@@ -249,7 +251,8 @@ class OutfitPotential(IncrementalPotential):
 
     def residual(self, gradient: Tensor) -> Tensor:
         """Return the largest RMS acceleration of a garment that a gradient (V, 3, N) leaves, in units of g: (N,)."""
-        return torch.stack([part.residual(gradient[rows]) for part, rows in self._each()]).amax(0)
+        moving = [part.residual(gradient[rows]) for part, rows in self._each() if len(part.free)]
+        return torch.stack([gradient.new_zeros(gradient.shape[-1]), *moving]).amax(0)
 
 
 def _slices(counts: Sequence[int]) -> list[slice]:

@@ -15,7 +15,7 @@ from ssilk_core.physics.self_contact import SelfContact
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, WornGarment
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.physics.simulate.newton import SolverOptions
+from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.outfit import OutfitPotential
 from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import (
@@ -315,6 +315,23 @@ def test_tight_cloth_touches_the_tight_cloth_of_another_garment_that_it_lies_on(
         assert contacts is not None
         assert (float(contacts.energy(x)) > 0) == expected
         assert (len(contacts.frame) > 0) == expected
+
+
+def test_tight_cloth_stays_over_other_cloth_that_its_tether_pulls_it_through(scene, toy_grid):
+    fabric = replace(LIGHT, tether=5e3, friction=0.0)
+    points, faces = lying(toy_grid, 0.0, 0.2, 6)
+    garments = [
+        WornGarment(wearing(scene, points, faces, PINNED, "/in"), fabric),
+        WornGarment(wearing(scene, points + [0.003, 0.004, 0.002], faces, TIGHT, "/over"), fabric),
+    ]
+    potential, x = outfit(garments), positions(garments)
+    skinned = x.clone()
+    skinned[len(points) :, 1] -= 0.16  # 800 Pa
+    inputs = replace(touching(potential, x), skinned=skinned)
+    found = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-3, iterations=300))
+    gap = (found.x[len(points) :, 1] - found.x[: len(points), 1]).numpy()
+    inner = np.abs((points - AWAY)[:, [0, 2]]).max(axis=1) < 0.09
+    assert 0 < gap[inner].min() < 0.004
 
 
 def test_a_garment_starts_where_it_was_settled_off_another(scene, toy_motion, toy_grid):
