@@ -58,6 +58,11 @@ def test_it_may_begin_at_any_frame_of_a_longer_shot(copy):
     assert np.abs(points_of("late.usdc") - points_of("whole.usdc")[20:]).max() < 2e-4
 
 
+def test_a_shot_with_handles_begins_with_the_cloth_of_its_first_handle(copy):
+    assert run(f"{BAKE} --range 20-25 --handles 2 --start-cloth whole.usdc@18 -o late.usdc") == 0
+    assert np.abs(points_of("late.usdc") - points_of("whole.usdc")[18:28]).max() < 2e-4
+
+
 def write_cache(path: str, frames: list[np.ndarray], first: int) -> None:
     """Write points as a cache of the toy's garment, one frame after the other, as other programs do."""
     rigged = Usd.Stage.Open("rigged.usda")
@@ -122,6 +127,7 @@ def test_the_solver_refines_what_goes_on(copy):
         ("--start-cloth first.usdc --pre-roll 1", "a start and a run-up"),
         ("--start-cloth first.usdc --loop", "a start and a loop"),
         ("--start-cloth first.usdc --hold 2", "a start and poses that are held"),
+        ("--start-cloth first.usdc --range 14-20 --handles 2", "a start and handles, which come before it"),
         ("--start-cloth first.usdc --lbs", "a start and linear blend skinning"),
         ("--start-cloth first.usdc --latent-iterations 1", "a start and a solver in latents"),
     ],

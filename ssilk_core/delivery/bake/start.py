@@ -77,12 +77,14 @@ def need_startable(request: BakeRequest, loops: bool) -> None:
     Args:
         loops: whether the shot is a loop, as the request or its stage says.
     """
+    at_end = request.start_cloth is not None and split_start(request.start_cloth)[1] is None
     for found, there, todo in (
         ("linear blend skinning", request.lbs, "leave --lbs out"),
         ("a run-up", request.pre_roll > 0, "leave --pre-roll out"),
         ("a loop", loops, "leave --loop out, and ssilk:loop of the garment in the shot"),
         ("a solver in latents, which starts by itself", request.latent_iterations > 0, "leave --quality latent out"),
         ("poses that are held", request.hold > 1, "leave --hold out"),
+        ("handles, which come before it", at_end and request.handles > 0, "name the first handle's frame after '@'"),
     ):
         if there:
             fail("--start-cloth", f"a start and {found}", "one of both", todo)
