@@ -149,7 +149,7 @@ def _bound(file: ModelFile, lies: Garment, character: Character, posed: PosedAli
     mesh = replace(own.garment.mesh, path=lies.mesh.path, points=lies_at)
     garment = replace(
         own.garment, mesh=mesh, skin=moved(own.lbs_skin, movers), sewn=own.garment.sewn_mesh.points,
-        colour=lies.colour,
+        colour=lies.colour, graded=False,  # brought into another bind pose, it is no shape that cloth rests in
     )  # fmt: skip
     binds = moved_proxies(own.rig, own.garment.mesh.points, points - own.garment.mesh.points)
     parents, paths = movers[own.rig.parents], [*skeleton.joint_names]
@@ -223,6 +223,9 @@ def _told(
         most = max(turned, key=lambda joint: posed.turned[joint])
         found = f"{len(turned)} joints are bound up to {posed.turned[most]:.0f} degrees ('{others[most]}')"
         told.append(Message(f"{path}: {found} from where the model has them, which is taken into account"))
+    if file.scene.garment.graded:
+        text = "it was graded to bodies; the solver and figures count from its shape on the first of them here"
+        told.append(Message(f"{path}: {text}", "warning"))
     left = weights_left(file.scene.lbs_skin, own, images)
     if left:
         listed = ", ".join(f"{names[joint]} ({share:.0%})" for joint, share in left[:3])

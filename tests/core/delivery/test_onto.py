@@ -101,3 +101,18 @@ def test_proxies_on_a_limb_that_is_bound_otherwise_are_refused(put):
     put(holds=ARM, arms=40)
     with pytest.raises(SsilkError, match=r"'upperarm_l', from which proxies hang, is bound 45 degrees .* 12 degrees"):
         put(holds=ARM, arms=0)
+
+
+def test_a_graded_garment_counts_from_its_shape_on_the_first_body_there(scene):
+    file = _random(scene, CHEST, False)
+    shape = file.scene.garment.mesh.points * 1.1
+    garment = replace(file.scene.garment, graded=True, sewn=shape)
+    file = replace(file, scene=replace(file.scene, garment=garment))
+    other = humanoid(SCHEMES["unreal"], axes=2, arms=0)
+    posed = alike(OWN, other, IMAGES)
+    character = carrying(OWN, Character("/other", other, ()), IMAGES, posed)
+    lies = Garment(replace(file.scene.garment.mesh, path="/other/strip"))
+    there = onto._bound(file, lies, character, posed, file.scene.garment.mesh.points).scene.garment
+    np.testing.assert_array_equal(there.rest_mesh.points, shape)
+    told = onto._told(file, character, IMAGES, posed, None)
+    assert any("it was graded to bodies" in event.text for event in told)
