@@ -56,7 +56,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail("--cluster", "no folder for the layers", "-o names one")
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
     if options.certify:
-        tasks = [task for level in in_levels(certified_over(tasks, report)) for task in level]
+        tasks = certified_over(tasks, report)
     if options.output:
         LayerFolder(options.output).need_names(tasks, complete=not options.bundle)
     job = submitted(tasks, report)

@@ -17,6 +17,7 @@ from ...files import replacing
 from ...scene.plain import from_plain
 from ..bake import BakeRequest, BakeTask
 from ..bake.inputs import InputContents, InputFiles, InputHashes
+from ..bake.layered import in_levels
 
 NAME = "job.json"
 
@@ -32,7 +33,7 @@ class FarmJob:
 def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     """Return tasks pinned to what their inputs hold now, so that nobody bakes other files that come in their place.
 
-    A task with an input that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
+    Those that are certified over others come after these, as the steps of a bundle count them. A task with an input that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
@@ -41,7 +42,7 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
             found[path] = files.contents(name, path)
         except SsilkError as error:
             report(Message(str(error), "warning"))
-    return FarmJob(tuple(_pinned(task, found) for task in tasks), found)
+    return FarmJob(tuple(_pinned(task, found) for level in in_levels(tasks) for task in level), found)
 
 
 def write_job(path: str | Path, job: FarmJob) -> None:

@@ -30,7 +30,7 @@ from ssilk_core.delivery.bake.record import (
 )
 from ssilk_core.delivery.bake.request import INPUTS
 from ssilk_core.delivery.bake.task import named_by_bodies
-from ssilk_core.delivery.farm.job import FarmJob, numbers, read_job, write_job
+from ssilk_core.delivery.farm.job import FarmJob, numbers, read_job, submitted, write_job
 from ssilk_core.delivery.farm.openjd import BundleOptions, OpenJdReporter, template, write_bundle
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Failed, GarmentEvent, Message, Progress, Result, Started
@@ -287,6 +287,10 @@ def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over()
     ]  # fmt: skip
     circle = [replace(TASK, garment="a", over=("b",)), replace(TASK, garment="b", over=("a",))]
     assert in_levels(circle) == [circle]  # each fails with a sentence
+    # Steps count the tasks of the job as it was submitted, in whatever order they came.
+    backwards = submitted(tasks[::-1], lambda event: None).tasks
+    assert [task.name for task in backwards] == [task.name for level in in_levels(tasks[::-1]) for task in level]
+    assert {task.name for task in backwards[: len(levels[0])]} == {task.name for task in levels[0]}
     assert task_key(tasks[1], CONTENTS) == task_key(replace(tasks[1], over=()), CONTENTS)
 
 
