@@ -33,7 +33,8 @@ class FarmJob:
 def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     """Return tasks pinned to what their inputs hold now, so that nobody bakes other files that come in their place.
 
-    Those that are certified over others come after these, as the steps of a bundle count them. A task with an input that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
+    Those that are certified over others come after these, as the steps of a bundle count them. A task with an input
+    that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
