@@ -29,7 +29,7 @@ VERBS = {
     "bake": "Bake trained garments over motions as UsdSkel, and verify it by re-skinning the files.",
     "live": "Solve for a garment while a program plays its character: what live playback in Blender runs.",
     "remove": "Take garments out of the shots of a folder of layers, and write the stages of these shots again.",
-    "simulate": "Simulate a garment over motions without a network: slow and accurate, the reference for models.",
+    "simulate": "Simulate a garment, or an outfit, over motions without a network: slow and accurate, the reference.",
     "skin": "Turn a point cache into joints and blendshapes on the character's skeleton, and verify them.",
     "evaluate": "Measure trained garments on whole clips: energies, against the simulator, and what energies hide.",
     "trade": "Measure what speed and size cost in accuracy, for all that can be changed without training again.",

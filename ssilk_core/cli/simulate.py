@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a garment, or an outfit, over motions without a network: slow and accurate, the reference for models.
+"""Simulate a garment, or an outfit, over motions without a network: slow and accurate, the reference.
 
 Every frame minimises, over all vertices, the energy that networks are trained with. The result is a shot with the
 garment on joints and blendshapes of the shot's own, within 1 mm (RMS) and 5 mm (any vertex) of the simulated points,

@@ -136,11 +136,11 @@ def test_what_another_process_finishes_while_a_stage_is_written_is_not_lost(copy
     """The other one finishes, stage and all, between our look at the folder and the rename of our stage."""
     write, other = layers_stage.write_stage, []
 
-    def late(garments, needed=(), levels=None):
+    def late(garments, *rest):
         if not other:
             other.append(garments)
             assert bake("shirt.safetensors", "--motion walk.usda -o layers") == 0
-        return write(garments, needed, levels)
+        return write(garments, *rest)
 
     monkeypatch.setattr(layers_stage, "write_stage", late)
     gathering.write_shot_stage(Path("layers"), "walk")
