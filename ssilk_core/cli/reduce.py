@@ -56,6 +56,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if file.bodies:
         text = "a model of a family of bodies: what is kept is the best for the first of them, and is kept for all"
         report(Message(f"{options.model}: {text}"))
+    if file.fabrics:
+        text = "a model of a range of fabrics: what is kept is the best for its own fabric, and is kept for all"
+        report(Message(f"{options.model}: {text}"))
     motions = _motions(file, options)
     reducer = Reducer(file, motions)
     found = _chosen(options, reducer, motions, report)

@@ -202,3 +202,10 @@ def test_lists_name_ranges(tmp_path, capsys):
     path.write_text('[cape]\nstage = "a.usdc"\nmotions = "b"\nfabrics = true\n')
     assert main(["wardrobe", str(path), "-o", str(tmp_path / "out")]) == 2
     assert "a list of presets and factors" in capsys.readouterr().err
+
+
+def test_what_is_reduced_still_knows_the_range_and_what_it_was_measured_in_is_told(copy, capsys):
+    assert run("reduce ranged.safetensors -o small.safetensors --shapes 2 --motions sway.usda") == 0
+    told = capsys.readouterr()
+    assert "what is kept is the best for its own fabric, and is kept for all" in told.out + told.err
+    assert load_model("small.safetensors").fabrics.range == load_model("ranged.safetensors").fabrics.range
