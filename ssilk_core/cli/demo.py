@@ -129,12 +129,13 @@ def _on_bodies(options: argparse.Namespace) -> list[list[str]]:
 
 
 def _in_fabrics(options: argparse.Namespace) -> list[list[str]]:
-    """Return the commands that bake one model in three fabrics, and film them."""
+    """Return the commands that rig the garment, bake one model of it in three fabrics, and film them."""
     from ..demo.shipped import shipped_path
 
-    out, stage = options.output, str(_body())
+    out, stage = options.output, _stage(options)
     shots = {fabric: str(out / f"{RANGED_GARMENT}_{fabric}.usdc") for fabric in FILMED_FABRICS}
     return [
+        ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{RANGED_GARMENT}.usdc"), "-o", stage],
         *(
             ["bake", str(shipped_path(FABRICS)), "--stage", stage, "--motion", str(out / "shot.usdc"),
              "--fabric", fabric, "-o", shots[fabric]]

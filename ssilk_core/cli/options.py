@@ -215,8 +215,8 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         help="run-up to the first pose and after each cut, so that the garment has settled (default 0)",
     )
     verb.add_argument("--start-cloth", metavar="FILE[:/PRIM][@CODE]",
-                      help="shot or point cache that this one goes on from: its cloth in the last frame, or at a "
-                           "time code, is what the first frame begins with (default: it is at rest)")  # fmt: skip
+                      help="shot or point cache that this one goes on from: its last frame, or that at a time code, "
+                           "is the first one here, and its cloth is there (default: it is at rest)")  # fmt: skip
     verb.add_argument("--hold", type=NumberRange(1, MAX_HOLD, int), metavar="N",
                       help="frames for which each pose of the garment is held, 2 for animation on twos (default: "
                            "ssilk:hold of the garment in the shot, or 1)")  # fmt: skip

@@ -189,8 +189,8 @@ def test_one_model_is_filmed_on_three_bodies(tmp_path, capsys):
 def test_one_model_is_filmed_in_three_fabrics(tmp_path, capsys):
     assert main(["demo", "--garment", "cape_fabrics", "-o", str(tmp_path)]) == 0
     commands = typed(capsys.readouterr().err)
-    assert [command[0] for command in commands] == ["bake", "bake", "bake", "view", "view"]
-    names = [command[command.index("--fabric") + 1] for command in commands[:3]]
+    assert [command[0] for command in commands] == ["rig", "bake", "bake", "bake", "view", "view"]
+    names = [command[command.index("--fabric") + 1] for command in commands[1:4]]
     assert names == ["silk", "default", "leather"]
     silk, own, leather = (first_points(tmp_path / f"cape_{name}.usdc")["Cape"] for name in names)
     assert 1e-3 < np.abs(leather - own).max() < 0.2 and 1e-3 < np.abs(leather - silk).max() < 0.2

@@ -123,6 +123,8 @@ def test_the_solver_refines_what_goes_on(copy):
     [
         ("--start-cloth none.usdc", "none.usdc"),
         ("--start-cloth first.usdc@99", "a start at time code 99; it lasts from 0 to 14"),
+        ("--start-cloth first.usdc --range 15-29", "it lasts from 0 to 14, and the shot begins at 15"),
+        ("--start-cloth whole.usdc --range 14-29", "it lasts from 0 to 29, and the shot begins at 14"),
         ("--start-cloth hero.usda:/Hero/Body", "points"),
         ("--start-cloth first.usdc --pre-roll 1", "a start and a run-up"),
         ("--start-cloth first.usdc --loop", "a start and a loop"),

@@ -119,7 +119,8 @@ class LoadedGarment:
         if request.start_cloth:
             need_startable(request, loops=read.loop is not None)
             read = replace(read, whole=read.sampled, lead=0)  # nothing is rolled out before it
-            start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps)
+            begins = read.sampled.start / request.samples_per_frame
+            start = read_start(request.start_cloth, self.deformer.scene.garment, self.file.config.fps, begins)
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)

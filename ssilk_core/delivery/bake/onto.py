@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 TURNED = 10.0  # [degrees] by which limbs are bound otherwise, from which on it is told
 PROXIES_TURNED = 12.0  # [degrees] by which joints with proxies may be bound otherwise
 IN_BIND_POSE = ("decoder.shapes", "decoder.offset")  # parameters that are displacements in the bind pose
+FEW = 0.5  # of the model's joints, of which less is a warning
 TALLER = 0.15  # of the height, by which a character is larger or smaller, from which on it is a warning
 
 
@@ -212,7 +213,7 @@ def _told(
     path, names, others = character.path, short_names(own), short_names(other)
     mapped = int(np.count_nonzero(images >= 0))
     text = f"{path}: joints of this character stand for {mapped} of the model's {format_count(len(images), 'joints')}"
-    told: list[Event] = [Message(text)]
+    told: list[Event] = [Message(text, "warning" if mapped < FEW * len(images) else "info")]
     if coordinates is not None:
         place = ", ".join(f"{round(float(value), 3) + 0.0:.3f}" for value in coordinates)
         told.append(

@@ -35,7 +35,7 @@ from .inputs import InputHashes
 from .looped import MOST_ROUNDS, Loop, LoopedPoses, looped, seam_words, summary
 from .request import BakeRequest
 from .result import CertificateSummary, FrameSpan, LatentSummary, LoopSummary, RefinementSummary
-from .start import BLEND, FAR, SEEN, StartCloth, fading
+from .start import BLEND, ELSEWHERE, FAR, SEEN, StartCloth, fading
 from .world import ShotSurroundings, Sight
 
 if TYPE_CHECKING:
@@ -355,11 +355,13 @@ class BakeRollout:
         root = motion_transforms(self.motion.clip(0, 1), scene.character.skeleton.parents)[0, :, :3, 3]
         away = np.linalg.norm(self.start_cloth.points[1][:, None] - root[None], axis=2).min()
         reach = scene.garment.mesh.diagonal
+        todo = "name the frame after '@' that is this shot's first, of a shot of this character"
         if away > reach:
             found = f"its cloth is {away:.3g} m away from the character's first pose"
-            fail(
-                self.start_cloth.where, found, f"{reach:.3g} m are allowed", "name the frame before this shot's first"
-            )
+            fail(self.start_cloth.where, found, f"{reach:.3g} m are allowed", todo)
+        if self._given.left[0] > ELSEWHERE * reach:
+            found = f"the network's cloth comes no nearer to it than {self._given.left[0]:.3g} m (RMS)"
+            fail(self.start_cloth.where, found, f"{ELSEWHERE * reach:.3g} m are allowed", todo)
 
     def _tell_start(self, report: Reporter) -> None:
         """Report how near the first frame is to the cloth that it begins with."""
@@ -367,7 +369,7 @@ class BakeRollout:
             return
         rms, most = (1000 * value for value in self._given.left)
         slow = "" if self.start_cloth.moves else "; nothing is known of how it moves there"
-        near = f"{rms:.2g} mm (RMS), {most:.2g} mm at most"
+        near = f"{rms:.2f} mm (RMS), {most:.2f} mm at most"
         rest = f"; a blendshape that fades in {BLEND:g} s makes up for the rest" if self.is_fading else ""
         text = f"the cloth begins as in {self.start_cloth.where}; latents come within {near}{rest}{slow}"
         far = self._given.left[0] > FAR

@@ -15,6 +15,7 @@ from .request import BakeRequest, split_start
 
 SLACK = 1e-6  # of a time code
 FAR = 0.01  # [m] RMS, from which on latents do not reach the cloth: it is warned of
+ELSEWHERE = 0.1  # of the garment's size, RMS, from which on the cloth is of another moment or character
 SEEN = 1e-4  # [m] that latents may miss at most without a blendshape that makes up for it
 BLEND = 0.5  # [s] after which that weighs nothing
 
@@ -36,18 +37,31 @@ class StartCloth:
     digest: str
 
 
-def read_start(text: str, garment: Garment, fps: float) -> StartCloth:
+def read_start(text: str, garment: Garment, fps: float, begins: float) -> StartCloth:
     """Read the cloth of one frame of a shot or a cache, and of one step before that at a rate [1/s].
 
+    Args:
+        begins: time code of the frame that is to have this cloth.
+
     Raises:
-        SsilkError: it cannot be read, has not that frame, or is another mesh.
+        SsilkError: it cannot be read, has not that frame, is another mesh, or ends just before `begins`, or goes on
+            past it, and no frame is named.
     """
     from ssilk_usd.shots.trajectories import MeshTrajectories
 
     place, code = split_start(text)
     cache = MeshTrajectories(place, garment.mesh.vertex_count, garment.mesh.faces)
     first, last = float(cache.times[0]), float(cache.times[-1])
-    code = last if code is None else code
+    if code is None:
+        after = float(np.diff(cache.times[-2:]).sum()) or 1.0
+        if first - SLACK <= begins < last - SLACK or last + SLACK < begins <= last + after + SLACK:
+            fail(
+                place,
+                f"it lasts from {first:.9g} to {last:.9g}, and the shot begins at {begins:.9g}",
+                "the shot's first frame is to be its last one",
+                "begin the shot there, as with --range, or name the frame after '@' that is the shot's first",
+            )
+        code = last
     if not first - SLACK <= code <= last + SLACK:
         found = f"a start at time code {code:.9g}"
         fail(
