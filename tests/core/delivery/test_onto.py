@@ -121,7 +121,7 @@ def test_a_graded_garment_counts_from_its_shape_on_the_first_body_there(scene):
 def test_a_map_of_few_joints_is_warned_of(scene):
     file, other = _random(scene, CHEST, False), humanoid(SCHEMES["unreal"], axes=2)
     posed = alike(OWN, other, IMAGES)
-    few = np.where(IMAGES < len(IMAGES) // 3, IMAGES, -1)
+    few = np.where(np.arange(len(IMAGES)) < len(IMAGES) // 3, IMAGES, -1)
     levels = [
         onto._told(file, Character("/other", other, ()), images, posed, None)[0].level for images in (IMAGES, few)
     ]
