@@ -36,6 +36,7 @@ NAMED_SIDES = tuple(
     for side in ("left", "right")
 )
 LEFT = 0.02  # of a garment's weight on a joint that none stands for, from which on it is told
+OTHER_SIZE = 0.15  # of the size, by which characters differ, from which on it is told as a warning
 AWAY = 0.03  # of the height, from a joint to the one that it moves with
 LISTED = 3
 ALLOWED = "a line holds a joint of the garment's character, and the joint of the other one that stands for it"
@@ -80,13 +81,13 @@ class JointMap:
     def _need_once(self, own: Skeleton, other: Skeleton, images: Ints) -> None:
         repeated = [joint for joint, count in Counter(images[images >= 0].tolist()).items() if count > 1]
         if repeated:
-            first, second = (_leaf(own, joint) for joint in np.flatnonzero(images == repeated[0])[:2])
-            found = f"'{_leaf(other, repeated[0])}' stands for both '{first}' and '{second}'"
+            first, second = (leaf(own, joint) for joint in np.flatnonzero(images == repeated[0])[:2])
+            found = f"'{leaf(other, repeated[0])}' stands for both '{first}' and '{second}'"
             fail(self.path, found, "a joint stands for one joint at most", 'write "" for one of them')
 
     def _need_hub(self, own: Skeleton, images: Ints) -> None:
         if images[own.hub] < 0:
-            found = f"no joint stands for '{_leaf(own, own.hub)}', which carries the body"
+            found = f"no joint stands for '{leaf(own, own.hub)}', which carries the body"
             fail(self.path, found, "the other character has one too", "name its hips or pelvis")
 
     def _need_order(self, own: Skeleton, other: Skeleton, images: Ints) -> None:
@@ -97,9 +98,9 @@ class JointMap:
             while above >= 0 and above not in stands_for:
                 above = int(other.parents[above])
             if above >= 0 and stands_for[above] not in ancestors(own, joint):
-                name, its = _leaf(own, joint), _leaf(own, stands_for[above])
+                name, its = leaf(own, joint), leaf(own, stands_for[above])
                 found = (
-                    f"'{_leaf(other, image)}' for '{name}' hangs from '{_leaf(other, above)}' for '{its}', "
+                    f"'{leaf(other, image)}' for '{name}' hangs from '{leaf(other, above)}' for '{its}', "
                     f"and '{name}' does not hang from '{its}'"
                 )
                 fail(self.path, found, "joints hang from each other on both characters alike", "correct one of them")
@@ -111,7 +112,7 @@ class JointMap:
         across = np.zeros(3)  # from side to side, which is where limbs are apart most
         across[[0, 2]] = np.linalg.svd(here[mapped][:, [0, 2]])[2][0]
         for joint in mapped.tolist():
-            name, image = _leaf(own, joint), _leaf(other, int(images[joint]))
+            name, image = leaf(own, joint), leaf(other, int(images[joint]))
             sides = named_side(name), named_side(image)
             if None not in sides and sides[0] != sides[1]:
                 found = f"'{image}' on the {sides[1]} stands for '{name}' on the {sides[0]}"
@@ -257,7 +258,8 @@ def _names(skeleton: Skeleton) -> tuple[str, ...]:
     return names if len(names) <= LISTED * 10 else (*names[: LISTED * 10], "...")
 
 
-def _leaf(skeleton: Skeleton, joint: int) -> str:
+def leaf(skeleton: Skeleton, joint: int) -> str:
+    """Return the last part of a joint's name, for messages."""
     return skeleton.joint_names[joint].rpartition("/")[2]
 
 

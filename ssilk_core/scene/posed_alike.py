@@ -18,7 +18,7 @@ import numpy as np
 from ..errors import fail
 from .assets import Body, Character, Floats, Ints, Motion, ProxyRig, Skeleton, SkinWeights
 from .assets.skeleton import SeenJoints
-from .joint_map import ancestors, heading, height, owners
+from .joint_map import ancestors, heading, height, leaf, owners
 from .kinematics import invert_rigid, local_transforms, rigid, skin_points
 
 LONG = 0.11  # of the height, from which on a bone is a limb's, not one of hands, feet, collar or spine
@@ -26,6 +26,7 @@ BESIDE = 0.035  # of the height, by which it is beside the hub
 LOW = 0.12  # of the height over the lowest joint, below which joints are feet
 LEAN = 10.0  # [degrees] from which on a trunk is bound leaning, and not only with its joints elsewhere
 FLAT = 0.02  # of the largest principal value of joints, below which they lie on a line
+TURNED = 10.0  # [degrees] by which a limb is bound otherwise, from which on it is told
 UNLIKE = 135.0  # [degrees] by which a limb is bound otherwise, from which on it is not known how it was turned
 
 
@@ -73,7 +74,7 @@ def alike(own: Skeleton, other: Skeleton, images: Ints) -> PosedAlike:
     angles = rotation_angles(np.swapaxes(turn, 0, 1) @ turns)
     joint = int(angles.argmax())
     if angles[joint] > UNLIKE:
-        found = f"'{_leaf(other, joint)}' is bound {angles[joint]:.0f} degrees from where {own.path} has it"
+        found = f"'{leaf(other, joint)}' is bound {angles[joint]:.0f} degrees from where {own.path} has it"
         fail(other.path, found, f"up to {UNLIKE:.0f} degrees are allowed", "bind it in an A-pose or a T-pose")
     return PosedAlike(rigid(turns @ binds[:, :3, :3], places), angles, turn)
 
@@ -200,15 +201,16 @@ def body_alike(character: Character, posed: PosedAlike) -> Body:
 
 def unposed(points: Floats, skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
     """Return where points (V, 3) of a pose are in the bind pose, by linear blend skinning, shape (V, 3)."""
-    return (np.linalg.inv(_blended(skin, posed, skeleton)) @ _homogeneous(points)[..., None])[:, :3, 0]
+    return (np.linalg.inv(blended(skin, posed, skeleton)) @ _homogeneous(points)[..., None])[:, :3, 0]
 
 
 def posed_points(points: Floats, skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
     """Invert `unposed`."""
-    return (_blended(skin, posed, skeleton) @ _homogeneous(points)[..., None])[:, :3, 0]
+    return (blended(skin, posed, skeleton) @ _homogeneous(points)[..., None])[:, :3, 0]
 
 
-def _blended(skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
+def blended(skin: SkinWeights, posed: PosedAlike, skeleton: Skeleton) -> Floats:
+    """Return the transforms (V, 4, 4) by which linear blend skinning takes points to the pose."""
     moves = posed.transforms @ invert_rigid(skeleton.bind_transforms)
     return np.einsum("vi,viab->vab", skin.weights, moves[skin.indices])
 
@@ -224,7 +226,3 @@ def moved_proxies(rig: ProxyRig, cloth: Floats, moves: Floats) -> Floats:
         at = np.linalg.norm(binds[:, None, :3, 3] - cloth[None], axis=-1).argmin(axis=1)
         binds[:, :3, 3] += moves[at]
     return binds
-
-
-def _leaf(skeleton: Skeleton, joint: int) -> str:
-    return skeleton.joint_names[joint].rpartition("/")[2]

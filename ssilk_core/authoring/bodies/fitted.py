@@ -14,7 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...scene.assets import Body, Floats, Mesh, Skeleton
-from ...scene.mesh.topology import edges, vertex_areas, vertex_normals
+from ...scene.mesh.laplacian import laplacian
+from ...scene.mesh.topology import edges, face_normals, vertex_areas, vertex_normals
 
 STIFFNESS = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the edges in each round, relative to the pull of the surface
 REACH = 0.15  # [m] farther than which a surface does not pull
@@ -36,8 +37,9 @@ def fitted_body(body: Body, skeleton: Skeleton, binds: Floats, onto: Mesh) -> Bo
     areas = vertex_areas(mesh.points, mesh.faces)
     pull = areas / areas.mean()
     begun, onto = points.copy(), _outer(onto)
+    facing = face_normals(onto.points, onto.faces)
     for stiffness in STIFFNESS:
-        targets, found = _nearest(points, mesh, onto)
+        targets, found = _nearest(points, mesh, onto, facing)
         weights = np.where(found, pull, 0.0)
         points = begun + _smooth_moves(mesh, weights, targets - begun, stiffness)
     return replace(body, mesh=replace(mesh, points=points))
@@ -47,10 +49,7 @@ def _outer(mesh: Mesh) -> Mesh:
     """Return a body without faces that lie within it, such as joints of a mannequin beneath its shell."""
     import igl
 
-    corners = mesh.points[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(min=1e-12)
-    over = corners.mean(axis=1) + OVER * normals
+    over = mesh.points[mesh.faces].mean(axis=1) + OVER * face_normals(mesh.points, mesh.faces)
     within = np.asarray(igl.fast_winding_number(mesh.points, mesh.faces.astype(np.int64), over)).reshape(-1) > 0.5
     return mesh if within.all() else Mesh(mesh.path, mesh.points, mesh.faces[~within])
 
@@ -75,29 +74,25 @@ def _carried(body: Body, skeleton: Skeleton, binds: Floats) -> Floats:
     return found
 
 
-def _nearest(points: Floats, mesh: Mesh, onto: Mesh) -> tuple[Floats, np.ndarray]:
-    """Return the nearest points of a surface (V, 3), and which of them are near and face the same way (V,)."""
+def _nearest(points: Floats, mesh: Mesh, onto: Mesh, facing: Floats) -> tuple[Floats, np.ndarray]:
+    """Return the nearest points of a surface (V, 3), and which of them are near and face the same way (V,).
+
+    Args:
+        facing: normals of that surface's triangles, shape (F, 3).
+    """
     import igl
 
     square, face, nearest = igl.point_mesh_squared_distance(points, onto.points, onto.faces.astype(np.int64))
-    corners = onto.points[onto.faces[np.asarray(face).reshape(-1)]]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True).clip(min=1e-12)
-    own = vertex_normals(points, mesh.faces)
-    alike = (own * normals).sum(axis=1) > FACING
+    alike = (vertex_normals(points, mesh.faces) * facing[np.asarray(face).reshape(-1)]).sum(axis=1) > FACING
     return np.asarray(nearest), alike & (np.sqrt(np.asarray(square).reshape(-1)) < REACH)
 
 
 def _smooth_moves(mesh: Mesh, weights: Floats, wanted: Floats, stiffness: float) -> Floats:
     """Return the moves (V, 3) that differ least from those wanted, weighted (V,), and from those of neighbours."""
-    from scipy.sparse import coo_matrix, diags
+    from scipy.sparse import diags
     from scipy.sparse.linalg import splu
 
-    pairs, count = edges(mesh.faces), len(weights)
-    rows = np.concatenate([pairs[:, 0], pairs[:, 1]])
-    columns = np.concatenate([pairs[:, 1], pairs[:, 0]])
-    joined = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    laplacian = diags(np.asarray(joined.sum(axis=1)).reshape(-1)) - joined
+    links = laplacian(edges(mesh.faces), 1.0, len(weights))
     # A little of each vertex holds pieces that no surface pulls.
-    system = (diags(weights + 1e-6) + stiffness * laplacian).tocsc()
+    system = (diags(weights + 1e-6) + stiffness * links).tocsc()
     return splu(system).solve(weights[:, None] * wanted)

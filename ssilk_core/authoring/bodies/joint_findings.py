@@ -8,13 +8,11 @@ import numpy as np
 from ...errors import SsilkError
 from ...events import format_count
 from ...scene.assets import Character, Garment, Ints, Skeleton
-from ...scene.joint_map import JointMap, short_names, size_ratio, weights_left
-from ...scene.posed_alike import alike
+from ...scene.joint_map import OTHER_SIZE, JointMap, short_names, size_ratio, weights_left
+from ...scene.posed_alike import TURNED, alike
 from ..preflight.finding import Finding, Findings, format_joints, index_tuple
 
 LISTED = 6
-TURNED = 10.0  # [degrees] by which limbs are bound otherwise, from which on it is told
-UNLIKE = 0.15  # of the height, by which characters differ, from which on it is a warning
 
 
 def joint_findings(names: JointMap, own: Character, other: Character, garment: Garment) -> Findings:
@@ -53,7 +51,7 @@ def joint_findings(names: JointMap, own: Character, other: Character, garment: G
             why="the garment is put on in the pose in which it was made, and brought into this one",
         )  # fmt: skip
     ratio = size_ratio(mine, its, images)
-    if abs(ratio - 1) > UNLIKE:
+    if abs(ratio - 1) > OTHER_SIZE:
         yield Finding(
             severity="warning", code="other-size", prim=other.path,
             found=f"it is {abs(ratio - 1):.0%} {'taller' if ratio > 1 else 'smaller'} than {own.path}",

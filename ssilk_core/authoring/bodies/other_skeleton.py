@@ -17,9 +17,9 @@ import numpy as np
 
 from ...events import Message, Reporter
 from ...scene.assets import Body, Character, Floats, Ints, Mesh, ProxyRig, Scene, Skeleton, SkinWeights
-from ...scene.joint_map import owners
+from ...scene.joint_map import leaf, owners
 from ...scene.kinematics import invert_rigid
-from ...scene.posed_alike import PosedAlike, alike, body_alike, fitted_binds, moved_proxies, unposed
+from ...scene.posed_alike import TURNED, PosedAlike, alike, body_alike, fitted_binds, moved_proxies, unposed
 from ..preflight.fit import describe_left, describe_move
 from ..preflight.settle import Settled, settle
 from .carry import carried_moves
@@ -28,7 +28,6 @@ from .fitted import fitted_body
 NEAREST = 8  # points of skin that tell which joints move cloth
 SHARED = 0.2  # of the weights beneath, from which on joints share all of a weight as they do there
 LOOSE_FIT = 20.0  # [mm] from which on the bodies are told to be unlike
-TURNED = 10.0  # [degrees] by which a limb is bound otherwise, from which on it is told
 LEAST = 0.01  # weights below this are left out
 
 
@@ -96,8 +95,8 @@ def tell_carried(carried: CarriedOnto, scene: Scene, report: Reporter) -> None:
     report(Message(text, "warning" if worst > LOOSE_FIT else "info"))
     joint = int(carried.posed.turned.argmax())
     if carried.posed.turned[joint] > TURNED:
-        name, angle = carried.scene.character.skeleton.joint_names[joint], carried.posed.turned[joint]
-        text = f"'{name.rpartition('/')[2]}' was turned by {angle:.0f} degrees into the pose of the garment, and back"
+        name, angle = leaf(carried.scene.character.skeleton, joint), carried.posed.turned[joint]
+        text = f"'{name}' was turned by {angle:.0f} degrees into the pose of the garment, and back"
         report(Message(f"{there}: {text}"))
     if carried.settled.moved:
         report(Message(f"{path}: settling it there {describe_move(carried.settled, 'moves')}"))

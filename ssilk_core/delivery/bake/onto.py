@@ -24,11 +24,13 @@ from ...network.checkpoint import ModelFile
 from ...network.runtime.deformer import deformer
 from ...scene.assets import PINNED, Character, Floats, Garment, Ints, Scene, Skeleton, SkinWeights
 from ...scene.family import BodyFamily
-from ...scene.joint_map import JointMap, short_names, size_ratio, weights_left
+from ...scene.joint_map import OTHER_SIZE, JointMap, leaf, short_names, size_ratio, weights_left
 from ...scene.kinematics import invert_rigid
 from ...scene.posed_alike import (
+    TURNED,
     PosedAlike,
     alike,
+    blended,
     carrying,
     fitted_binds,
     moved_proxies,
@@ -41,11 +43,9 @@ if TYPE_CHECKING:
     from pxr import Usd
     from ssilk_usd.reading.stand_ins import PutOn
 
-TURNED = 10.0  # [degrees] by which limbs are bound otherwise, from which on it is told
 PROXIES_TURNED = 12.0  # [degrees] by which joints with proxies may be bound otherwise
 IN_BIND_POSE = ("decoder.shapes", "decoder.offset")  # parameters that are displacements in the bind pose
 FEW = 0.5  # of the model's joints, of which less is a warning
-TALLER = 0.15  # of the height, by which a character is larger or smaller, from which on it is a warning
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +145,6 @@ def _bound(file: ModelFile, lies: Garment, character: Character, posed: PosedAli
 
     trained = deformer(file).skin
     carried = moved(trained, np.concatenate([carriers, carriers[roots]]))
-    blended = np.einsum("vi,viab->vab", carried.weights, limbs[carried.indices])
     lies_at = unposed(points, carried, posed, skeleton)
     mesh = replace(own.garment.mesh, path=lies.mesh.path, points=lies_at)
     garment = replace(
@@ -160,7 +159,7 @@ def _bound(file: ModelFile, lies: Garment, character: Character, posed: PosedAli
         own.rig, joint_names=tuple(paths[skeleton.joint_count :]), parents=parents,
         bind_transforms=invert_rigid(limbs[carriers[roots]]) @ binds, skin=moved(own.rig.skin, movers),
     )  # fmt: skip
-    back = np.linalg.inv(blended[own.classes != PINNED, :3, :3])
+    back = np.linalg.inv(blended(carried, posed, skeleton)[own.classes != PINNED, :3, :3])
     parameters = {
         name: (np.einsum("vab,vb...->va...", back, values).astype(values.dtype) if name in IN_BIND_POSE else values)
         for name, values in file.parameters.items()
@@ -183,7 +182,7 @@ def _need_alike(file: ModelFile, character: Character, roots: Ints, limbs: Float
     angles = rotation_angles(limbs[roots, :3, :3])
     worst = int(angles.argmax())
     if angles[worst] > PROXIES_TURNED:
-        name = character.skeleton.joint_names[roots[worst]].rpartition("/")[2]
+        name = leaf(character.skeleton, int(roots[worst]))
         found = f"'{name}', from which proxies hang, is bound {angles[worst]:.0f} degrees from where the model has it"
         allowed = f"the model's proxies may be turned by {PROXIES_TURNED:.0f} degrees"
         fail(character.path, found, allowed, "bind that limb as the garment's character does, or train on this one")
@@ -232,7 +231,7 @@ def _told(
         listed = ", ".join(f"{names[joint]} ({share:.0%})" for joint, share in left[:3])
         told.append(Message(f"{path}: joints with weights that none stands for move with those above them: {listed}"))
     ratio = size_ratio(own, other, images)
-    if abs(ratio - 1) > TALLER:
+    if abs(ratio - 1) > OTHER_SIZE:
         found = f"it is {abs(ratio - 1):.0%} {'taller' if ratio > 1 else 'smaller'} than the body of the training"
         told.append(Message(f"{path}: {found}; the network moves its garment as there", "warning"))
     return told

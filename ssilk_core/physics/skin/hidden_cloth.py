@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.topology import components, edges, merged_places, vertex_normals
+from ...scene.mesh.topology import components, edges, face_crosses, merged_places, vertex_normals
 from .hidden_faces import HiddenFaces
 
 AT_ONCE = 1 << 22  # distances in memory
@@ -50,9 +50,8 @@ def turned_outward(inner: Mesh, body: Mesh) -> Ints:
     Each part that hangs together is turned as a whole, as most of its area says by the skin nearest to it.
     """
     faces, points = inner.faces, inner.points
-    corners = points[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    away = vertex_normals(body.points, body.faces)[_nearest(corners.mean(axis=1), body.points)]
+    cross, middles = face_crosses(points, faces), points[faces].mean(axis=1)
+    away = vertex_normals(body.points, body.faces)[_nearest(middles, body.points)]
     place = merged_places(points)
     part = components(edges(place[faces]), len(points))[place[faces[:, 0]]]
     inward = np.bincount(part, (cross * away).sum(axis=1), part.max(initial=0) + 1) < 0

@@ -64,9 +64,20 @@ def hinges(faces: Ints) -> NDArray[np.int64]:
     return np.column_stack([half[first], opposite[first], opposite[second]])
 
 
+def face_crosses(points: Floats, faces: Ints) -> Floats:
+    """Return normals of the triangles, twice as long as each is large [m2], shape (F, 3)."""
+    a, b, c = np.moveaxis(np.asarray(points, dtype=np.float64)[faces], 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def face_normals(points: Floats, faces: Ints) -> Floats:
+    """Return unit normals of the triangles, zero where one has no area, shape (F, 3)."""
+    return _unit(face_crosses(points, faces))
+
+
 def face_areas(points: Floats, faces: Ints) -> Floats:
     """Return triangle areas [m2], shape (F,)."""
-    return 0.5 * np.linalg.norm(_face_crosses(points, faces), axis=-1)
+    return 0.5 * np.linalg.norm(face_crosses(points, faces), axis=-1)
 
 
 def vertex_areas(points: Floats, faces: Ints) -> Floats:
@@ -77,7 +88,7 @@ def vertex_areas(points: Floats, faces: Ints) -> Floats:
 
 def vertex_normals(points: Floats, faces: Ints) -> Floats:
     """Return unit vertex normals, the area-weighted mean of the face normals around, shape (V, 3)."""
-    crosses = np.repeat(_face_crosses(points, faces), 3, axis=0)
+    crosses = np.repeat(face_crosses(points, faces), 3, axis=0)
     corners = faces.reshape(-1)
     return _unit(np.stack([np.bincount(corners, axis, minlength=len(points)) for axis in crosses.T], axis=-1))
 
@@ -132,11 +143,6 @@ def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
             total[owners] += np.add.reduceat(result[tails], starts, axis=0)
         result = total * share[:, None]
     return result
-
-
-def _face_crosses(points: Floats, faces: Ints) -> Floats:
-    a, b, c = np.moveaxis(np.asarray(points, dtype=np.float64)[faces], 1, 0)
-    return np.cross(b - a, c - a)
 
 
 def _unit(vectors: Floats) -> Floats:
