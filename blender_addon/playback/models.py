@@ -172,9 +172,7 @@ class TrainingProgress:
         return bool(self.state and self.state.alive)
 
 
-_sewn: dict[Path, tuple[float, Sewing | None]] = {}  # likewise, and how the garment is sewn
-_sees: dict[Path, tuple[float, bool]] = {}  # when a model was written that was read, and whether it sees colliders
-_fabrics: dict[Path, tuple[float, tuple[Fabric, FabricRange] | None]] = {}  # likewise, and what `fabrics_of` returns
+_facts: dict[Path, tuple[float, ModelFacts]] = {}  # when a model was written that was read, and what it says
 _known: dict[int, tuple[Question, TrainingProgress | None]] = {}
 
 
@@ -269,25 +267,16 @@ def fabrics_of(garment: bpy.types.Object) -> tuple[Fabric, FabricRange] | None:
     Raises:
         SsilkError: there is no model, or it cannot be read.
     """
-    path = model_of(garment)
-    written = path.stat().st_mtime
-    if _fabrics.get(path, (0.0, None))[0] != written:
-        file = load_model(path)
-        _fabrics[path] = written, (file.fabric, file.fabrics.range) if file.fabrics else None
-    return _fabrics[path][1]
+    return facts_of(model_of(garment)).fabrics
 
 
 def sees_colliders(garment: bpy.types.Object) -> bool:
-    """Return whether a garment's model was trained to see colliders; the file is read where it is another by now.
+    """Return whether a garment's model was trained to see colliders.
 
     Raises:
         SsilkError: there is no model, or it cannot be read.
     """
-    path = model_of(garment)
-    written = path.stat().st_mtime
-    if _sees.get(path, (0.0, False))[0] != written:
-        _sees[path] = written, load_model(path).config.proximity_points > 0
-    return _sees[path][1]
+    return facts_of(model_of(garment)).sees_colliders
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,18 +288,39 @@ class Sewing:
     graded: bool
 
 
-def sewing_of(path: Path) -> Sewing | None:
-    """Return how a model has its garment sewn; None for one body. The file is read where it is another by now.
+@dataclass(frozen=True, eq=False)
+class ModelFacts:
+    """What panels and pictures ask of a model.
+
+    Attributes:
+        fabrics: the fabric of its training, and the range of others that it knows; None for that one alone.
+        sewing: None for a model of one body.
+    """
+
+    sees_colliders: bool
+    fabrics: tuple[Fabric, FabricRange] | None
+    sewing: Sewing | None
+
+
+def facts_of(path: Path) -> ModelFacts:
+    """Return what a model says; the file is read where it is another by now.
 
     Raises:
         SsilkError: it cannot be read.
     """
     written = path.stat().st_mtime
-    if path not in _sewn or _sewn[path][0] != written:
+    if path not in _facts or _facts[path][0] != written:
         file = load_model(path)
         garment = file.scene.garment
-        _sewn[path] = written, Sewing(garment.mesh.points, garment.graded) if file.bodies else None
-    return _sewn[path][1]
+        _facts[path] = (
+            written,
+            ModelFacts(
+                file.config.proximity_points > 0,
+                (file.fabric, file.fabrics.range) if file.fabrics else None,
+                Sewing(garment.mesh.points, garment.graded) if file.bodies else None,
+            ),
+        )
+    return _facts[path][1]
 
 
 class TrainedGarment:

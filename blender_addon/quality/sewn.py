@@ -10,7 +10,7 @@ from ssilk_core.errors import SsilkError
 
 from ..errors import SetupError
 from ..playback.bake import LAID
-from ..playback.models import model_of, sewing_of
+from ..playback.models import facts_of, model_of
 from ..scene.meshes import PREFIX
 from ..scene.shapes import key_offsets, worn_points
 
@@ -26,7 +26,7 @@ def sewn_points(garment: bpy.types.Object) -> np.ndarray:
     """
     points, to_world = worn_points(garment), np.array(garment.matrix_world)[:3, :3].T
     try:
-        sewing = sewing_of(model_of(garment))
+        sewing = facts_of(model_of(garment)).sewing
     except (SetupError, SsilkError, OSError):  # it has no model yet, or none that can be read
         sewing = None
     if sewing is None or len(sewing.first) != len(points):

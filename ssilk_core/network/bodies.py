@@ -21,6 +21,7 @@ from ..errors import fail
 from ..scene.assets import Floats, Ints, Skeleton
 from ..scene.assets.arrays import assign, frozen
 from ..scene.family import BodyFamily, DressedFamily
+from .first_layers import biases_under, blank_columns, misfit
 
 SEEING = ("initialiser", "stepper", "output")  # networks that see the body, where a model has them
 TENSORS = ("members", "rows", "joints", "points", "joint_moves", "point_moves", "taller")
@@ -76,19 +77,12 @@ class SeenBodies:
         if found != (skeleton.joint_count, vertices, proxies):
             wanted = f"{skeleton.joint_count} joints, {vertices} vertices and {proxies} proxies are needed"
             fail("body family", f"{found[0]} joints, {found[1]} vertices and {found[2]} proxies", wanted)
-        for name in SEEING:
-            bias = parameters.get(f"{name}.0.bias")
-            if (bias is None) != (name not in self.columns) or (
-                bias is not None and len(bias) != len(self.columns[name])
-            ):
-                fail("body family", f"weights '{name}' do not fit the network", "one row for each unit is needed")
+        if name := misfit(SEEING, self.columns, parameters):
+            fail("body family", f"weights '{name}' do not fit the network", "one row for each unit is needed")
 
     def biases(self, parameters: Mapping[str, Floats], coordinates: Floats) -> dict[str, Floats]:
         """Return the biases of the first layers on a body at coordinates (K,), by name."""
-        return {
-            f"{name}.0.bias": (parameters[f"{name}.0.bias"] + values @ coordinates).astype(np.float32)
-            for name, values in self.columns.items()
-        }
+        return biases_under(self.columns, parameters, coordinates)
 
     def with_proxies(self, kept: Ints) -> SeenBodies:
         """Return this for a garment that keeps some of its proxies alone."""
@@ -101,8 +95,7 @@ class SeenBodies:
 
 def unseen(parameters: Mapping[str, Floats], size: int) -> dict[str, Floats]:
     """Return weights of K coordinates that count nothing, for the networks of a model of one body, by name."""
-    biases = {name: parameters.get(f"{name}.0.bias") for name in SEEING}
-    return {name: np.zeros((len(bias), size), np.float32) for name, bias in biases.items() if bias is not None}
+    return blank_columns(SEEING, parameters, size)
 
 
 COLUMNS = re.compile(r"(\w+)\.0\.parametrizations\.bias\.(original|0\.columns)")

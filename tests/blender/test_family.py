@@ -205,7 +205,7 @@ def test_another_body_is_taken_up_while_it_plays(ready, wearing):
 def test_stretch_counts_from_the_rest_shape_that_the_model_trained(ready, wearing, ssilk_python, graded):
     """One garment for all bodies is stretched over a heavy one; one that is graded to it is not."""
     from blender_addon.arrays import heat
-    from blender_addon.playback.models import sewing_of
+    from blender_addon.playback.models import facts_of
     from blender_addon.quality.heat import STRETCH, measuring
     from blender_addon.scene.meshes import triangles_of
     from blender_addon.scene.modifiers import cage_points
@@ -225,7 +225,7 @@ def test_stretch_counts_from_the_rest_shape_that_the_model_trained(ready, wearin
         except StopIteration as end:
             found = end.value.values
             break
-    sewing = sewing_of(model)
+    sewing = facts_of(model).sewing
     assert sewing.graded is graded
     laid = wearing.data.shape_keys.key_blocks["SSILK body"]
     lies = np.array([tuple(point.co) for point in laid.data])
