@@ -172,10 +172,8 @@ def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Repo
 
 def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
     """Return what there is to say of the joints of --onto; write the map of --joints where there is none yet."""
+    shared.need_onto(options)
     if not options.onto:
-        if options.joints:
-            allowed = "a map says which joints of --onto stand for those of the garment's character"
-            fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
         return []
     from ..authoring.bodies.joint_findings import joint_findings
     from ..authoring.bodies.joint_names import propose

@@ -460,6 +460,13 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
+def need_onto(options: argparse.Namespace) -> None:
+    """Raise `SsilkError` for --joints without --onto."""
+    if options.joints and not options.onto:
+        allowed = "a map says which joints of --onto stand for those of the garment's character"
+        fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
+
+
 def read_onto(options: argparse.Namespace, report: Reporter) -> Character:
     """Read the character of --onto, "STAGE[:/ROOT]", which has another skeleton: --root and --body name others."""
     from ssilk_usd.reading.character import read_character

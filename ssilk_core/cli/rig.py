@@ -73,9 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     onto = split_location(str(options.onto))[0] if options.onto else None
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], onto)
     report(Started("rig", options.proxies))
-    if options.joints and not options.onto:
-        allowed = "a map says which joints of --onto stand for those of the garment's character"
-        fail(f"--joints {options.joints}", "no --onto", allowed, "name a character with --onto")
+    shared.need_onto(options)
     character, garment, rig = shared.read(options, report)
     if garment.surface is not None:
         shared.stated_fabric(garment.surface, report)

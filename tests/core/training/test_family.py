@@ -24,7 +24,7 @@ from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.scene.assets import Collider, ShotWorld
 from ssilk_core.scene.fabric_range import FabricRange, fabric_with, factors_of, inputs_of
 from ssilk_core.scene.fabrics import Fabric
-from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
+from ssilk_core.scene.family import BodyFamily, motion_on
 from ssilk_core.scene.kinematics import motion_transforms
 from ssilk_core.training.bodies import BEYOND, DrawnBodies, FamilyBody, random_body
 from ssilk_core.training.family_bank import build_family_bank
@@ -38,22 +38,15 @@ from ssilk_core.training.step import Stepper
 from ssilk_core.training.validation import BodyScore, Score, Validator
 from ssilk_core.training.verdict import worse_bodies, worst_body
 
+from ..body_family import members_of, shaped
+
 CPU = torch.device("cpu")
 CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
 
 
-def shaped(character, change, path):
-    bodies = tuple(replace(b, mesh=replace(b.mesh, points=change(b.mesh.points))) for b in character.bodies)
-    joints = change(np.array(character.skeleton.bind_transforms[:, :3, 3]))
-    return replace(character, path=path, skeleton=with_joints(character.skeleton, joints), bodies=bodies)
-
-
 @pytest.fixture(scope="module")
 def members(scene):
-    base = scene.character
-    taller = shaped(base, lambda points: points * [1, 1.2, 1], "/taller")
-    heavier = shaped(base, lambda points: points * [1.3, 1, 1.25], "/heavier")
-    return [base, taller, heavier]
+    return members_of(scene.character)
 
 
 @pytest.fixture(scope="module")

@@ -19,11 +19,13 @@ from ssilk_core.physics.simulate.incremental_potential import IncrementalPotenti
 from ssilk_core.quality.evaluation.methods import EvaluationScene
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
-from ssilk_core.scene.family import BodyFamily, with_joints
+from ssilk_core.scene.family import BodyFamily
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.run import train
 from ssilk_core.training.settings import TrainConfig
+
+from ..body_family import members_of
 
 CPU = torch.device("cpu")
 CONFIG = ModelConfig(latent=8, widths=(16, 12), shapes=4, feedback_points=6)
@@ -31,18 +33,9 @@ SCHEDULE = TrainConfig(batch=4, static_batch=2, static_fraction=0, collider_frac
 DOUBLE = torch.float64
 
 
-def shaped(character, change, path):
-    bodies = tuple(replace(b, mesh=replace(b.mesh, points=change(b.mesh.points))) for b in character.bodies)
-    joints = change(np.array(character.skeleton.bind_transforms[:, :3, 3]))
-    return replace(character, path=path, skeleton=with_joints(character.skeleton, joints), bodies=bodies)
-
-
 @pytest.fixture(scope="module")
 def members(scene):
-    base = scene.character
-    taller = shaped(base, lambda points: points * [1, 1.2, 1], "/taller")
-    heavier = shaped(base, lambda points: points * [1.3, 1, 1.25], "/heavier")
-    return [base, taller, heavier]
+    return members_of(scene.character)
 
 
 @pytest.fixture(scope="module")
