@@ -369,8 +369,8 @@ def test_shorter_steps_hand_their_velocity_on(scene, toy_grid) -> None:
     poses, dt = simulator.poser.pose(turned[None], placed[None]), 1 / 30 / PARTS**SPLITS
     velocity = torch.tensor([0.3, 2.0, -0.1], dtype=torch.float64)[:, None]
     past = StepHistory(start, start - velocity / 30, poses.root, poses.lbs, matrices=poses.matrices)
-    for frame, state in enumerate(simulator.carry_on(past, [poses] * 3), start=1):
-        n = frame * PARTS**SPLITS
+    for each in simulator.carry_on([past], [range(1, 4)], lambda places: poses):
+        state, n = each.state, each.step * PARTS**SPLITS
         fall = torch.tensor([0.0, -G, 0.0], dtype=torch.float64)[:, None] * dt**2 * n * (n + 1) / 2
         torch.testing.assert_close(state.last, start + velocity * n * dt + fall, rtol=0, atol=1e-5)
 
