@@ -293,10 +293,9 @@ class SelfContact:
         parts = self._faces.contacts(faces, known.faces), self._edges.contacts(edges, known.edges)
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
-        frame, vertices, *rows = (part[..., order] for part in joined)
+        slack = self._slack(joined[1], joined[5])
         unknown = self.reach - 2 * _drift(x, known)
-        slack = self._slack(vertices, rows[3])
-        return ClothContacts(self.law, x.shape[-1], unknown, frame, vertices, *rows, slack)
+        return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in [*joined, slack]))
 
     def _slack(self, vertices: Tensor, start: Tensor) -> Tensor:
         """Return by which pairs that begin to touch later may come nearer, however near they are [m], shape (P,).
