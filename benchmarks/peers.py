@@ -214,9 +214,9 @@ def measure(scene: Scene, clips: list[Motion], options: argparse.Namespace, sour
     }
     spans = spans_of(simulators[True], clips, frames)
     character, start = Posed.of(simulators[True], spans, frames), started(simulators[True], spans)
-    arrays = (np.array(each) for each in (character.bodies, character.skinned, character.roots))
-    fps = simulators[True].options.fps
-    shots = Shots(start.last.permute(2, 0, 1).cpu().numpy(), *arrays, fps)
+    bodies, skinned, roots = (np.array(each) for each in (character.bodies, character.skinned, character.roots))
+    cloth = start.last.permute(2, 0, 1).cpu().numpy()
+    shots = Shots(cloth, bodies, skinned, roots, simulators[True].options.fps)
     figures = PeerFigures(scene, fabric, simulators[True], character)
     made: dict[str, Ours | Peer] = {}
     measured: dict[str, Any] = {}
