@@ -306,7 +306,7 @@ class BakeRollout:
         return fitted_start(self.model, Motion(self.source.path, fps, *poses, **felt), first, points)
 
     def begun(self) -> BakeRollout:
-        """Return the rollout with blendshapes of its own: those that proxies take which are held each by itself, or one
+        """Return the rollout with blendshapes of its own: those of proxies that are held each by itself, or one
         for what latents miss of its first cloth, where that is seen."""
         if self.direction is not None and self.direction.parts is not None:
             if self.start_cloth is not None:

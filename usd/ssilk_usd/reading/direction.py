@@ -191,7 +191,7 @@ def _subset(prims: Sequence[Usd.Prim], name: str) -> Ints | None:
     if found is None:
         return None
     rows = np.array(found.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
-    mesh = UsdGeom.Mesh(found.GetPrim().GetParent())
+    mesh = UsdGeom.Mesh(next(prim for prim in prims if has_value(prim, "faceVertexIndices")))  # an over may have none
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
     kind, most = found.GetElementTypeAttr().Get(), int(corners.max(initial=-1)) + 1
     if kind == UsdGeom.Tokens.face:
