@@ -294,11 +294,12 @@ class LoadedGarment:
         if said.free is None and hold == 1 and parts is None:
             return None
         free = np.ones(read.whole.frame_count) if said.free is None else said.free
-        shares = [free[:, None], *((parts.skinned, parts.posed) if parts else ())]
-        for share in shares if loop.cycle.closed else ():
-            if (off := np.abs(share[-1] - share[0])).max(initial=0) > FREE_TOLERANCE:
-                first, last = (share[row, int(off.argmax())] for row in (0, -1))
-                found = f"ssilk:free is {first:g} in the first frame and {last:g} in the last"
+        keyed = [("ssilk:free", free[:, None])]
+        keyed += [("ssilk:free of a part", 1 - parts.skinned), ("ssilk:posed of a part", parts.posed)] if parts else []
+        for name, values in keyed if loop.cycle.closed else ():
+            if (off := np.abs(values[-1] - values[0])).max(initial=0) > FREE_TOLERANCE:
+                first, last = (values[row, int(off.argmax())] for row in (0, -1))
+                found = f"{name} is {first:g} in the first frame and {last:g} in the last"
                 fail(request.motion, found, "a loop ends as it begins", "key it so")
         rate = loop.motion.fps / read.sampled.fps
         motion = _sampled(loop.motion, read.sampled.fps, np.arange(loop.samples) * rate)
