@@ -295,7 +295,8 @@ class LoadedGarment:
             return None
         free = np.ones(read.whole.frame_count) if said.free is None else said.free
         keyed = [("ssilk:free", free[:, None])]
-        keyed += [("ssilk:free of a part", 1 - parts.skinned), ("ssilk:posed of a part", parts.posed)] if parts else []
+        if parts is not None:
+            keyed += [("ssilk:free of a part", 1 - parts.skinned), ("ssilk:posed of a part", parts.posed)]
         for name, values in keyed if loop.cycle.closed else ():
             if (off := np.abs(values[-1] - values[0])).max(initial=0) > FREE_TOLERANCE:
                 first, last = (values[row, int(off.argmax())] for row in (0, -1))
