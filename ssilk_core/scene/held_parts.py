@@ -83,6 +83,13 @@ def _followers(deformer: Deformer) -> Floats:
     return deformer.skin.dense(len(scene.joint_names))[:, scene.character.skeleton.joint_count :]
 
 
+def shares_of_proxies(deformer: Deformer) -> Floats:
+    """Return what proxies count at vertices, of all that these follow, shape (V, P); alike where they follow none."""
+    follow = _followers(deformer)
+    total = follow.sum(axis=1, keepdims=True)
+    return np.where(total > 0, follow / np.maximum(total, 1e-9), 1 / max(follow.shape[1], 1))
+
+
 @dataclass(frozen=True, eq=False)
 class PartShapes:
     """The blendshapes that a garment has besides its own K, of which the last is constant, where parts are held.
@@ -98,11 +105,8 @@ class PartShapes:
     @classmethod
     def of(cls, deformer: Deformer, free: Floats, whole: Floats) -> PartShapes:
         """Return those of a garment of which proxies are free by (S, P), and all else by (S,)."""
-        follow = _followers(deformer)
-        total = follow.sum(axis=1, keepdims=True)
-        follow = np.where(total > 0, follow / np.maximum(total, 1e-9), 1 / max(follow.shape[1], 1))
         curves, shares = _independent(free - whole[:, None])
-        masks = (follow @ shares.T).T
+        masks = (shares_of_proxies(deformer) @ shares.T).T
         # A weight lies in [0, 1]: that of no change is in the middle, and the constant shape takes the middle back.
         parts = 2 * masks[:, None, :, None] * deformer.shapes[None, :-1]
         parts = parts.reshape(-1, *deformer.shapes.shape[1:])

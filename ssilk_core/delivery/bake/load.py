@@ -268,13 +268,9 @@ class LoadedGarment:
         if read.loop is not None:
             return self._directed_in_loop(request, read, read.loop, said, parts)
         hold = request.hold or said.hold
-        for found, there, todo in (
-            (f"poses that are held for {hold} frames", hold > 1, "or give --hold 1"),
-            ("proxies that are held by themselves", parts is not None, "or key ssilk:free of the whole garment"),
-        ):
-            if there and request.refine:
-                allowed = "the solver moves each frame" if hold > 1 else "the solver moves all cloth that is free"
-                fail(request.motion, f"{found}, and --refine", allowed, f"leave --refine out, {todo}")
+        if hold > 1 and request.refine:
+            found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
+            fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
         if said.free is None and hold == 1 and parts is None:
             return None
         samples, count = request.samples_per_frame, read.whole.frame_count

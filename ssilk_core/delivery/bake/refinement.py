@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, tee
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -16,8 +16,9 @@ from ...events import Countdown, Message, Reporter, silent
 from ...network.settings import STRONGEST_PULL
 from ...physics.constants import GRAVITY
 from ...scene.assets import Deformer, Floats, Motion
+from ...scene.held_parts import shares_of_proxies
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
-from .direction import free_stretches
+from .direction import Direction, free_stretches
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 from .world import tell_surrounded
@@ -96,8 +97,13 @@ def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[_Frame]:
         left_out, played = rollout.lead, rollout.with_lead()
         report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
     told, count = Countdown(played.motion.frame_count, report), played.motion.frame_count
-    free = np.ones(count) if played.direction is None else played.direction.free[played.lead : played.lead + count]
-    frames = _directed_frames(played, free, report) if (free < 1).any() else _solved_frames(played, 0, count, report)
+    direction, rows = played.direction, slice(played.lead, played.lead + count)
+    if direction is not None and direction.parts is not None:
+        frames = _frames_in_part(played, direction, rows, report)
+    elif direction is not None and (direction.free[rows] < 1).any():
+        frames = _directed_frames(played, direction.free[rows], report)
+    else:
+        frames = _solved_frames(played, 0, count, report)
     for number, frame in enumerate(frames):
         told()
         if number >= left_out:
@@ -112,8 +118,7 @@ def _directed_frames(played: BakeRollout, free: Floats, report: Reporter) -> Ite
     """
     stretches = free_stretches(free)
     if not stretches:
-        found, allowed = "the garment is held in all frames", "--refine solves for cloth that moves freely"
-        fail(played.request.motion, found, allowed, "leave --refine out, or key ssilk:free")
+        _refuse_held(played)
     deformer, motion = lbs_deformer(played.deformer.scene), played.motion
     done = 0
     for first, stop in [*stretches, (len(free), len(free))]:
@@ -122,6 +127,27 @@ def _directed_frames(played: BakeRollout, free: Floats, report: Reporter) -> Ite
         for share, points, frame in zip(free[first:stop], _skinned(deformer, motion, first, stop), solved):
             yield _Frame(points + share * (frame.points - points), frame.change)
         done = stop
+
+
+def _frames_in_part(played: BakeRollout, direction: Direction, rows: slice, report: Reporter) -> Iterator[_Frame]:
+    """Yield frames between refined ones and those of the network, where proxies are held each by itself."""
+    assert direction.parts is not None
+    stretches, done = free_stretches(direction.moves[rows]), 0
+    if not stretches:
+        _refuse_held(played)
+    free = direction.free[rows, None] * direction.parts.free[rows]
+    follow, held = shares_of_proxies(played.deformer), played.network_vertices()
+    for first, stop in [*stretches, (len(free), len(free))]:
+        yield from (_Frame(points, None) for points in islice(held, first - done))
+        solved = _solved_frames(played, first, stop, report) if first < stop else ()
+        for share, points, frame in zip(free[first:stop] @ follow.T, islice(held, stop - first), solved):
+            yield _Frame(points + share[:, None] * (frame.points - points), frame.change)
+        done = stop
+
+
+def _refuse_held(played: BakeRollout) -> NoReturn:
+    found, allowed = "the garment is held in all frames", "--refine solves for cloth that moves freely"
+    fail(played.request.motion, found, allowed, "leave --refine out, or key ssilk:free")
 
 
 def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Iterator[Floats]:
