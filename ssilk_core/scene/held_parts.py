@@ -106,11 +106,12 @@ class PartShapes:
     def of(cls, deformer: Deformer, free: Floats, whole: Floats) -> PartShapes:
         """Return those of a garment of which proxies are free by (S, P), and all else by (S,)."""
         curves, shares = _independent(free - whole[:, None])
-        masks = (shares_of_proxies(deformer) @ shares.T).T
+        masks = (shares_of_proxies(deformer) @ shares.T).T.astype(np.float32)
         # A weight lies in [0, 1]: that of no change is in the middle, and the constant shape takes the middle back.
         parts = 2 * masks[:, None, :, None] * deformer.shapes[None, :-1]
         parts = parts.reshape(-1, *deformer.shapes.shape[1:])
-        return cls(np.concatenate([parts, -0.5 * parts.sum(axis=0, keepdims=True)]).astype(np.float32), curves)
+        constant = -0.5 * parts.sum(axis=0, keepdims=True, dtype=np.float64)
+        return cls(np.concatenate([parts, constant.astype(np.float32)]), curves)
 
     def weights(self, away: Floats, samples: Ints) -> Floats:
         """Return the weights of these shapes (F, R (K - 1) + 1) at samples (F,).

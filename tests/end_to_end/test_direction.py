@@ -11,7 +11,12 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRequest, load_rollout
+from ssilk_core.delivery.bake.direction import DirectedPoses
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.runtime import Player
+from ssilk_core.scene.assets import GarmentPose
+from ssilk_core.scene.kinematics import deform
 
 FRAMES = 24
 BAKE = ["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion"]
@@ -215,6 +220,22 @@ def test_a_group_is_held_and_the_rest_of_the_garment_moves_as_before(stage):
     np.testing.assert_allclose(found[then], plain[then], atol=1e-5)  # the network went on as if nothing was held
     assert main([*BAKE, "clip.usda", "-o", "layers"]) == 0
     np.testing.assert_allclose(points_of("layers/shots/clip/shot.usda"), found, atol=1e-5)
+
+
+def test_a_player_in_numpy_holds_parts_as_a_bake_does(stage):
+    leaf = proxies_of("rigged.usda")[-1].rpartition("/")[2]
+    hold_parts("clip.usda", {f"ssilk:free:{leaf}": {8: 0.0, 14: 1.0}})
+    rollout = load_rollout(BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="clip.usda"))
+    player = Player.load("lively.safetensors")
+
+    def rolled(first: int, stop: int, step: int):
+        return player.play(rollout.motion.picked(slice(first, stop, step))).poses()
+
+    directed = DirectedPoses(rollout.direction, player.deformer(), rolled).poses(0, FRAMES)
+    found, wanted = (GarmentPose.joined(list(poses)) for poses in (directed, rollout.poses()))
+    assert found.weights.shape[1] > len(player.deformer().shapes)
+    points = [deform(rollout.deformer, rollout.motion, pose) for pose in (found, wanted)]
+    np.testing.assert_allclose(*points, atol=1e-4)
 
 
 def test_a_refined_garment_is_held_in_part(stage):

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ...errors import fail
 from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, Scene, Skeleton
 from ...scene.held import HeldGarment
 from ...scene.held_parts import HeldParts, PartShapes, placed_apart, shares_of_group
@@ -100,11 +101,13 @@ def held_parts(
         motion: the character's, at whose samples they are held.
 
     Raises:
-        SsilkError: a proxy is held to a pose by hand that the request's motion has not.
+        SsilkError: the model has no proxies, or one is held to a pose by hand that the request's motion has not.
     """
     from ssilk_usd.reading.direction import read_hand_pose
 
     names, shares, needed = scene.rig.joint_names, list[Floats](), list[str]()
+    if not names:
+        fail(said[0].where, "a part of a garment without proxies", "parts are held by proxies", "key ssilk:free")
     leaves = np.array([name.rpartition("/")[2] for name in names])
     for posed in (False, True):
         share = np.zeros((motion.frame_count, len(names)))

@@ -191,7 +191,10 @@ def _subset(prims: Sequence[Usd.Prim], name: str) -> Ints | None:
     if found is None:
         return None
     rows = np.array(found.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
-    mesh = UsdGeom.Mesh(next(prim for prim in prims if has_value(prim, "faceVertexIndices")))  # an over may have none
+    meshes = [prim for prim in prims if has_value(prim, "faceVertexIndices")]  # an over may have none
+    if not meshes:
+        fail(location(found.GetPrim()), "a subset of a mesh without faces", "a garment has some", "look at the stage")
+    mesh = UsdGeom.Mesh(meshes[0])
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
     kind, most = found.GetElementTypeAttr().Get(), int(corners.max(initial=-1)) + 1
     if kind == UsdGeom.Tokens.face:
