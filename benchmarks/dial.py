@@ -4,7 +4,6 @@
     python benchmarks/dial.py errors --garment cape --stage character.usdc --motions FOLDER --device cuda
     python benchmarks/dial.py times --garment cape --stage character.usdc --motions FOLDER --device cuda
     OMP_NUM_THREADS=1 python benchmarks/dial.py times --garment cape ... --device cpu --threads 1
-    python benchmarks/dial.py join --garment cape --stage ... --motions FOLDER --parts FILES
     python benchmarks/dial.py picture
 
 Places are the network, as trained and reduced to quality levels, the solver in latents on few elements and on all,
@@ -20,17 +19,14 @@ that show, of frames in which a limb is through the cloth, and of triangles that
 distances are told, and RMS third differences of positions [m].
 
 Times are those of a frame of one shot: on one processor core of a shot alone, on a GPU of --shots at once, but of
-refinement, whose frames are solved at once instead. Both write the garment's file, which grows by the rows of --batch
-windows; the same command goes on where it was cut off. A step of the simulator takes as long as its slowest window,
-and windows that are not finished are lost. `errors --clips CLIP --output PART` keeps each clip apart, in a process of
-its own, and `join` makes one file of the parts: on one H200 twelve at once take about as long in all as one batch.
+refinement, whose frames are solved at once instead. Both write the garment's file, which grows by the row of a place
+as soon as the simulator has gone on from all its windows; the same command goes on where it was cut off.
 `picture` draws what the files of the garments that ship hold.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -52,11 +48,9 @@ from ssilk_core.physics.energy import TERMS
 from ssilk_core.physics.intersections.pairs import need_predicates
 from ssilk_core.physics.skin.covered_skin import ShownCounts
 from ssilk_core.quality.evaluation.metrics import mean_square
-from ssilk_core.quality.evaluation.own_starts import BATCH, MethodWindow, Window, continuations
+from ssilk_core.quality.evaluation.own_starts import MethodWindow, Window, continuations
 from ssilk_core.quality.evaluation.record import frame_energies
-from ssilk_core.quality.kept_rows import UNFINISHED
 from ssilk_core.scene.assets import Motion
-from ssilk_core.scene.plain import from_plain
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "dial.png"
 LOOKS = ("total", "shown", "limbs", "intersecting", "jitter")
@@ -97,16 +91,12 @@ def errors(options: argparse.Namespace, report: Reporter) -> None:
     frames = max(take.frame_count for take in bench.windows.takes)
     report(Message(f"{bench.subject.name}: {count} windows, of takes of {frames} frames at most"))
     group: list[Played] = []
-    room = bench.options.batch
-    for number, place in enumerate(missing, start=1):
+    for place in missing:
         one_by_one = place.refine is not None and not place.refine.feedback
         told = Countdown(sum(take.frame_count for take in bench.windows.takes) if one_by_one else frames, report)
         report(Message(f"{bench.subject.name}: {place.name}"))
         group += played(bench, place, told)
-        room -= count * (2 if place == NETWORK else 1)
-        if room < count or number == len(missing):
-            simulated(bench, group)
-            group, room = [], bench.options.batch
+    simulated(bench, group)
 
 
 def played(bench: DialBench, place: DialPlace, told: Countdown) -> list[Played]:
@@ -127,22 +117,32 @@ def played(bench: DialBench, place: DialPlace, told: Countdown) -> list[Played]:
 
 
 def simulated(bench: DialBench, group: Sequence[Played]) -> None:
-    """Let the simulator go on from all windows of a group at once, and write what that tells of each."""
+    """Let the simulator go on from all windows, and write what that tells of each place as soon as it is known."""
     every = [window for one in group for window in one.own]
     report = bench.report
     report(Message(f"{bench.subject.name}: the simulator goes on from {len(every)} windows"))
     told = Countdown(sum(len(window.x) - STATES for window in every), report)
-    ends = iter(continuations(bench.subject.dressed.simulator, every, told))
-    reached = {(one.split, one.place): [next(ends) for _ in one.own] for one in group}
-    for one in group:
-        own, reference = [window.x for window in one.own], reached[one.split, one.place]
-        if one.place == OFF:  # the simulation from the network's own states is what it is compared with
-            own, reference = reference, reached[one.split, NETWORK.name]
-        bench.rows.append(figures(bench, one, own, reference))
-        if one.place == NETWORK.name:
-            simulator = replace(one, place=SIMULATOR)
-            bench.rows.append(figures(bench, simulator, reference, reference))
-        bench.write(**provenance(bench.options))
+    ends = np.cumsum([len(one.own) for one in group])
+    network = {
+        one.split: range(end - len(one.own), end) for one, end in zip(group, ends) if one.place == NETWORK.name
+    }
+    reached: dict[int, Tensor] = {}
+    waiting = dict(zip(ends.tolist(), group))
+    for number, x in continuations(bench.subject.dressed.simulator, every, told):
+        reached[number] = x
+        for end, one in list(waiting.items()):
+            # The simulation from the network's own states is what that from a millimetre beside is compared with.
+            own = range(end - len(one.own), end)
+            compared = network[one.split] if one.place == OFF else own
+            if not reached.keys() >= {*own, *compared}:
+                continue
+            del waiting[end]
+            reference = [reached[at] for at in compared]
+            shown = [reached[at] for at in own] if one.place == OFF else [window.x for window in one.own]
+            bench.rows.append(figures(bench, one, shown, reference))
+            if one.place == NETWORK.name:
+                bench.rows.append(figures(bench, replace(one, place=SIMULATOR), reference, reference))
+            bench.write(**provenance(bench.options))
 
 
 def figures(bench: DialBench, one: Played, own: Sequence[Tensor], reference: Sequence[Tensor]) -> DialErrors:
@@ -188,31 +188,6 @@ def appearance(bench: DialBench, take: int, frames: range, local: Tensor, x: Ten
     }
 
 
-def joined(options: argparse.Namespace, report: Reporter) -> None:
-    """Write the garment's file with the windows of all parts, in the order of the clips."""
-    bench = DialBench(options, report)
-    clips = [(split, clip) for split, names in bench.splits.items() for clip in names]
-    found: dict[tuple[str, str], DialErrors] = {}
-    parts = {}
-    for path in options.parts:
-        document = json.loads(path.read_text())
-        own = document[bench.kept.inputs_at]
-        if UNFINISHED in document or {**own, "clips": None} != {**bench.kept.inputs, "clips": None}:
-            fail(path, "not finished, or of other inputs", "parts are of one model and its clips", "measure it again")
-        for split, names in own["clips"].items():
-            parts.update({(split, name): (document, names) for name in names})
-    missing = [clip for split, clip in clips if parts.get((split, clip), (None, []))[1] != [clip]]
-    if missing:
-        fail("--parts", f"no part of {', '.join(missing)} alone", "each clip needs one")
-    for split, clip in clips:
-        document = parts[split, clip][0]
-        for row in (from_plain(DialErrors, each, figures=True) for each in document[bench.kept.rows_at]):
-            at = split, row.place
-            found[at] = row if at not in found else found[at].followed_by(row)
-    bench.rows = list(found.values())
-    bench.write(**{name: document[name] for name in provenance(options) if name in document})
-
-
 def times(options: argparse.Namespace, report: Reporter) -> None:
     """Time the places that the garment's file lacks on this device."""
     bench = DialBench(options, report)
@@ -247,7 +222,7 @@ def timed_shots(bench: DialBench, count: int) -> list[Motion]:
 def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     found = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    found.add_argument("what", choices=("errors", "join", "times", "picture"), help="to do")
+    found.add_argument("what", choices=("errors", "times", "picture"), help="to do")
     found.add_argument("--garment", default="cape", help="garment that ships (default cape)")
     found.add_argument("--model", type=Path, metavar="FILE", help="another model, written by 'ssilk train'")
     found.add_argument("--stage", type=Path, default=demo_body_path(),
@@ -264,10 +239,6 @@ def parser() -> argparse.ArgumentParser:
     found.add_argument("--lead", type=int, default=30, help="frames played before a window (default 30)")
     found.add_argument("--after", type=int, nargs="+", default=[10, 30],
                        help="frames to tell distances after; the last ends a window (default 10 30)")  # fmt: skip
-    found.add_argument("--batch", type=int, default=BATCH,
-                       help="windows, about, that the simulator goes on from at once, and that are written together "
-                       f"(default {BATCH})")  # fmt: skip
-    found.add_argument("--parts", type=Path, nargs="+", default=[], metavar="FILE", help="of single clips, to join")
     found.add_argument("--shots", type=int, help="that are timed at once (default: 64 on a GPU, 1 on a processor)")
     found.add_argument("--output", type=Path, metavar="FILE",
                        help="figures, or picture (default: in results/, and docs/images/dial.png)")  # fmt: skip
@@ -288,7 +259,7 @@ def main() -> None:
         if options.windows < 1 or min(options.after) < 1:
             found = f"{options.windows} windows, after {options.after} frames"
             fail("windows", found, "at least 1 is needed of each")
-        {"errors": errors, "join": joined, "times": times}[options.what](options, TextReporter())
+        {"errors": errors, "times": times}[options.what](options, TextReporter())
     except SsilkError as error:
         raise SystemExit(f"error: {error}") from error
 

@@ -23,8 +23,8 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.physics.simulate.characters import PosedCharacters
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import StepInputs
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.quality.evaluation.methods import Network, TakeSet, build_take_set
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.solver_errors import windows_of
@@ -149,8 +149,9 @@ class PlayedWindow:
         solver, best, outputs = [*first], [*first], [self.outputs[n : n + 1] for n in (0, 1)]
         for frame in range(2, length):
             pose = self.pose(frame)
-            found = simulator.step(pose.posed, self.history(solver[-1], solver[-2], frame)).x
-            solver.append(found.double() + pose.posed.root)
+            past = self.history(solver[-1], solver[-2], frame)
+            (found,) = simulator.carry_on([past], [range(frame, frame + 1)], lambda _: pose.posed)  # noqa: B023
+            solver.append(found.state.last)
             inputs = simulator.inputs(pose.posed, self.history(best[-1], best[-2], frame))
             starts = outputs[-1], 2 * outputs[-1] - outputs[-2]
             start = min(starts, key=lambda each: self.best.energy(self.best.positions(each, pose), inputs))

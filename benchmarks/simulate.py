@@ -12,7 +12,7 @@ with the nearest body points of the final states.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,11 @@ from ssilk_core.authoring.setup.prepare import prepare_scene
 from ssilk_core.devices import select_device
 from ssilk_core.events import TextReporter
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
+from ssilk_core.physics.simulate.characters import PosedCharacters
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.physics.simulate.newton import Solution, SolverOptions
+from ssilk_core.physics.simulate.newton import Search, Solution, SolverOptions
+from ssilk_core.physics.simulate.simulator import PosesAt, Stepped
 from ssilk_core.scene.assets import Motion, Scene
 from ssilk_core.scene.fabrics import Fabric
 
@@ -39,23 +42,33 @@ ROUND = 50  # iterations of L-BFGS between looks at the body
 
 
 class Watched(Simulator):
-    """A simulator that keeps every step's problem and solution of the first shot, and times the steps."""
+    """A simulator that keeps all solutions, and every problem of the first shot, and times the steps."""
 
     def __init__(self, scene: Scene, options: SimulationOptions, device: torch.device) -> None:
         super().__init__(scene, Fabric("default"), options, device=device)
-        self.seconds: list[float] = []
+        self.seconds = 0.0
         self.problems: list[tuple[Tensor, StepInputs]] = []
         self.solutions: list[Solution] = []
+        self.first: list[Solution] = []
 
-    def solve(self, start: Tensor, inputs: StepInputs) -> Solution:
-        """Solve one step."""
-        first = torch.zeros(1, dtype=torch.int64, device=start.device)
-        begun = now(start.device)
-        solution = super().solve(start, inputs)
-        self.seconds.append(now(start.device) - begun)
-        self.problems.append((start[..., :1], inputs.select(first)))
-        self.solutions.append(solution)
-        return solution
+    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int]) -> Search:
+        """Begin with steps of shots."""
+        found = super().search(poses, past, numbers)
+        if 0 in numbers:
+            row = torch.tensor([list(numbers).index(0)], device=found.residual.device)
+            self.problems.append((found.state.x[..., row], found.inputs.select(row)))
+        return found
+
+    def carry_on(self, past: Sequence[StepHistory], steps: Sequence[range], poses_at: PosesAt) -> Iterator[Stepped]:
+        """Take the steps of shots; what is at rest before is not timed."""
+        device = self.poser.rest.device
+        begun = now(device)
+        for each in super().carry_on(past, steps, poses_at):
+            self.solutions.append(each.solution)
+            if each.shot == 0:
+                self.first.append(each.solution)
+            yield each
+        self.seconds += now(device) - begun
 
 
 def shots(motions: Sequence[Motion], count: int, frames: int, fps: float) -> list[Motion]:
@@ -88,12 +101,12 @@ def newton_figures(simulator: Watched, count: int) -> dict[str, Any]:
     residual = torch.cat([s.residual for s in simulator.solutions])
     return {
         "shots": count,
-        "seconds": sum(simulator.seconds) / len(simulator.seconds) / count,
+        "seconds": simulator.seconds / len(simulator.solutions),
         "iterations": float(torch.cat([s.iterations for s in simulator.solutions]).double().mean()),
-        "cg_iterations": sum(s.cg_iterations for s in simulator.solutions) / len(simulator.solutions),
+        "cg_iterations": float(torch.cat([s.cg_iterations for s in simulator.solutions]).double().mean()),
         "residual": float(residual.median()),
         "solved": float((residual <= simulator.options.solver.tolerance).double().mean()),
-        "energy": sum(float(s.energy[0]) for s in simulator.solutions) / len(simulator.solutions),
+        "energy": sum(float(s.energy) for s in simulator.first) / len(simulator.first),
     }
 
 
@@ -172,7 +185,7 @@ def main() -> None:
         measured[f"newton {count}"] = found = newton_figures(simulator, count)
         rows.append(row("Newton", found))
         print(table(HEADER, rows), flush=True)
-    compared = simulator.solutions[: options.compared]
+    compared = simulator.first[: options.compared]
     energy = sum(float(s.energy[0]) for s in compared) / len(compared)
     measured["newton compared"] = found = {**measured[f"newton {count}"], "energy": energy}
     rows.append(row("Newton, compared frames", found))

@@ -50,13 +50,6 @@ class DialErrors:
     intersecting: tuple[float, ...]
     jitter: tuple[float, ...]
 
-    def followed_by(self, other: DialErrors) -> DialErrors:
-        """Return the figures of this place in more windows of its split."""
-        lists = ("velocity", "total", "shown", "limbs", "intersecting", "jitter")
-        told = {name: getattr(self, name) + getattr(other, name) for name in lists}
-        distance = {after: own + other.distance[after] for after, own in self.distance.items()}
-        return replace(self, lost=self.lost + other.lost, distance=distance, **told)
-
 
 @dataclass(frozen=True, kw_only=True)
 class DialTime:

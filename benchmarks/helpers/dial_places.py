@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 import torch
@@ -26,7 +27,7 @@ from ssilk_core.network.runtime import Player
 from ssilk_core.physics.refine import RefineOptions, Refiner
 from ssilk_core.quality.cost import play_time
 from ssilk_core.quality.evaluation.methods import Method, Network, SolvedNetwork, TakeSet, build_take_set
-from ssilk_core.quality.evaluation.own_starts import MethodWindow, history, poses_of
+from ssilk_core.quality.evaluation.own_starts import STATES, MethodWindow, history, poses_of
 from ssilk_core.quality.evaluation.takes import Take
 from ssilk_core.quality.levels import QUALITIES
 from ssilk_core.quality.reduction import Reducer
@@ -220,7 +221,8 @@ class Dial:
         simulator, count = subject.dressed.simulator, batch[0].frame_count
         own = [MethodWindow(subject.dressed, take_set, played, (at, range(count))) for at in range(len(batch))]
         yield None
-        past = history(simulator, [(window, 2) for window in own])
-        yield from simulator.carry_on(
-            past, (poses_of(simulator, [(window, at) for window in own]) for at in range(2, count))
+        past = history(simulator, [(window, STATES) for window in own]).split()
+        steps = simulator.carry_on(
+            past, [range(STATES, count)] * len(own), lambda at: poses_of(simulator, [(own[n], f) for n, f in at])
         )
+        yield from islice(steps, len(own) - 1, None, len(own))  # so many make a frame of all shots

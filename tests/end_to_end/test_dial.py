@@ -44,7 +44,7 @@ def script(world) -> Callable[[str], None]:
 
 @pytest.fixture(scope="module")
 def measured(script, world):
-    script(f"errors {OPTIONS} --output dial.json --batch 7")  # two places at once, then the others
+    script(f"errors {OPTIONS} --output dial.json")
     return json.loads((world / "dial.json").read_text())
 
 
@@ -61,23 +61,6 @@ def test_each_place_is_measured_from_its_own_two_states(measured):
         assert all(len(rows[split, place]["total"]) == 1 and rows[split, place]["lost"] == 0 for place in SOLVERS)
 
 
-def test_clips_that_were_measured_apart_join(measured, script, world):
-    """Reduced networks are those of all clips, so each window's figures are the same."""
-    places = "--places game network hero"
-    for clip in ("calm", "wild"):
-        script(f"errors {OPTIONS} {places} --clips {clip} --output {clip}.json")
-    with pytest.raises(SystemExit, match="no part of wild alone"):
-        script(f"join {OPTIONS} {places} --output joined.json --parts calm.json")
-    script(f"join {OPTIONS} {places} --output joined.json --parts wild.json calm.json")
-    found = json.loads((world / "joined.json").read_text())
-    rows = {(row["split"], row["place"]): row for row in measured["figures"]}
-    assert "unfinished" not in found and len(found["figures"]) == 2 * 5
-    for row in found["figures"]:
-        known = rows[row["split"], row["place"]]
-        assert row["distance"]["4"] == pytest.approx(known["distance"]["4"], rel=1e-3)
-        assert row["total"] == pytest.approx(known["total"], rel=1e-3)
-
-
 def test_what_was_cut_off_goes_on(measured, script, world, capsys):
     """Rows that are there stay as they are; the missing place alone is measured, to the same figures."""
     cut = {**measured, "unfinished": "yes"}
@@ -87,7 +70,7 @@ def test_what_was_cut_off_goes_on(measured, script, world, capsys):
         if row["place"] != "crowd"
     ]
     (world / "cut.json").write_text(json.dumps(cut))
-    script(f"errors {OPTIONS} --output cut.json --batch 1")
+    script(f"errors {OPTIONS} --output cut.json")
     found = json.loads((world / "cut.json").read_text())
     assert "unfinished" not in found and len(found["figures"]) == len(measured["figures"])
     for row, known in zip(found["figures"], measured["figures"]):
@@ -102,7 +85,7 @@ def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measure
     gone = (("flips", "crowd"), ("flips", "simulator, 1 mm off"))
     cut["figures"] = [row for row in measured["figures"] if (row["split"], row["place"]) not in gone]
     (world / "between.json").write_text(json.dumps(cut))
-    script(f"errors {OPTIONS} --output between.json --batch 1")
+    script(f"errors {OPTIONS} --output between.json")
     found = json.loads((world / "between.json").read_text())
     names = [(row["split"], row["place"]) for row in found["figures"]]
     assert "unfinished" not in found and names == [(row["split"], row["place"]) for row in measured["figures"]]

@@ -265,12 +265,12 @@ class LoadedGarment:
             names = self.model.scene.rig.joint_names
             said = read_direction(request.motion, request.stage, garment, read.whole, names)
         parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole) if said.parts else None
-        if read.loop is not None:
-            return self._directed_in_loop(request, read, read.loop, said, parts)
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
             fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
+        if read.loop is not None:
+            return self._directed_in_loop(request, read, read.loop, said, parts)
         if said.free is None and hold == 1 and parts is None:
             return None
         samples, count = request.samples_per_frame, read.whole.frame_count

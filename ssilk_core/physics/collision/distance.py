@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .. import kernels, loops
+from ..framed import Framed
 from .closest_point import bounding_spheres, closest_on_faces, frames_at_once
 from .limb_axes import PosedLimbs
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK, consecutive_blocks, nearest_vertex
@@ -36,7 +37,7 @@ SURFACE_EPSILON = 1e-5  # [m]; closer to the surface, float32 no longer resolves
 
 
 @dataclass(frozen=True, eq=False)
-class PosedBody:
+class PosedBody(Framed):
     """Body vertices [m] and unit vertex normals for each frame, both (B, 3, N).
 
     Attributes:
@@ -51,6 +52,8 @@ class PosedBody:
         patches: the triangles in compact patches (`closest_point.triangle_patches`), int32, for the search on a GPU.
         limbs: axes that loose cloth must not cross; none by default.
     """
+
+    SHARED = frozenset({"rings", "groups", "faces", "patches"})
 
     points: Tensor
     normals: Tensor
@@ -67,11 +70,6 @@ class PosedBody:
 
         assert self.faces is not None
         return sphere_bounds(self.points, self.faces)
-
-    def select(self, frames: Tensor) -> PosedBody:
-        """Return the body in the frames with indices (M,)."""
-        limbs = self.limbs and self.limbs.select(frames)
-        return replace(self, points=self.points[..., frames], normals=self.normals[..., frames], limbs=limbs)
 
 
 def gather_frames(values: Tensor, index: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ...scene.assets import LOOSE, Body, Floats, Ints, Mesh, Scene, Skeleton
 from ...scene.mesh import topology
+from ..framed import Framed
 from ..skinning import Skinning, transform_points
 from .ray_casting import RayCaster
 from .winding_number import ENCLOSED, winding_number
@@ -167,7 +168,7 @@ def along_paths(values: Tensor, paths: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedLimbs:
+class PosedLimbs(Framed):
     """Axes of limbs in N frames.
 
     Attributes:
@@ -176,17 +177,14 @@ class PosedLimbs:
         buried: whether the tip of each limb lies in another part of the body, bool (L, N).
     """
 
+    SHARED = frozenset({"radii", "paths", "beyond"})
+
     start: Tensor
     end: Tensor
     radii: Tensor
     paths: Tensor
     beyond: Tensor
     buried: Tensor
-
-    def select(self, frames: Tensor) -> PosedLimbs:
-        """Return the axes in the frames with indices (M,)."""
-        start, end, buried = (values[..., frames] for values in (self.start, self.end, self.buried))
-        return replace(self, start=start, end=end, buried=buried)
 
 
 class LimbPoser:

@@ -13,6 +13,7 @@ crossing is decided at rest, so that the same cloth is pushed until it is past t
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from ...scene.assets import LOOSE, Scene
 from .. import kernels, loops
+from ..framed import Framed
 from .limb_axes import MIN_LENGTH, PosedLimbs, along_paths, loose_faces
 from .ray_casting import EDGE_TOLERANCE, RayCaster
 from .samples import ContactSamples
@@ -32,7 +34,7 @@ MARGIN = 0.02  # [m] around the skin of a limb: the spacing of samples
 
 
 @dataclass(frozen=True, eq=False)
-class PiercedCloth:
+class PiercedCloth(Framed):
     """Where L limbs pierce the cloth in N frames.
 
     Attributes:
@@ -63,10 +65,6 @@ class PiercedCloth:
         """Return the same cloth, pierced by the same limbs in another pose; none by those that are buried in it."""
         return PiercedCloth.of(self.bone, self.step, self.point, self.radius.where(~limbs.buried, 0), limbs)
 
-    def select(self, frames: Tensor) -> PiercedCloth:
-        """Return that of the frames with indices (M,)."""
-        return PiercedCloth(*(getattr(self, name)[..., frames] for name in vars(self)))
-
 
 @dataclass(frozen=True, eq=False)
 class PiercedOutfit:
@@ -86,6 +84,12 @@ class PiercedOutfit:
     def select(self, frames: Tensor) -> PiercedOutfit:
         """Return that of the frames with indices (M,)."""
         return PiercedOutfit(tuple(part and part.select(frames) for part in self.parts))
+
+    @classmethod
+    def concatenated(cls, several: Sequence[PiercedOutfit]) -> PiercedOutfit:
+        """Return that of the frames of several, one after the other."""
+        parts = zip(*(each.parts for each in several))
+        return cls(tuple(PiercedCloth.concatenated(own) if own[0] else None for own in parts))
 
 
 class Piercing:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..framed import Framed
 from .closest_point import candidate_pairs, segment_min
 from .one_ring import closest_in_triangle
 
@@ -29,7 +30,7 @@ EDGE_EPSILON = 1e-6  # barycentric coordinate up to which a point counts as on t
 
 
 @dataclass(frozen=True, eq=False)
-class SmoothedDistance:
+class SmoothedDistance(Framed):
     """Smoothed distances to first and second order, for each vertex and frame.
 
     Attributes:
@@ -61,10 +62,6 @@ class SmoothedDistance:
     def tensors(self) -> list[Tensor]:
         """Return all tensors, frames last."""
         return [self.normal, self.offset, self.curvature]
-
-    def select(self, frames: Tensor) -> SmoothedDistance:
-        """Return the distances in the frames with indices (M,)."""
-        return SmoothedDistance(*(values[..., frames] for values in self.tensors()))
 
     def to(self, dtype: torch.dtype) -> SmoothedDistance:
         """Convert the planes to a precision; the curvature stays float32."""

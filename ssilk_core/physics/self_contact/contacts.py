@@ -7,8 +7,10 @@ which they turn, but for the Hessian's part that turning makes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -163,6 +165,16 @@ class ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""
         new = places_among(self.frame, frames, self.frames)
         return replace(self._kept(new >= 0, new, len(frames)), known=self.known[frames])
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[ClothContacts]) -> ClothContacts:
+        """Return the contacts in the frames of several, one after the other."""
+        before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
+        rows = "vertices", "coefficients", "second", "direction", "start", "area"
+        known = torch.cat([part.known for part in parts])
+        frame = torch.cat([part.frame + first for part, first in zip(parts, before)])
+        own = (torch.cat([getattr(part, name) for part in parts], dim=-1) for name in rows)
+        return cls(parts[0].law, before[-1], known, frame, *own)
 
     def pressing(self, x: Tensor) -> ClothContacts:
         """Return those that have an energy."""

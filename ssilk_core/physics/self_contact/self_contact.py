@@ -116,6 +116,13 @@ class ClothNeighbours:
         last, at = (torch.cat([getattr(part, name) for _, part in parts], -1)[..., order] for name in ("last", "at"))
         return cls(last, at, pairs("faces"), pairs("edges"))
 
+    @classmethod
+    def concatenated(cls, parts: Sequence[ClothNeighbours]) -> ClothNeighbours:
+        """Return those of the frames of several, one after the other."""
+        device, counts = parts[0].at.device, [part.at.shape[-1] for part in parts]
+        places = torch.arange(sum(counts), device=device).split(counts)
+        return cls.joined(list(zip(places, parts)))
+
     def replace_frames(self, frames: Tensor, other: ClothNeighbours) -> ClothNeighbours:
         """Return those with frames (M,), in ascending order, replaced by those of another."""
         kept = torch.ones(self.at.shape[-1], dtype=torch.bool, device=self.at.device)

@@ -26,6 +26,7 @@ from ...scene.kinematics import (
     world_transforms,
 )
 from ..collision import CollisionBody, LimbAxes, PosedBody
+from ..framed import Framed
 from ..skinning import blend_matrices, transform_points
 from ..world.surroundings import PosedWorld
 
@@ -86,7 +87,7 @@ def join_spans(motion: Motion, spans: Sequence[MotionSpan]) -> Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedCharacters:
+class PosedCharacters(Framed):
     """Posed characters, each relative to its own root.
 
     Attributes:
@@ -104,13 +105,6 @@ class PosedCharacters:
     matrices: Tensor
     world: PosedWorld | None = None
     moves: Tensor | None = None
-
-    def select(self, frames: Tensor) -> PosedCharacters:
-        """Return the poses of the frames with indices (M,)."""
-        body, world = self.body.select(frames), self.world and self.world.select(frames)
-        moves = None if self.moves is None else self.moves[..., frames]
-        own = self.lbs[..., frames], self.matrices[..., frames]
-        return PosedCharacters(self.root[:, frames], body, *own, world, moves)
 
 
 class CharacterPoser:
@@ -142,11 +136,13 @@ class CharacterPoser:
         part.weights, part.rest = self.weights[rows], self.rest[rows]
         return part
 
-    def poses_at(self, spans: Sequence[MotionSpan], step: int) -> PosedCharacters:
-        """Return the poses of all spans at a step."""
-        rotations = np.stack([span.motion.rotations[step] for span in spans])
-        translations = np.stack([span.motion.translations[step] for span in spans])
-        return self.pose(rotations, translations, self.moves((span.motion, slice(step, step + 1)) for span in spans))
+    def poses_at(self, places: Sequence[tuple[Motion, int]]) -> PosedCharacters:
+        """Return the poses of motions, each at a frame of it."""
+        rotations, translations = (
+            np.stack([getattr(motion, name)[frame] for motion, frame in places])
+            for name in ("rotations", "translations")
+        )
+        return self.pose(rotations, translations, self.moves((motion, slice(at, at + 1)) for motion, at in places))
 
     def moves(self, parts: Iterable[tuple[Motion, slice | Ints]]) -> Tensor | None:
         """Return by how much shapes move the body's vertices in the bind pose [m], shape (B, 3, N); None without any.

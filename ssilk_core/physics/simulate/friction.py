@@ -9,8 +9,10 @@ cloth that sticks creeps, at most so fast.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -71,6 +73,13 @@ class Friction:
         held = _combined(own.coefficients, x, own.vertices, own.frame)
         rows = own.vertices, own.coefficients, none, none.to(x.dtype), own.direction, mu * own.pressure(x), held
         return cls(own.frames, CREEP * dt, own.frame, *rows)
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[Friction]) -> Friction:
+        """Return that of the frames of several, one after the other."""
+        before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
+        moved = [replace(part, frame=part.frame + first) for part, first in zip(parts, before)]
+        return replace(cls.joined(*moved), frames=before[-1])
 
     def after(self, body: Tensor) -> Friction:
         """Return that of a step in which the body has moved to points (B, 3, N)."""

@@ -31,6 +31,7 @@ from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
+from ..framed import Framed
 from ..kernels.corners import ElasticTables, elastic_tables
 from ..self_contact import ClothContacts, ClothNeighbours, SelfContact, TouchingCloth
 from ..self_contact.contacts import Slopes
@@ -47,7 +48,7 @@ HELD = 1e3  # weight of a vertex that is not free, in the rigid motion that a ga
 
 
 @dataclass(frozen=True, eq=False)
-class StepInputs:
+class StepInputs(Framed):
     """Inputs of the energy of N frames, besides the positions.
 
     Attributes:
@@ -65,6 +66,8 @@ class StepInputs:
         world: what cloth meets besides the body; None without.
     """
 
+    SHARED = frozenset({"dt"})
+
     body: PosedBody | None
     gravity: Tensor
     predicted: Tensor | None = None
@@ -76,21 +79,6 @@ class StepInputs:
     friction: Friction | None = None
     pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
-
-    def select(self, frames: Tensor) -> StepInputs:
-        """Return the inputs of the frames with indices (M,)."""
-        body = self.body and self.body.select(frames)
-        predicted, advected, skinned = (
-            v if v is None else v[..., frames] for v in (self.predicted, self.advected, self.skinned)
-        )
-        neighbours = self.neighbours and self.neighbours.select(frames)
-        contacts, friction = (
-            self.contacts and self.contacts.select(frames),
-            self.friction and self.friction.select(frames),
-        )
-        pierced, world = self.pierced and self.pierced.select(frames), self.world and self.world.select(frames)
-        met = neighbours, contacts, friction, pierced, world
-        return StepInputs(body, self.gravity[..., frames], predicted, advected, self.dt, skinned, *met)
 
 
 class IncrementalPotential:

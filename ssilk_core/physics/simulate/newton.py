@@ -19,7 +19,7 @@ Where cloth may not pass through cloth, each step is cut short before it does, v
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -27,6 +27,7 @@ from torch import Tensor
 
 from ...errors import fail
 from ..collision import SmoothedDistance
+from ..framed import Framed
 from ..self_contact import ClothContacts, ClothNeighbours
 from .incremental_potential import IncrementalPotential, StepInputs
 
@@ -69,7 +70,7 @@ class SolverOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Solution:
+class Solution(Framed):
     """Minima of N frames.
 
     Attributes:
@@ -78,7 +79,7 @@ class Solution:
         residual: as in `SolverOptions.tolerance`, over vertices that are not fixed, shape (N,).
         iterations: Newton iterations, shape (N,).
         fixed: number of fixed vertices, shape (N,).
-        cg_iterations: conjugate gradient iterations, each for all active frames.
+        cg_iterations: conjugate gradient iterations that a frame took part in, shape (N,).
         neighbours: which cloth may touch which at x, where inputs say so.
     """
 
@@ -87,24 +88,12 @@ class Solution:
     residual: Tensor
     iterations: Tensor
     fixed: Tensor
-    cg_iterations: int
+    cg_iterations: Tensor
     neighbours: ClothNeighbours | None = None
-
-    def replace_frames(self, frames: Tensor, other: Solution) -> Solution:
-        """Return the solution with frames (M,), in ascending order, from another; iterations are those of both."""
-        x, energy, residual, fixed = (
-            getattr(self, name).index_copy(-1, frames, getattr(other, name))
-            for name in ("x", "energy", "residual", "fixed")
-        )
-        neighbours, iterations = self.neighbours, self.iterations.index_add(-1, frames, other.iterations)
-        if neighbours and other.neighbours:
-            neighbours = neighbours.replace_frames(frames, other.neighbours)
-        count = self.cg_iterations + other.cg_iterations
-        return Solution(x, energy, residual, iterations, fixed, count, neighbours)
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class State(Framed):
     """Positions of N frames with their distances and energies.
 
     Attributes:
@@ -128,15 +117,6 @@ class State:
     def tensors(self) -> list[Tensor]:
         """Return all tensors but those of the neighbours, frames last."""
         return [self.x, self.energy, *(self.body_distance.tensors() if self.body_distance else [])]
-
-    def select(self, frames: Tensor) -> State:
-        """Return the state of the frames with indices (M,)."""
-        return State(
-            self.x[..., frames],
-            self.body_distance and self.body_distance.select(frames),
-            self.energy[frames],
-            self.neighbours and self.neighbours.select(frames),
-        )
 
     def replace_frames(self, frames: Tensor, other: State) -> State:
         """Return the state with frames (M,) replaced by those of another state."""
@@ -166,13 +146,16 @@ def minimise_from(
     Raises:
         SsilkError: the energy of the start is not finite.
     """
-    search = _Search(potential, start, inputs, options)
-    for _ in range(options.iterations):
-        if not search.drop_finished():
-            break
+    search = Search(potential, start, inputs, options)
+    left = search.leave()
+    while len(search):
         search.advance()
         advanced()
-    return search.ended()
+        left += search.leave()
+    order = torch.cat([frames for frames, _ in left]).argsort()
+    found = Solution.concatenated([replace(each, neighbours=None) for _, each in left]).select(order)
+    known = [(frames, each.neighbours) for frames, each in left if each.neighbours]
+    return replace(found, neighbours=ClothNeighbours.joined(known)) if known else found
 
 
 def need_finite(first: State) -> None:
@@ -187,69 +170,124 @@ def need_finite(first: State) -> None:
         )
 
 
-class _Search:
-    """The search of `minimise_from`: the active frames, and the best state of every frame.
+@dataclass(frozen=True, eq=False)
+class _Course(Framed):
+    """How the search for the minima of N frames goes.
 
     Attributes:
+        moving: whether the last step improved a frame, shape (N,).
         fixed: fixed vertices, shape (V, N).
         cooldown: remaining iterations without the exact Hessian, shape (N,).
         released: frames whose fixed vertices have been released, shape (N,).
-        left: which cloth may touch which in frames that are looked at no more, each with the indices of its frames.
+        iterations, cg_iterations: as in `Solution`.
+    """
+
+    moving: Tensor
+    fixed: Tensor
+    cooldown: Tensor
+    released: Tensor
+    iterations: Tensor
+    cg_iterations: Tensor
+
+
+class Search:
+    """The search for the minima of several frames, which leave it when they are found; others may join.
+
+    Attributes:
+        frames: numbers by which frames are known, shape (N,).
+
+    Raises:
+        SsilkError: the energy of a start is not finite.
     """
 
     gradient: Tensor
     residual: Tensor
 
     def __init__(
-        self, potential: IncrementalPotential, start: Tensor, inputs: StepInputs, options: SolverOptions
+        self,
+        potential: IncrementalPotential,
+        start: Tensor,
+        inputs: StepInputs,
+        options: SolverOptions,
+        numbers: Sequence[int] | None = None,
     ) -> None:
+        """Evaluate the starts of frames, which have the numbers from 0 on unless others are given."""
         self.potential, self.options = potential, options
+        self.frames = torch.tensor(range(start.shape[-1]) if numbers is None else numbers, device=start.device)
         self.inputs = potential.with_contacts(start, inputs)
         self.state = State.at(potential, start, self.inputs)
         need_finite(self.state)
-        energy = self.state.energy
-        self.active = torch.arange(len(energy), device=start.device)
-        self.moving = torch.ones_like(energy, dtype=torch.bool)
-        self.fixed = torch.zeros_like(start[:, 0], dtype=torch.bool)
-        self.cooldown, self.released = torch.zeros_like(self.active), torch.zeros_like(self.moving)
-        self.left: list[tuple[Tensor, ClothNeighbours]] = []
+        count = torch.zeros_like(self.state.energy, dtype=torch.long)
+        self.course = _Course(
+            moving=torch.ones_like(count, dtype=torch.bool),
+            fixed=torch.zeros_like(start[:, 0], dtype=torch.bool),
+            cooldown=count,
+            released=torch.zeros_like(count, dtype=torch.bool),
+            iterations=count,
+            cg_iterations=count,
+        )
         self._evaluate()
-        iterations = torch.zeros_like(self.active)
-        found = start.clone(), energy.clone(), self.residual.clone()
-        self.solution = Solution(*found, iterations, iterations.clone(), 0)
 
-    def drop_finished(self) -> bool:
-        """Drop frames that have converged or that no step improves; return whether any remains."""
-        self._release_fixed()
-        keeps = self.moving & (self.residual > self.options.tolerance)
-        kept = keeps.nonzero()[:, 0]
-        self._leave((~keeps).nonzero()[:, 0])
-        if 0 < len(kept) < len(self.active):
-            self.state, self.inputs = self.state.select(kept), self.inputs.select(kept)
-            for name in ("gradient", "fixed", "active", "residual", "cooldown", "released"):
-                setattr(self, name, getattr(self, name)[..., kept])
-        return len(kept) > 0
+    def __len__(self) -> int:
+        """The number of frames that are searched."""
+        return len(self.frames)
+
+    def join(self, other: Search) -> None:
+        """Go on with the frames of another search of the same potential, after its own."""
+        self.state = State.concatenated([self.state, other.state])
+        self.inputs = StepInputs.concatenated([self.inputs, other.inputs])
+        self.course = _Course.concatenated([self.course, other.course])
+        for name in ("gradient", "residual", "frames"):
+            setattr(self, name, torch.cat([getattr(self, name), getattr(other, name)], dim=-1))
+
+    def leave(self) -> list[tuple[Tensor, Solution]]:
+        """Let frames leave that have converged, that no step improves, or that had all their iterations.
+
+        Returns:
+            The numbers of those that left (M,), with their solution, if there are any.
+        """
+        may = self.course.iterations < self.options.iterations
+        self._release_fixed(may)
+        stays = may & self.course.moving & (self.residual > self.options.tolerance)
+        leaving = (~stays).nonzero()[:, 0]
+        if not len(leaving):
+            return []
+        left = self.frames[leaving], self._solution(leaving)
+        kept = stays.nonzero()[:, 0]
+        self.state, self.inputs = self.state.select(kept), self.inputs.select(kept)
+        self.course = self.course.select(kept)
+        for name in ("gradient", "residual", "frames"):
+            setattr(self, name, getattr(self, name)[..., kept])
+        return [left]
+
+    def _solution(self, rows: Tensor) -> Solution:
+        """Return what is found for frames in places (M,)."""
+        x, energy, residual = self.state.x[..., rows], self.state.energy[rows], self.residual[rows]
+        course, known = self.course.select(rows), self.inputs.neighbours
+        counts = course.iterations, course.fixed.sum(0), course.cg_iterations
+        return Solution(x, energy, residual, *counts, known and known.select(rows))
 
     def advance(self) -> None:
         """Make one step."""
-        potential, inputs, gradient = self.potential, self.inputs, self.gradient
-        exact_hessian = (self.residual < EXACT_HESSIAN_BELOW) & (self.cooldown <= 0)
+        potential, inputs, gradient, course = self.potential, self.inputs, self.gradient, self.course
+        exact_hessian = (self.residual < EXACT_HESSIAN_BELOW) & (course.cooldown <= 0)
         step, count = newton_step(
-            potential, self.state, inputs, gradient, self.options.cg_iterations, self.fixed, exact_hessian
+            potential, self.state, inputs, gradient, self.options.cg_iterations, course.fixed, exact_hessian
         )
         if inputs.contacts is not None:
             step = self._without_passing(inputs.contacts, step)
         self.state, length, obstructing = line_search(potential, self.state, inputs, gradient, step)
         misled = exact_hessian & (length < MISLED_BELOW)
-        self.cooldown = torch.where(misled, COOLDOWN, self.cooldown - 1)
-        new = obstructing & ~self.fixed & ~misled
-        self.fixed |= new
-        self.moving = (length > 0) | new.any(0) | misled
+        new = obstructing & ~course.fixed & ~misled
+        self.course = replace(
+            course,
+            moving=(length > 0) | new.any(0) | misled,
+            fixed=course.fixed | new,
+            cooldown=torch.where(misled, COOLDOWN, course.cooldown - 1),
+            iterations=course.iterations + 1,
+            cg_iterations=course.cg_iterations + count,
+        )
         self._evaluate()
-        self._record()
-        found = self.solution
-        found.iterations[self.active] += 1
-        self.solution = replace(found, cg_iterations=found.cg_iterations + count)
 
     def _without_passing(self, contacts: ClothContacts, step: Tensor) -> Tensor:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
@@ -257,27 +295,13 @@ class _Search:
         steep = (self.gradient * slowed).sum((0, 1)) < DOWNHILL * (self.gradient * step).sum((0, 1))
         return torch.where(steep, slowed, contacts.allowed(self.state.x, step, YIELDING).amin(0) * step)
 
-    def ended(self) -> Solution:
-        """Return the solution after the last step."""
-        if self.inputs.neighbours is None:
-            return self.solution
-        if sum(len(frames) for frames, _ in self.left) < len(self.solution.energy):
-            self._leave(torch.arange(len(self.active), device=self.active.device))
-        return replace(self.solution, neighbours=ClothNeighbours.joined(self.left))
-
-    def _leave(self, frames: Tensor) -> None:
-        """Keep which cloth may touch which in active frames that are looked at no more."""
-        if self.inputs.neighbours is not None and len(frames):
-            self.left.append((self.active[frames], self.inputs.neighbours.select(frames)))
-
-    def _release_fixed(self) -> None:
-        """Release the fixed vertices of frames whose other vertices have converged, once."""
-        again = (self.residual <= self.options.tolerance) & ~self.released & self.fixed.any(0)
+    def _release_fixed(self, may: Tensor) -> None:
+        """Release the fixed vertices of frames (N,) that may, and whose other vertices have converged, once."""
+        course = self.course
+        again = may & (self.residual <= self.options.tolerance) & ~course.released & course.fixed.any(0)
         if bool(again.any()):
-            self.fixed &= ~again
-            self.released |= again
+            self.course = replace(course, fixed=course.fixed & ~again, released=course.released | again)
             self._evaluate()
-            self._record()
 
     def _evaluate(self) -> None:
         """Evaluate contacts of cloth with cloth, gradient and residual of the current states."""
@@ -285,14 +309,8 @@ class _Search:
             around = replace(self.inputs, neighbours=self.state.neighbours)
             self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
         gradient = self.potential.gradient(self.state.x, self.inputs, self.state.body_distance)
-        self.gradient = gradient.masked_fill(self.fixed[:, None], 0)
+        self.gradient = gradient.masked_fill(self.course.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)
-
-    def _record(self) -> None:
-        """Record the current states of the active frames."""
-        found, rows = self.solution, self.active
-        found.x[..., rows], found.energy[rows] = self.state.x, self.state.energy
-        found.residual[rows], found.fixed[rows] = self.residual, self.fixed.sum(0)
 
 
 def newton_step(

@@ -16,9 +16,10 @@ is split once more.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 import torch
@@ -36,10 +37,11 @@ from ..self_contact import ClothNeighbours
 from ..world.surroundings import PosedWorld, Surroundings
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
-from .friction import Friction
+from .history import StepHistory
 from .incremental_potential import IncrementalPotential, StepInputs
-from .newton import Solution, SolverOptions, minimise_from
+from .newton import Search, Solution, SolverOptions, minimise_from
 from .outfit import OutfitPotential, WornGarment
+from .scheduler import Asked, Course, Scheduler
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
@@ -113,55 +115,24 @@ class SimulatedFrame:
 
 
 @dataclass(frozen=True, eq=False)
-class StepHistory:
-    """The previous states of N shots.
+class Stepped:
+    """A step of one shot that was solved.
 
     Attributes:
-        last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
-            in the second step. After shorter steps it is where the last velocity leads back to in a whole one.
-        root: the character's root one step ago [m], float64, shape (3, N).
-        lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
-        neighbours: which cloth may touch which, where that is looked at.
-        friction: of what presses at the last positions, for the next step; None without.
-        matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
-            body is posed in shorter steps; None where no step is to be split. `moves` likewise
-            (`PosedCharacters.moves`).
-        pierced: the cloth that limbs were through at the last positions, which a shorter step holds on to.
+        shot, step: their numbers.
+        past, state: before and after it, of this shot alone.
+        solution: of this shot, relative to its root.
     """
 
-    last: Tensor
-    before: Tensor | None
-    root: Tensor
-    lbs: Tensor
-    neighbours: ClothNeighbours | None = None
-    friction: Friction | None = None
-    matrices: Tensor | None = None
-    pierced: PiercedCloth | PiercedOutfit | None = None
-    moves: Tensor | None = None
+    shot: int
+    step: int
+    past: StepHistory
+    state: StepHistory
+    solution: Solution
 
-    def first(self, count: int) -> StepHistory:
-        """Return the history of the first `count` shots."""
-        return self.select(torch.arange(count, device=self.last.device))
 
-    def select(self, shots: Tensor) -> StepHistory:
-        """Return the history of the shots with indices (M,), in ascending order."""
-        before, matrices, moves = (
-            v if v is None else v[..., shots] for v in (self.before, self.matrices, self.moves)
-        )
-        neighbours, friction = self.neighbours and self.neighbours.select(shots), self.friction
-        friction, pierced = friction and friction.select(shots), self.pierced and self.pierced.select(shots)
-        root, lbs = self.root[:, shots], self.lbs[..., shots]
-        known = neighbours, friction, matrices, pierced, moves
-        return StepHistory(self.last[..., shots], before, root, lbs, *known)
-
-    @property
-    def local(self) -> Tensor:
-        """The last positions relative to the root at that time, shape (V, 3, N)."""
-        return (self.last - self.root).to(self.lbs.dtype)
-
-    def follow_lbs(self, poses: PosedCharacters) -> Tensor:
-        """Return the last positions moved along with linear blend skinning, relative to the roots of `poses`."""
-        return self.local - self.lbs + poses.lbs
+PosesAt = Callable[[Sequence[tuple[int, int]]], PosedCharacters]
+"""Returns the characters at the ends of steps, each given by the numbers of its shot and step."""
 
 
 class Simulator:
@@ -249,45 +220,69 @@ class Simulator:
     def _simulate_spans(
         self, spans: Sequence[MotionSpan], surroundings: Surroundings | None
     ) -> Iterator[SimulatedFrame]:
-        """Yield the frames of spans, which are sorted by decreasing length."""
-        past: StepHistory | None = None
-        for step in range(spans[0].motion.frame_count):
-            running = [span for span in spans if span.motion.frame_count > step]
-            past = past and past.first(len(running))
-            if past:
-                poses = _surrounded(self.poser.poses_at(running, step), surroundings, running, step)
-                past, solution = self._after(past, poses)
-            else:
-                past, solution = self._first(running, surroundings)
-            if step % self.options.substeps == 0:
-                yield from _frames(running, step // self.options.substeps, past.last, solution)
+        """Yield the frames of spans."""
+        past, solution = self._first(spans, surroundings)
+        for span, state, found in zip(spans, past.split(), solution.split()):
+            yield _frame(span, 0, state, found)
 
-    def carry_on(self, past: StepHistory, characters: Iterable[PosedCharacters]) -> Iterator[StepHistory]:
-        """Yield the states after each step that follows `past`, however it came about.
+        def poses_at(places: Sequence[tuple[int, int]]) -> PosedCharacters:
+            at = [(spans[shot], step) for shot, step in places]
+            poses = self.poser.poses_at([(span.motion, step) for span, step in at])
+            return _surrounded(poses, surroundings, at)
+
+        courses = [range(1, span.motion.frame_count) for span in spans]
+        for each in self.carry_on(past.split(), courses, poses_at):
+            if each.step % self.options.substeps == 0:
+                frame = each.step // self.options.substeps
+                yield _frame(spans[each.shot], frame, each.state, each.solution)
+
+    def carry_on(
+        self,
+        past: Sequence[StepHistory],
+        steps: Sequence[range],
+        poses_at: PosesAt,
+    ) -> Iterator[Stepped]:
+        """Yield what comes after states, however these came about: the steps of a shot in order, and each shot's as
+        soon as they are solved. `SimulationOptions.batch` shots are under way at once.
 
         Args:
-            characters: poses of each step, of as many shots as the step before, or of the first of these.
+            past: of each shot alone.
+            steps: the numbers of the steps that each takes.
         """
-        for poses in characters:
-            past = past.first(poses.root.shape[-1])
-            past = self._after(past, poses)[0]
-            yield past
+        scheduler: Scheduler[tuple[StepHistory, Solution]] = Scheduler()
+        left, later = [iter(each) for each in steps], list(enumerate(past))[::-1]
+        ready: list[tuple[int, StepHistory]] = []
+        taken: dict[int, tuple[int, StepHistory]] = {}
+        while ready or later or len(scheduler):
+            begun = [(shot, step, last) for shot, last in ready if (step := next(left[shot], None)) is not None]
+            while later and len(begun) + len(scheduler) < self.options.batch:
+                shot, last = later.pop()
+                begun += [(shot, step, last) for step in islice(left[shot], 1)]
+            poses = poses_at([(shot, step) for shot, step, _ in begun]).split() if begun else []
+            for (shot, step, last), at in zip(begun, poses):
+                taken[shot] = step, last
+                scheduler.begin(shot, self._stepped(last, at))
+            ready = []
+            for shot, (state, solution) in scheduler.run():
+                step, last = taken[shot]
+                yield Stepped(shot, step, last, state, solution)
+                ready.append((shot, state))
 
-    def _after(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
-        """Return the states after those of the past, and their solution."""
-        solution, before = self.step(poses, past), past.last
+    def _stepped(self, past: StepHistory, poses: PosedCharacters) -> Course[tuple[StepHistory, Solution]]:
+        """Return the state of one shot after that of the past, and its solution."""
+        solution, before = (yield Asked(self.dt, self.search, past, poses)), past.last
         if self.splits and past.matrices is not None and poses.world is None:  # no world is posed in between
             stuck = ~(solution.residual <= self.options.solver.tolerance)
             if past.pierced and (now := self._pierced(solution.x, poses)):
                 stuck |= ((now.radius > 0) & (past.pierced.radius == 0)).any(0)
-            if len(again := stuck.nonzero()[:, 0]):
-                part, found = self._in_parts(past.select(again), poses.select(again))
+            if bool(stuck):
+                part, found = yield from self._in_parts(past, poses)
                 assert part.before is not None
-                solution, before = solution.replace_frames(again, found), before.index_copy(-1, again, part.before)
+                solution, before = counted(found, [solution, found]), part.before
         return self._history(solution, poses, before), solution
 
-    def _in_parts(self, past: StepHistory, poses: PosedCharacters) -> tuple[StepHistory, Solution]:
-        """Return what `_after` does by way of `PARTS` shorter steps."""
+    def _in_parts(self, past: StepHistory, poses: PosedCharacters) -> Course[tuple[StepHistory, Solution]]:
+        """Return what `_stepped` does by way of `PARTS` shorter steps."""
         shorter = copy.copy(self)
         shorter.dt, shorter.splits = self.dt / PARTS, self.splits - 1
         assert past.matrices is not None
@@ -298,15 +293,11 @@ class Simulator:
         for share in np.arange(1, PARTS + 1) / PARTS:
             past = replace(past, pierced=self._pierced(past.local, at))
             at = poses if share == 1 else between(share)
-            past, found = shorter._after(past, at)
+            past, found = yield from shorter._stepped(past, at)
             solutions.append(found)
         assert past.before is not None
-        residual, iterations = (
-            torch.stack([getattr(each, name) for each in solutions]) for name in ("residual", "iterations")
-        )
-        spent = sum(each.cg_iterations for each in solutions)
-        found = replace(found, residual=residual.amax(0), iterations=iterations.sum(0), cg_iterations=spent)
-        return replace(past, before=past.last - PARTS * (past.last - past.before)), found
+        found = replace(found, residual=torch.stack([each.residual for each in solutions]).amax(0))
+        return replace(past, before=past.last - PARTS * (past.last - past.before)), counted(found, solutions)
 
     def _pierced(self, x: Tensor, poses: PosedCharacters) -> PiercedCloth | PiercedOutfit | None:
         return self.potential.pierced(x, poses.body)
@@ -329,7 +320,7 @@ class Simulator:
             rotations,
             translations,
             Countdown(most, self.report),
-            lambda poses: _surrounded(poses, surroundings, spans, 0),
+            lambda poses: _surrounded(poses, surroundings, [(span, 0) for span in spans]),
             self.poser.moves((span.motion, slice(0, 1)) for span in spans),
         )
         return self._history(solution, poses, None), solution
@@ -430,12 +421,12 @@ class Simulator:
                 pushed[:, frame] = torch.as_tensor(blown).to(pushed)
         return fabric.drag / fabric.density * pushed
 
-    def step(self, poses: PosedCharacters, past: StepHistory) -> Solution:
-        """Return the states one step after `past`, relative to the roots."""
+    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int]) -> Search:
+        """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots."""
         inputs = self.inputs(poses, past)
         start = self.potential.best_start(self.starts(poses, past, inputs), inputs)
         x, inputs = self._carried(past.local, start, inputs, past.neighbours)
-        return self.solve(self.apply_pins(x, poses), inputs)
+        return Search(self.potential, self.apply_pins(x, poses), inputs, self.options.solver, numbers)
 
     def starts(self, poses: PosedCharacters, past: StepHistory, inputs: StepInputs) -> list[Tensor]:
         """Return states (V, 3, N) that a step after `past` may start from: predicted, still, and with the body."""
@@ -452,23 +443,29 @@ class Simulator:
         return poses.lbs.index_copy(0, free, x[free].to(poses.lbs.dtype))
 
 
+def counted(found: Solution, parts: Sequence[Solution]) -> Solution:
+    """Return a solution with the iterations of all its parts."""
+    iterations, cg_iterations = (
+        torch.stack([getattr(each, name) for each in parts]).sum(0) for name in ("iterations", "cg_iterations")
+    )
+    return replace(found, iterations=iterations, cg_iterations=cg_iterations)
+
+
 def _surrounded(
-    poses: PosedCharacters, surroundings: Surroundings | None, spans: Sequence[MotionSpan], step: int
+    poses: PosedCharacters, surroundings: Surroundings | None, at: Sequence[tuple[MotionSpan, int]]
 ) -> PosedCharacters:
-    """Return the poses of spans at a step with what surrounds them."""
+    """Return the poses of spans, each at a step, with what surrounds them."""
     if surroundings is None:
         return poses
-    places = [(span.shot, float(span.seconds[step])) for span in spans]
+    places = [(span.shot, float(span.seconds[step])) for span, step in at]
     return replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
 
 
-def _frames(spans: Sequence[MotionSpan], frame: int, world: Tensor, solution: Solution) -> Iterator[SimulatedFrame]:
-    points = world.permute(2, 0, 1).cpu().numpy()
-    figures = [
-        values.tolist() for values in (solution.energy, solution.residual, solution.iterations, solution.fixed)
-    ]
-    for span, x, *found in zip(spans, points, *figures):
-        yield SimulatedFrame(span.shot, span.first + frame, x, *found)
+def _frame(span: MotionSpan, frame: int, state: StepHistory, solution: Solution) -> SimulatedFrame:
+    """Return a frame of a span, of its state and solution alone."""
+    points, reached = state.last[..., 0].cpu().numpy(), (float(solution.energy), float(solution.residual))
+    counts = int(solution.iterations), int(solution.fixed)
+    return SimulatedFrame(span.shot, span.first + frame, points, *reached, *counts)
 
 
 def simulate(

@@ -64,6 +64,16 @@ class PosedWorld:
         air, seconds = tuple(self.air[index] for index in chosen), tuple(self.seconds[index] for index in chosen)
         return PosedWorld(colliders, self.gravity[:, frames], air, seconds, self.roots[chosen])
 
+    @classmethod
+    def concatenated(cls, parts: Sequence[PosedWorld]) -> PosedWorld:
+        """Return that of the frames of several, one after the other."""
+        colliders, air, seconds = (
+            tuple(value for part in parts for value in getattr(part, name))
+            for name in ("colliders", "air", "seconds")
+        )
+        gravity = torch.cat([part.gravity for part in parts], dim=-1)
+        return cls(colliders, gravity, air, seconds, np.concatenate([part.roots for part in parts]))
+
     @property
     def has_colliders(self) -> bool:
         return any(self.colliders)

@@ -8,23 +8,23 @@ states tells what it does wrong from there on. Any method of `methods` can be me
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ...physics.simulate import Simulator
 from ...physics.simulate.characters import PosedCharacters
-from ...physics.simulate.simulator import StepHistory
+from ...physics.simulate.history import StepHistory
+from ...physics.simulate.simulator import Stepped
 from ...scene.assets import Motion
 from ...scene.kinematics import first_place
 from .kept_parts import NOTHING_KEPT, KeptParts
 from .methods import EvaluationScene, Method, TakeSet
 from .metrics import mean_square
 
-BATCH = 64  # windows simulated in parallel
+STATES = 2  # of a method, that its window begins with
 
 Window = tuple[int, range]
 """A take, and frames of it."""
@@ -85,9 +85,15 @@ class Departures:
 
 @dataclass(frozen=True, eq=False)
 class _Begun:
-    """Windows after some steps of a simulation: figures as `_departures` has them, and the state, None at the end."""
+    """Windows of which some steps are simulated.
 
-    steps: int
+    Attributes:
+        steps: how many of each, shape (N,).
+        figures: of these, as `Departures` has them, shape (3, F, N).
+        state: after the last one, of the windows that have begun and not ended; None without any.
+    """
+
+    steps: Tensor
     figures: Tensor
     state: StepHistory | None
 
@@ -103,94 +109,88 @@ def departures(
     """Simulate from the first two states of windows.
 
     Args:
-        windows: of three frames or more, by decreasing length; the method is finite in all.
+        windows: of three frames or more; the method is finite in all.
         mass: of the vertices [kg], shape (V,).
         advanced: called with the number of frames that were simulated since the last call.
         kept: where simulations go on from, as far as they were simulated before.
     """
-    frames = len(windows[0].x) - 2
-    parts = [
-        _departures(simulator, windows[start : start + BATCH], mass.double(), advanced, frames, kept.of(start))
-        for start in range(0, len(windows), BATCH)
-    ]
-    return Departures(*torch.cat(parts, dim=-1))
-
-
-def _departures(
-    simulator: Simulator,
-    windows: Sequence[MethodWindow],
-    mass: Tensor,
-    advanced: Callable[[int], object],
-    frames: int,
-    kept: KeptParts,
-) -> Tensor:
-    """Return the figures of `Departures` of one batch, shape (3, frames, N)."""
-    found = torch.full((3, frames, len(windows)), torch.nan, dtype=torch.float64)
+    counts = [len(window.x) - STATES for window in windows]
+    found = torch.full((3, max(counts), len(windows)), torch.nan, dtype=torch.float64)
+    steps = torch.zeros(len(windows), dtype=torch.long)
+    last: dict[int, StepHistory] = {}
     begun = kept.get("windows", _Begun, windows[0].x.device)
     if begun:
-        found[:, : begun.steps] = begun.figures[:, : begun.steps].cpu()
-        advanced(sum(min(len(window.x) - 2, begun.steps) for window in windows))
-    last = len(windows[0].x) - 2
-    for step, (places, past, state) in enumerate(_steps(simulator, windows, begun), begun.steps if begun else 0):
-        away, moved = stacked(places, 0) - state.last, state.last - past.last
-        lbs = state.lbs + state.root - past.lbs - past.root
+        found, steps = begun.figures.cpu(), begun.steps.cpu()
+        last = dict(zip(_going_on(steps, counts), begun.state.split() if begun.state else []))
+        advanced(int(steps.sum()))
+
+    def keep() -> None:
+        states = [last[number] for number in _going_on(steps, counts)]
+        kept.put("windows", _Begun(steps, found, StepHistory.concatenated(states) if states else None))
+
+    for each in _simulated(simulator, windows, steps.tolist(), last):
+        places = [(windows[each.shot], each.step)]
+        away, moved = stacked(places, 0) - each.state.last, each.state.last - each.past.last
+        lbs = each.state.lbs + each.state.root - each.past.lbs - each.past.root
         missed = [away, stacked(places, 0) - stacked(places, 1) - moved, lbs - moved]
-        found[:, step, : len(places)] = torch.stack([mean_square(each, mass) for each in missed]).cpu()
-        advanced(len(places))
-        if kept.due and step + 1 < last:
-            kept.put("windows", _Begun(step + 1, found, state))
-    if not begun or begun.state:
-        kept.put("windows", _Begun(last, found, None))
-    return found
+        found[:, each.step - STATES, each.shot] = torch.stack(
+            [mean_square(part, mass.double())[0] for part in missed]
+        ).cpu()
+        steps[each.shot], last[each.shot] = each.step - STATES + 1, each.state
+        advanced(1)
+        if kept.due:
+            keep()
+    keep()
+    return Departures(*found)
 
 
-def _steps(
-    simulator: Simulator, windows: Sequence[MethodWindow], begun: _Begun | None = None
-) -> Iterator[tuple[list[Place], StepHistory, StepHistory]]:
-    """Yield the places that are stepped to, and the simulator's states before and after each step.
+def _going_on(steps: Tensor, counts: Sequence[int]) -> list[int]:
+    """Return the windows of which some steps were taken, and not all."""
+    return [number for number, (taken, count) in enumerate(zip(steps.tolist(), counts)) if 0 < taken < count]
+
+
+def _simulated(
+    simulator: Simulator, windows: Sequence[MethodWindow], taken: Sequence[int], last: Mapping[int, StepHistory]
+) -> Iterator[Stepped]:
+    """Yield the simulator's steps to the frames of windows, each numbered by its frame, as they are solved.
 
     Args:
-        begun: whose steps are not taken again.
+        taken: how many steps of each window are not taken again.
+        last: the state after these, where there are any and more are to come.
     """
-    first = 2 + (begun.steps if begun else 0)
-    steps = [[(window, at) for window in windows if len(window.x) > at] for at in range(first, len(windows[0].x))]
-    if not steps:
-        return
-    past = begun.state if begun and begun.state else history(simulator, [(window, 2) for window in windows])
-    states = simulator.carry_on(past, (poses_of(simulator, places) for places in steps))
-    for places, state in zip(steps, states):
-        yield places, past.first(len(places)), state
-        past = state
+    own = history(simulator, [(window, STATES) for window in windows]).split()
+    ahead = [range(STATES + count, len(window.x)) for count, window in zip(taken, windows)]
+
+    def poses_at(places: Sequence[tuple[int, int]]) -> PosedCharacters:
+        return poses_of(simulator, [(windows[number], frame) for number, frame in places])
+
+    return simulator.carry_on([last.get(number, state) for number, state in enumerate(own)], ahead, poses_at)
 
 
 @torch.no_grad()
 def continuations(
     simulator: Simulator, windows: Sequence[MethodWindow], advanced: Callable[[int], object]
-) -> list[Tensor]:
-    """Return the simulator's positions in windows, from the first two states of each on.
+) -> Iterator[tuple[int, Tensor]]:
+    """Yield the simulator's positions in windows, from the first two states of each on, as soon as they are known.
 
     Args:
         windows, advanced: as for `departures`.
 
-    Returns:
-        Of each window, positions in the world [m], float64, shape (L, V, 3); the first two are the window's own.
+    Yields:
+        The index of a window, and positions in the world [m], float64, shape (L, V, 3); the first two are its own.
     """
-    found = [[*window.x[:2]] for window in windows]
-    for start in range(0, len(windows), BATCH):
-        for places, _, state in _steps(simulator, windows[start : start + BATCH]):
-            for own, x in zip(found[start:], state.last.unbind(-1)):
-                own.append(x)
-            advanced(len(places))
-    return [torch.stack(own) for own in found]
+    found = [[*window.x[:STATES]] for window in windows]
+    for each in _simulated(simulator, windows, [0] * len(windows), {}):
+        own = found[each.shot]
+        own.append(each.state.last[..., 0])
+        advanced(1)
+        if len(own) == len(windows[each.shot].x):
+            yield each.shot, torch.stack(own)
 
 
 def poses_of(simulator: Simulator, places: Sequence[Place]) -> PosedCharacters:
     """Return the characters of N places."""
-    rotations, translations = (
-        np.stack([getattr(window.motion, name)[frame] for window, frame in places])
-        for name in ("rotations", "translations")
-    )
-    return simulator.poser.pose(rotations, translations)
+    return simulator.poser.poses_at([(window.motion, frame) for window, frame in places])
 
 
 def stacked(places: Sequence[Place], back: int) -> Tensor:

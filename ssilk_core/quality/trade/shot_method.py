@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import lru_cache
 
@@ -22,7 +22,8 @@ from ...network.runtime.skinning import skin_garment
 from ...network.sampling import sample_pose
 from ...physics.refine import RefineOptions, Refiner
 from ...physics.simulate import Simulator
-from ...physics.simulate.simulator import StepHistory
+from ...physics.simulate.characters import PosedCharacters
+from ...physics.simulate.history import StepHistory
 from ...scene.assets import Floats, GarmentPose, Motion
 from ...scene.decomposition import Decomposition, decompose
 from ...scene.kinematics import deform, first_place, resample, sample_motion
@@ -128,13 +129,15 @@ class ShotMethod:
     def _carried_on(self, simulator: Simulator, motion: Motion, given: Floats) -> Iterator[Floats]:
         """Yield the simulator's vertices (V, 3) [m] in the frames after the first two, which are given (2, V, 3)."""
         states = torch.as_tensor(given, dtype=torch.float64, device=self.dressed.device)
-        frames = (slice(frame, frame + 1) for frame in range(GIVEN - 1, motion.frame_count))
-        characters = (simulator.poser.pose(motion.rotations[at], motion.translations[at]) for at in frames)
-        last = next(characters)
+
+        def poses_at(places: Sequence[tuple[int, int]]) -> PosedCharacters:
+            return simulator.poser.poses_at([(motion, frame) for _, frame in places])
+
+        last = poses_at([(0, GIVEN - 1)])
         at = last.root, last.lbs
         past = StepHistory(states[1, ..., None], states[0, ..., None], *at, matrices=last.matrices)
-        for state in simulator.carry_on(past, characters):
-            yield state.last[..., 0].cpu().numpy()
+        for each in simulator.carry_on([past], [range(GIVEN, motion.frame_count)], poses_at):
+            yield each.state.last[..., 0].cpu().numpy()
 
     def _stored(self, take: int, points: Floats) -> Floats:
         """Return vertices as a bake's joints and blendshapes have them [m], shape (N, V, 3)."""

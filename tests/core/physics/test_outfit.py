@@ -14,10 +14,10 @@ from ssilk_core.physics.intersections.pairs import intersections_between
 from ssilk_core.physics.self_contact import SelfContact
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, WornGarment
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.outfit import OutfitPotential
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
@@ -203,7 +203,8 @@ def test_a_sheet_on_a_sheet_on_a_floor_keeps_its_thickness_and_weighs_on_both(sc
     assert surroundings is not None
     around = replace(poses, world=surroundings.around([(0, 0.0)], poses.root, poses.lbs))
     begun = poses.lbs.double() + poses.root
-    *_, last = simulator.carry_on(StepHistory(begun, begun, poses.root, poses.lbs), [around] * 24)
+    past = StepHistory(begun, begun, poses.root, poses.lbs)
+    last = [each.state for each in simulator.carry_on([past], [range(24)], lambda places: around)][-1]
     potential, x = simulator.potential, last.local
     assert isinstance(potential, OutfitPotential) and around.world is not None
     below, above = (rows for rows, _ in potential.garments)
@@ -275,13 +276,13 @@ def test_garments_that_are_far_apart_move_as_alone(scene, toy_motion, toy_grid):
     options = SimulationOptions(solver=SolverOptions(tolerance=1e-6, iterations=300))
 
     def steps(simulator: Simulator) -> np.ndarray:
-        first, *others = (
-            simulator.poser.pose(motion.rotations[at : at + 1], motion.translations[at : at + 1]) for at in range(4)
-        )
+        def poses_at(places):
+            return simulator.poser.poses_at([(motion, frame) for _, frame in places])
+
+        first = poses_at([(0, 0)])
         x = first.lbs.double() + first.root
-        return np.stack(
-            [state.last[..., 0] for state in simulator.carry_on(StepHistory(x, x, first.root, first.lbs), others)]
-        )
+        past = StepHistory(x, x, first.root, first.lbs)
+        return np.stack([each.state.last[..., 0] for each in simulator.carry_on([past], [range(1, 4)], poses_at)])
 
     together = steps(Simulator(inner, HEAVY, options, over=[WornGarment(moved, LIGHT)]))
     alone = [steps(Simulator(each, own, options)) for each, own in ((inner, HEAVY), (moved, LIGHT))]

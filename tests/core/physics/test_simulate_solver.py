@@ -470,14 +470,39 @@ def test_fixed_vertices_are_released_once_when_the_others_have_converged(
     start = minimise_from(potential, x, inputs, SolverOptions(tolerance=1e-5)).x
     vertex = int(potential.free[-1])
     start[vertex, 1] += 2e-3
-    search = newton._Search(potential, start, inputs, SolverOptions(tolerance=1e9))
-    search.fixed[vertex] = torch.tensor([True, False])
-    assert not search.drop_finished() and not search.fixed.any() and search.released.tolist() == [True, False]
-    assert torch.equal(search.solution.residual, search.residual) and not search.solution.fixed.any()
-    assert (search.residual > 0.1).all()  # vertices that were fixed count again
-    search.fixed[vertex] = True
-    search.drop_finished()
-    assert search.fixed[vertex].tolist() == [True, False]
+
+    def left(released: bool) -> newton.Solution:
+        search = newton.Search(potential, start, inputs, SolverOptions(tolerance=1e9))
+        fixed = search.course.fixed.index_put((torch.tensor(vertex),), torch.tensor([True, False]))
+        search.course = replace(search.course, fixed=fixed, released=torch.full((2,), released))
+        ((frames, found),) = search.leave()
+        assert frames.tolist() == [0, 1] and not len(search)
+        return found
+
+    assert not left(False).fixed.any() and (left(False).residual > 0.1).all()  # fixed vertices count again
+    assert left(True).fixed.tolist() == [1, 0]
+
+
+def test_frames_that_join_a_search_find_what_they_find_alone(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene, 3)
+    options, alone = SolverOptions(tolerance=1e-5), {}
+    for frame in range(3):
+        one = torch.tensor([frame])
+        alone[10 + frame] = minimise_from(potential, x[..., one], inputs.select(one), options)
+    first, rest = torch.tensor([0]), torch.tensor([1, 2])
+    search, found = newton.Search(potential, x[..., first], inputs.select(first), options, [10]), []
+    for _ in range(3):
+        search.advance()
+    search.join(newton.Search(potential, x[..., rest], inputs.select(rest), options, [11, 12]))
+    while len(search):
+        found += search.leave()
+        if len(search):
+            search.advance()
+    for numbers, solution in found:
+        for number, own in zip(numbers.tolist(), solution.split()):
+            assert own.iterations > 3 and float(own.energy) == pytest.approx(float(alone[number].energy), abs=1e-9)
+            torch.testing.assert_close(own.x, alone[number].x, rtol=0, atol=1e-6)
+    assert sorted(int(number) for numbers, _ in found for number in numbers) == [10, 11, 12]
 
 
 def test_a_frame_that_the_whole_hessian_misleads_goes_on_without_it(

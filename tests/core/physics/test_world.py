@@ -15,9 +15,9 @@ from scipy.optimize import brentq
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, simulate
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
 from ssilk_core.physics.world.colliders import voting_points
 from ssilk_core.physics.world.felt import felt_gravity
@@ -103,15 +103,14 @@ def path(cloth, fabric: Fabric, world: ShotWorld, frames: int, precise: float = 
     poses = simulator.poser.pose(motion.rotations, motion.translations)
     surroundings = simulator.surroundings([world])
     assert surroundings is not None
-    placed = (
+    placed = [
         replace(poses, world=surroundings.around([(0, step / FPS)], poses.root, poses.lbs))
         for step in range(1, frames + 1)
-    )
-    x = poses.lbs.double() + poses.root
-    states = [
-        state.last[..., 0].numpy() for state in simulator.carry_on(StepHistory(x, x, poses.root, poses.lbs), placed)
     ]
-    return np.stack(states)
+    x = poses.lbs.double() + poses.root
+    past = StepHistory(x, x, poses.root, poses.lbs)
+    steps = simulator.carry_on([past], [range(frames)], lambda places: placed[places[0][1]])
+    return np.stack([each.state.last[..., 0].numpy() for each in steps])
 
 
 @pytest.mark.parametrize("name", SOLIDS)
