@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NoReturn
@@ -14,9 +14,9 @@ from ... import __version__
 from ...errors import SsilkError, fail
 from ...events import Message, Reporter
 from ...files import replacing
-from ...network.checkpoint import load_model
 from ...scene.plain import from_plain
-from ..bake import BakeRequest, BakeTask, in_fabric
+from ..bake import BakeRequest, BakeTask
+from ..bake.asked import tell_impossible
 from ..bake.inputs import InputContents, InputFiles, InputHashes
 from ..bake.layered import in_levels
 
@@ -49,48 +49,8 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
             found[path] = files.contents(name, path)
         except SsilkError as error:
             report(Message(str(error), "warning"))
-    _tell_impossible(tasks, found, report)
+    tell_impossible(tasks, found, report)
     return FarmJob(tuple(_pinned(task, found) for level in in_levels(tasks) for task in level), found)
-
-
-def _tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
-    """Warn of fabrics that readable models have not, and of ranges that readable motions have not.
-
-    Raises:
-        SsilkError: no task is left.
-    """
-    lost: set[str] = set()
-    for asked, need in ((_fabric, _need_fabric), (_range, _need_range)):
-        groups: dict[tuple[object, ...], list[BakeTask]] = {}
-        for task in tasks:
-            if (key := asked(task.request)) and key[0] in readable:
-                groups.setdefault(key, []).append(task)
-        for alike in groups.values():
-            try:
-                need(alike[0].request)
-            except SsilkError as error:
-                lost |= {task.name for task in alike}
-                if len(lost) == len(tasks):
-                    raise
-                report(Message(str(error), "warning"))
-
-
-def _fabric(request: BakeRequest) -> tuple[object, ...]:
-    return (request.model, request.fabric, request.material) if request.fabric or request.material else ()
-
-
-def _need_fabric(request: BakeRequest) -> None:
-    in_fabric(load_model(request.model), request.model, request.fabric, request.material)
-
-
-def _range(request: BakeRequest) -> tuple[object, ...]:
-    return (request.motion, request.root, request.range) if request.range else ()
-
-
-def _need_range(request: BakeRequest) -> None:
-    from ssilk_usd.reading.frame_range import read_frame_range
-
-    read_frame_range(request.motion, request.time_range, root=request.root)
 
 
 def write_job(path: str | Path, job: FarmJob) -> None:
