@@ -261,12 +261,12 @@ class LoadedGarment:
         garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
         if garment is not None:  # a model may know its garment by a name alone
             said = read_direction(request.motion, request.stage, garment, read.whole)
-        if read.loop is not None:
-            return self._directed_in_loop(request, read, read.loop, said)
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
             fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
+        if read.loop is not None:
+            return self._directed_in_loop(request, read, read.loop, said)
         if said.free is None and hold == 1:
             return None
         samples, count = request.samples_per_frame, read.whole.frame_count
