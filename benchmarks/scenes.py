@@ -5,8 +5,9 @@
 
 The same cloak of synthetic.py around the same body, as the classes, the body and the motion ask for less or more: all
 of it pinned, all of it tight, a fifth of it loose, the whole of it, away from the body, on a character that stands
-still, four at once, and one for two bodies, graded to them or not, which is rolled and baked on the second. Each is
-measured in a process of its own. What a scene does not need must not be paid for.
+still, four at once, and one for two bodies, graded to them or not, which is rolled and baked on the second; then
+trained for wind, colliders and fabrics, and rolled without any of these and with them: in a wind, over a floor, in
+another fabric. Each is measured in a process of its own. What a scene does not need must not be paid for.
 """
 
 from __future__ import annotations
@@ -33,9 +34,24 @@ from ssilk_core.authoring.bodies.carry import dressed_family
 from ssilk_core.network.checkpoint import ModelFile, model_file, network, save_model
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import garment_poses
+from ssilk_core.network.runtime.garment import NumpyGarment
+from ssilk_core.network.runtime.sight import seen_proximity
 from ssilk_core.network.settings import ModelConfig
-from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Character, Motion, ProxyRig, Scene
-from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.physics.world.felt import felt_gravity
+from ssilk_core.scene.assets import (
+    LOOSE,
+    PINNED,
+    TIGHT,
+    Air,
+    Character,
+    Collider,
+    Motion,
+    ProxyRig,
+    Scene,
+    ShotWorld,
+)
+from ssilk_core.scene.fabric_range import FabricRange
+from ssilk_core.scene.fabrics import FABRICS, Fabric
 from ssilk_core.scene.family import BodyFamily, motion_on, with_joints
 from ssilk_core.training.job import TrainJob
 from ssilk_core.training.parts import build_parts
@@ -43,18 +59,28 @@ from ssilk_core.training.settings import TrainConfig
 
 SIZE = synthetic.Size(vertices=2500, body=4000, proxies=20, shapes=64, batch=8, window=6, static_batch=8)
 STEPS, CLIPS, TIMES = 6, 4, 6
+WORLD = ("wind", "colliders", "fabrics")
 HEADER = ("scene", "free vertices", "proxies", "body vertices", "train step [ms]", "memory [MiB]", "roll [ms/frame]",
           "bake [ms/frame]", "model [kB]", "shot [kB]")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One scene: its garments, which are trained and baked one after another, what the character does, and whether
-    they are for a second body as well."""
+    """One scene.
+
+    Attributes:
+        garments: which are trained and baked one after another.
+        motions: what the character does.
+        two_bodies: whether they are for a second body as well.
+        knows: what else training draws: "wind", "colliders", "fabrics".
+        meets: what of it there is in the shot.
+    """
 
     garments: tuple[Scene, ...]
     motions: tuple[Motion, ...]
     two_bodies: bool = False
+    knows: tuple[str, ...] = ()
+    meets: tuple[str, ...] = ()
 
 
 def dressed(loose: float, *, tight: bool = True) -> Scene:
@@ -124,28 +150,37 @@ WORLDS: dict[str, Callable[[], World]] = {
     "four loose garments": lambda: World((dressed(0.9),) * 4, moving()),
     "loose, two bodies": lambda: World((dressed(0.9),), moving(), two_bodies=True),
     "loose, graded to two bodies": lambda: World((graded(dressed(0.9)),), moving(), two_bodies=True),
+    "loose, knows a world, meets none": lambda: World((dressed(0.9),), moving(), knows=WORLD),
+    **{
+        f"loose, knows a world, meets {each}": lambda each=each: World(
+            (dressed(0.9),), moving(), knows=WORLD, meets=(each,)
+        )
+        for each in WORLD
+    },
+    "loose, knows a world, meets all": lambda: World((dressed(0.9),), moving(), knows=WORLD, meets=WORLD),
 }
 
 
 def measure(name: str) -> dict[str, float]:
     """Return the figures of one scene, summed over its garments."""
     world = WORLDS[name]()
-    found = [measured(scene, world.motions, world.two_bodies) for scene in world.garments]
+    found = [measured(scene, world) for scene in world.garments]
     return {key: sum(each[key] for each in found) for key in found[0]} | {"memory": max(f["memory"] for f in found)}
 
 
-def measured(scene: Scene, motions: tuple[Motion, ...], two_bodies: bool) -> dict[str, float]:
+def measured(scene: Scene, world: World) -> dict[str, float]:
     """Train a few steps, roll and bake one garment."""
-    family = None
-    if two_bodies:
+    family, fabric, motions = None, Fabric("default"), world.motions
+    if world.two_bodies:
         other = larger(scene.character)
         family = dressed_family(scene, BodyFamily.of([scene.character, other]), [other])[0]
     config = TrainConfig(batch=SIZE.batch, window=SIZE.window, static_batch=SIZE.static_batch,
-                         pretraining_batch=SIZE.decoded,
-                         recombinations=0)  # fmt: skip
+                         pretraining_batch=SIZE.decoded, recombinations=0,
+                         wind_fraction=0.25 * ("wind" in world.knows),
+                         collider_fraction=0.25 * ("colliders" in world.knows))  # fmt: skip
     job = TrainJob(scene=scene, motions=motions, held_out=motions[:1], model=ModelConfig(shapes=SIZE.shapes),
-                   train=config, fabric=Fabric("default"), output=Path("none"), device="cpu",
-                   family=family)  # fmt: skip
+                   train=config, fabric=fabric, output=Path("none"), device="cpu", family=family,
+                   fabrics=FabricRange.of(fabric, ["4"]) if "fabrics" in world.knows else None)  # fmt: skip
     parts = build_parts(job, torch.device("cpu"))
     stepper, first = parts.stepper(job.train, 0), job.train.static_iterations
     peak = Peak(torch.device("cpu"))
@@ -155,15 +190,16 @@ def measured(scene: Scene, motions: tuple[Motion, ...], two_bodies: bool) -> dic
         stepper.run(first + 1 + step)
     train = (time.perf_counter() - began) / STEPS
     memory = peak.bytes()
-    file, motion = model_file(parts.model, Fabric("default"), {}), repeated(motions[0])
+    file, motion = model_file(parts.model, fabric, {}, job.fabrics), repeated(motions[0])
     if not family:
+        file = file.on_fabric(FABRICS["silk"]) if "fabrics" in world.meets else file
         model = network(file)
     else:
         model = network(file.on_body(family.bodies.members[1]))
         motion = motion_on(motion, scene.character.skeleton, model.scene.character.skeleton, 1.05)
     return {
         "free vertices": int((scene.classes != PINNED).sum()), "proxies": scene.rig.proxy_count,
-        "body vertices": parts.reached, "train": train, "memory": memory, **baked(file, model, motion),
+        "body vertices": parts.reached, "train": train, "memory": memory, **baked(file, model, motion, world.meets),
     }  # fmt: skip
 
 
@@ -173,9 +209,24 @@ def repeated(motion: Motion) -> Motion:
     return replace(motion, rotations=rotations, translations=translations)
 
 
-def baked(file: ModelFile, model: GarmentModel, motion: Motion) -> dict[str, float]:
-    """Roll and bake one garment of a file and write the file; times are for each frame [s], sizes in bytes."""
+def surrounded(file: ModelFile, motion: Motion, meets: tuple[str, ...]) -> Motion:
+    """Return a motion with the wind that cloth feels there, and the floor that it sees."""
+    lowest = synthetic.scene(SIZE).character.merged_body().mesh.points[:, 1].min()
+    square = np.array([[-9.0, lowest, -9], [-9, lowest, 9], [9, lowest, 9], [9, lowest, -9]])
+    floor = Collider("floor", np.array([[0, 1, 2], [0, 2, 3]]), square[None], np.eye(4)[None], np.ones(1, bool))
+    air = Air(np.array([[0.0, 0, -5]]), np.zeros(1)) if "wind" in meets else None
+    world = ShotWorld(motion.fps, (floor,) if "colliders" in meets else (), air=air)
+    motion = replace(motion, gravity=felt_gravity(world, motion, file.scene, file.fabric))
+    return replace(motion, proximity=seen_proximity(world, motion, NumpyGarment(file)))
+
+
+def baked(file: ModelFile, model: GarmentModel, motion: Motion, meets: tuple[str, ...]) -> dict[str, float]:
+    """Roll and bake one garment of a file and write the file; times are for each frame [s], sizes in bytes.
+
+    Rolling includes the search for what is met.
+    """
     began = time.perf_counter()
+    motion = surrounded(file, motion, meets) if {"wind", "colliders"} & {*meets} else motion
     for _ in garment_poses(model, motion, motion.fps):
         pass
     rolled = time.perf_counter() - began

@@ -146,8 +146,8 @@ def test_a_round_is_told_of_a_shot_with_more_shapes_than_the_network_has(stage):
 @pytest.mark.parametrize(
     "more",
     [["--hold", "2"], ["--fps", "60"], ["--fps", "28.75"], ["--samples-per-frame", "2"], ["--quality", "game"],
-     ["--wind", "0,0,0"], ["--latent-iterations", "1"]],
-    ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents"],
+     ["--wind", "0,0,0"], ["--latent-iterations", "1"], ["--refine", "2"]],
+    ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents", "refined"],
 )  # fmt: skip
 def test_a_loop_goes_with_other_wishes(stage, more):
     found = baked("loop.usdc", "cycle.usda", "--loop", *more)
@@ -241,7 +241,7 @@ def say_often() -> None:
         (stop_early, ["--loop"], "it is no cycle: its end is up to "),
         (jump, ["--loop"], "its root jumps; a loop has no cuts"),
         (None, ["--loop", "--range", "0-2"], "3 frames; a loop has at least 4"),
-        (None, ["--loop", "--refine", "2"], "a loop that is refined"),
+        (None, ["--loop", "--quality", "hero"], "a loop that the solver carries on"),
         (None, ["--loop", "--pre-roll", "1"], "a loop with a run-up"),
         (None, ["--loop", "--handles", "2"], "a loop with handles"),
         (None, ["--loop", "--hold", "5"], "poses that are held for 5 samples, in a round of 24"),

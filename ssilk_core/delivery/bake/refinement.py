@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, tee
+from itertools import chain, islice, tee
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
@@ -16,6 +16,7 @@ from ...events import Countdown, Message, Reporter, silent
 from ...network.settings import STRONGEST_PULL
 from ...physics.constants import GRAVITY
 from ...scene.assets import Deformer, Floats, Motion
+from ...scene.cycles import led
 from ...scene.held_parts import shares_of_proxies
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
 from .direction import Direction, free_stretches
@@ -159,12 +160,25 @@ def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Itera
 def _solved_frames(played: BakeRollout, first: int, stop: int, report: Reporter) -> Iterator[_Frame]:
     """Yield frames that the solver refines, from its start in the first of them on."""
     motion = played.motion
-    # What is cut out is normalised again, which changes its last digits.
-    part = motion if stop - first == motion.frame_count else motion.clip(first, stop)
+    if stop - first == motion.frame_count:
+        part, network = _led(played)
+    else:  # what is cut out is normalised again, which changes its last digits
+        part, network = motion.clip(first, stop), islice(played.network_vertices(), first, stop)
     world = played.around.over(part).read(report)
-    network = islice(played.network_vertices(), first, stop)
-    for frame in _refiner(played).frames(part, network, world):
+    frames = _refiner(played).frames(part, network, world)
+    for frame in islice(frames, part.frame_count - (stop - first), None):
         yield _Frame(frame.points, frame.change)
+
+
+def _led(played: BakeRollout) -> tuple[Motion, Iterator[Floats]]:
+    """Return the motion and the network's vertices, in a loop with the frame that leads up to them: the drag of the
+    first one looks back on it."""
+    loop, motion, network = played.loop, played.motion, played.network_vertices()
+    if loop is None:
+        return motion, network
+    own = list(network)
+    before = loop.cycle.back(own[loop.period - 1])
+    return led(motion, played.deformer.scene.character.skeleton, loop.cycle, loop.period), chain([before], own)
 
 
 def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:
@@ -220,8 +234,13 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """
     energies, (judged, measured) = [], tee(points)
     told = Countdown(rollout.motion.frame_count, report)
-    world = rollout.around.over(rollout.motion).read(silent)
-    changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged, world)
+    motion, network = _led(rollout)
+    more = motion.frame_count - rollout.motion.frame_count
+    if more:
+        network, again = tee(network)
+        judged = chain(islice(again, more), judged)
+    world = rollout.around.over(motion).read(silent)
+    changes = islice(_refiner(rollout).changes(motion, network, judged, world), more, None)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()
         rounding = ROUNDING_ENERGY + len(vertices) * ROUNDING_STIFFNESS * spacing**2
