@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -140,6 +141,10 @@ def still() -> tuple[Motion, ...]:
     )
 
 
+def knowing_a_world(*meets: str) -> World:
+    return World((dressed(0.9),), moving(), knows=WORLD, meets=meets)
+
+
 WORLDS: dict[str, Callable[[], World]] = {
     "all pinned": lambda: World((dressed(0, tight=False),), moving()),
     "all tight": lambda: World((dressed(0),), moving()),
@@ -150,14 +155,9 @@ WORLDS: dict[str, Callable[[], World]] = {
     "four loose garments": lambda: World((dressed(0.9),) * 4, moving()),
     "loose, two bodies": lambda: World((dressed(0.9),), moving(), two_bodies=True),
     "loose, graded to two bodies": lambda: World((graded(dressed(0.9)),), moving(), two_bodies=True),
-    "loose, knows a world, meets none": lambda: World((dressed(0.9),), moving(), knows=WORLD),
-    **{
-        f"loose, knows a world, meets {each}": lambda each=each: World(
-            (dressed(0.9),), moving(), knows=WORLD, meets=(each,)
-        )
-        for each in WORLD
-    },
-    "loose, knows a world, meets all": lambda: World((dressed(0.9),), moving(), knows=WORLD, meets=WORLD),
+    "loose, knows a world, meets none": knowing_a_world,
+    **{f"loose, knows a world, meets {each}": partial(knowing_a_world, each) for each in WORLD},
+    "loose, knows a world, meets all": partial(knowing_a_world, *WORLD),
 }
 
 
