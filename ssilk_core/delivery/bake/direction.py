@@ -106,14 +106,22 @@ class DirectedPoses:
         free = self.direction.free[samples]
         if (free == 1).all():
             return self._network(samples, 0, len(samples), not (self.direction.free == 1).all())
-        held = self._held_at(samples)
-        assert held.translations is not None
-        rotations, weights, moved = held.rotations.copy(), held.weights.copy(), held.translations.copy()
+        bound = np.flatnonzero(free < 1)  # fitting proxies takes longer than the network
+        held = self._held_at(samples[bound])
+        whole = [np.empty((len(samples), *values.shape[1:])) for values in _arrays(held)]
+
+        def put(rows: Ints | slice, pose: GarmentPose) -> None:
+            for values, new in zip(whole, _arrays(pose)):
+                values[rows] = new
+
+        put(bound, held)
         for first, stop in free_stretches(free):
-            part = slice(first, stop)
-            mixed = self._held.blended(held.part(part), self._network(samples, first, stop, True), free[part])
-            rotations[part], weights[part], moved[part] = mixed.rotations, mixed.weights, mixed.translations
-        return GarmentPose(0, rotations, weights, moved)
+            put(slice(first, stop), self._network(samples, first, stop, True))
+            low, high = np.searchsorted(bound, (first, stop))
+            rows = bound[low:high]
+            begun = GarmentPose(0, *(values[rows] for values in whole))
+            put(rows, self._held.blended(held.part(slice(low, high)), begun, free[rows]))
+        return GarmentPose(0, *whole)
 
     def _network(self, samples: Ints, first: int, stop: int, moves: bool) -> GarmentPose:
         rolled = self.rolled(int(samples[first]), int(samples[stop - 1]) + 1, self.direction.hold)
@@ -131,3 +139,8 @@ class DirectedPoses:
             self.off += off[self.direction.free[rows] < 1].tolist()
             found.append(replace(pose, start=at))
         return GarmentPose.joined(found)
+
+
+def _arrays(pose: GarmentPose) -> tuple[Floats, Floats, Floats]:
+    assert pose.translations is not None
+    return pose.rotations, pose.weights, pose.translations
