@@ -21,7 +21,7 @@ from ...scene.kinematics import split_at_cuts
 from ...scene.mesh.stitches import find_stitches
 from . import drives, surroundings, worlds
 from .drives import ProceduralMotion
-from .meter import MAX_LBS_DISTANCE, extent, positions, precision_errors
+from .meter import MAX_LBS_DISTANCE, Extent, extent, positions, precision_errors
 from .outcome import CaseMeasurement, DoesNotApply
 from .subject import StressSubject
 from .surroundings import LAST, PERIOD, WINDWARD, Prop, PropOver, Wind, surrounded, windy
@@ -277,13 +277,22 @@ def simulate_wind(speed: float) -> Measure:
 
 
 def simulate_prop(over: PropOver) -> Measure:
-    """Return a measure that simulates with a prop, which is placed by linear blend skinning."""
+    """Return a measure that simulates with a prop, which is placed by linear blend skinning.
+
+    It raises `ArithmeticError` where no less cloth is inside than under linear blend skinning.
+    """
 
     def measure(subject: StressSubject) -> CaseMeasurement:
         scene, motion = subject.cloth, simulated_motion(subject)
-        carried = carried_points(motion, scene, np.arange(scene.garment.mesh.vertex_count))
-        prop = over(scene, motion, carried - surroundings.roots(scene, motion)[:, None])
-        return simulate(subject, scene, subject.fabric, prop.world(motion.fps))
+        roots = surroundings.roots(scene, motion)[:, None]
+        carried = carried_points(motion, scene, np.arange(scene.garment.mesh.vertex_count)) - roots
+        prop = over(scene, motion, carried)
+        found, residual, points = simulate_trial(scene, subject.fabric, motion, prop.world(motion.fps))
+        met, skinned = prop.share_inside(points - roots), prop.share_inside(carried)
+        if skinned and not met < skinned:
+            raise ArithmeticError(f"{met:.2%} of the cloth are inside, and {skinned:.2%} under skinning")
+        note = f"{met:.2%} of the cloth inside, {skinned:.2%} under skinning"
+        return CaseMeasurement(found, residual, "g", f"{simulated_words(found)}; {note}")
 
     return measure
 
@@ -309,10 +318,13 @@ def simulate(
 
     The garment is bounded within `most` times its size.
     """
-    found, residual = simulate_trial(scene, fabric, simulated_motion(subject), world, most)
-    return CaseMeasurement(
-        found, residual, "g", f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
-    )
+    found, residual, _ = simulate_trial(scene, fabric, simulated_motion(subject), world, most)
+    return CaseMeasurement(found, residual, "g", simulated_words(found))
+
+
+def simulated_words(found: Extent) -> str:
+    """Return how many frames the solver did not solve."""
+    return f"simulated, {found.recovered} of {found.frames} frames not to tolerance"
 
 
 def membrane(fabric: Fabric, stiffness: float) -> Fabric:

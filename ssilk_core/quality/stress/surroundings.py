@@ -93,7 +93,7 @@ class Prop:
     def share_inside(self, points: Floats) -> float:
         """Return the mean share of points relative to the root (F, V, 3) that are inside while it is there."""
         depth = (self.half - np.abs(points - self.places[:, None])).min(axis=2)
-        return float((depth > INSIDE)[self.present].mean())
+        return float((depth > INSIDE)[self.present].mean()) if self.present.any() else 0.0
 
 
 PropOver = Callable[[Scene, Motion, Floats], Prop]

@@ -15,7 +15,7 @@ from ...network.settings import ModelConfig
 from ...physics.energy import GarmentEnergy
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.skinning import Skinning
-from ...scene.assets import PINNED, Motion, Scene, ShotWorld
+from ...scene.assets import PINNED, Floats, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
 from ...training.job import TrainJob
 from ...training.parts import build_parts
@@ -68,8 +68,8 @@ def train_trial(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: in
 
 def simulate_trial(
     scene: Scene, fabric: Fabric, motion: Motion, world: ShotWorld | None = None, most: float = MAX_LBS_DISTANCE
-) -> tuple[Extent, float]:
-    """Simulate a motion in a world; return its extent and the largest residual of a frame [g].
+) -> tuple[Extent, float, Floats]:
+    """Simulate a motion in a world; return its extent, the largest residual of a frame [g], and points [m] (F, V, 3).
 
     The garment is bounded within `most` times its size. Frames whose final residual exceeds the solver's tolerance
     count as recovered.
@@ -77,10 +77,10 @@ def simulate_trial(
     options = SimulationOptions(fps=motion.fps)
     meter = ExtentMeter(scene, fabric, motion.fps)
     frames = list(Simulator(scene, fabric, options).frames([motion], [world]))
-    residual = [frame.residual for frame in frames]
-    meter.add(motion, np.stack([frame.points for frame in frames]))
+    residual, points = [frame.residual for frame in frames], np.stack([frame.points for frame in frames])
+    meter.add(motion, points)
     unsolved = sum(value > options.solver.tolerance for value in residual)
-    return meter.extent(len(frames), recovered=unsolved, max_distance=most), max(residual)
+    return meter.extent(len(frames), recovered=unsolved, max_distance=most), max(residual), points
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:
