@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test a trained garment under extreme motions, rates, sizes, fabrics, meshes and precisions.
+"""Test a trained garment under extreme motions, rates, winds, props, sizes, fabrics, meshes and precisions.
 
 A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
-error is, and what happens: it works, falls back to rest, or is refused with a sentence. The exit code is 3 where
-anything else happens. --output writes each case when it has run; the same command, given again, goes on from there.
+error is, and what happens: it works, falls back to rest, is refused with a sentence, or does not apply to this model.
+The exit code is 3 where anything else happens. Simulators fall back where a frame misses their tolerance. --output writes each case when it has run; the same command, given again, goes on from there.
 --stage given several times tests each body of a family: cases then have the name of the body's stage in front.
 """
 
