@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -200,7 +201,10 @@ def button(mesh: Mesh) -> Rider:
     """Return a rider on the middle of a garment."""
     points = mesh.points[mesh.faces[len(mesh.faces) // 2]]
     return Rider(
-        "/button", "button", (Mesh("/button", points, [[0, 1, 2]]),), Attachment.beneath(points, mesh, "/button")
+        "/button",
+        "button",
+        (Mesh("/button", points, np.arange(3)[None]),),
+        Attachment.beneath(points, mesh, "/button"),
     )
 
 
@@ -210,8 +214,8 @@ class Need:
 
     unused: Play
     used: Play
-    model: Mapping[str, int] = field(default_factory=dict)
-    train: Mapping[str, float] = field(default_factory=dict)
+    model: Mapping[str, Any] = field(default_factory=dict)
+    train: Mapping[str, Any] = field(default_factory=dict)
     fabrics: FabricRange | None = None
 
 
@@ -219,7 +223,7 @@ def level_floor(fps: float) -> ShotWorld:
     """Return a world with a floor beneath the feet."""
     corners = np.array([[[-50.0, 0, -50], [-50, 0, 50], [50, 0, 50], [50, 0, -50]]])
     there = np.ones(1, dtype=bool)
-    return ShotWorld(fps, (Collider("/floor", [[0, 1, 2], [0, 2, 3]], corners, np.eye(4)[None], there),))
+    return ShotWorld(fps, (Collider("/floor", np.array([[0, 1, 2], [0, 2, 3]]), corners, np.eye(4)[None], there),))
 
 
 def needs() -> dict[str, Need]:
@@ -280,7 +284,7 @@ def measured(scene: Scene, motions: tuple[Motion, ...], two_bodies: bool) -> dic
     stepper, first = parts.stepper(job.train, 0), job.train.static_iterations
     peak = Peak(torch.device("cpu"))
     stepper.run(first)
-    train = timed(lambda: [stepper.run(first + 1 + step) for step in range(STEPS)]) / STEPS
+    train = sum(timed(partial(stepper.run, first + 1 + step)) for step in range(STEPS)) / STEPS
     memory = peak.bytes()
     file, motion = model_file(parts.model, Fabric("default"), {}), repeated(motions[0])
     place = None
@@ -367,7 +371,7 @@ def main() -> None:
     if options.only:
         print(json.dumps(measure(options.only) if options.only in WORLDS else paired(options.only)))
         return
-    rows, pairs, results = [], [], {}
+    rows, pairs, results = list[list[str]](), list[list[str]](), {}
     for name in [*WORLDS, *needs()]:
         words = [sys.executable, __file__, "--threads", str(options.threads), "--only", name]
         done = subprocess.run(words, capture_output=True, text=True, check=True)

@@ -3,8 +3,9 @@
 
 A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
 error is, and what happens: it works, falls back to rest, is refused with a sentence, or does not apply to this model.
-The exit code is 3 where anything else happens. Simulators fall back where a frame misses their tolerance. --output writes each case when it has run; the same command, given again, goes on from there.
---stage given several times tests each body of a family: cases then have the name of the body's stage in front.
+The exit code is 3 where anything else happens. Simulators fall back where a frame misses their tolerance. --output
+writes each case when it has run; the same command, given again, goes on from there. --stage given several times tests
+each body of a family: cases then have the name of the body's stage in front.
 """
 
 from __future__ import annotations
