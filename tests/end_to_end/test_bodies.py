@@ -16,7 +16,7 @@ from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 
 from ssilk_core.cli import main
-from ssilk_core.delivery.bake.bodies import worn
+from ssilk_core.delivery.bake import worn
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
