@@ -39,7 +39,7 @@ from ssilk_core.network.latent_solver.shots import LatentShots
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.rollout import decode, garment_poses
 from ssilk_core.physics.simulate import SimulationOptions, simulate
-from ssilk_core.physics.simulate.simulator import StepHistory
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.scene.assets import Floats, Motion
 
 HEADER = ("motion", "shots", "elements", "iterations", "begins [s]", "ms a frame and shot", "energy before [J]",

@@ -23,8 +23,8 @@ from helpers.subjects import Subject, arguments, clip_of, open_subject, parsed
 from torch import Tensor
 
 from ssilk_core.physics.simulate.characters import PosedCharacters
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import StepInputs
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.quality.evaluation.methods import Network, TakeSet, build_take_set
 from ssilk_core.quality.evaluation.metrics import mean_square
 from ssilk_core.quality.evaluation.solver_errors import windows_of

@@ -293,4 +293,5 @@ if __name__ == "__main__":
             fail("newton", "it is not installed", "it is the engine that is measured", "pip install newton")
         main()
     except SsilkError as error:
-        sys.exit(str(error))
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

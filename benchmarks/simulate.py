@@ -29,9 +29,10 @@ from ssilk_core.devices import select_device
 from ssilk_core.events import TextReporter
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.characters import PosedCharacters
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import Search, Solution, SolverOptions
-from ssilk_core.physics.simulate.simulator import PosesAt, StepHistory, Stepped
+from ssilk_core.physics.simulate.simulator import PosesAt, Stepped
 from ssilk_core.scene.assets import Motion, Scene
 from ssilk_core.scene.fabrics import Fabric
 

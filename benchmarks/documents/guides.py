@@ -7,7 +7,7 @@ import numpy as np
 
 from ssilk_core.training.settings import PRESETS
 
-from .forms import digits, fixed, result, table
+from .forms import digits, fixed, percent, result, table
 
 TARGETS = {
     "usd": ("all", "the stage's", "layers or a file"),
@@ -85,3 +85,21 @@ def peers() -> str:
     header = ("method", "cloth through cloth", "ms a frame", "a quarter below", "above", "intersect [%]",
               "inside the body [%]", "total [J]", "stretch [J]", "inertia [J]")  # fmt: skip
     return table(header, rows, 2)
+
+
+def bodies() -> str:
+    """The cape for a family on bodies that its training never saw, beside a cape for one of these alone."""
+    rows = []
+    for name, found in result("bodies").items():
+        models = [found[model] for model in ("family", "alone") if model in found]
+        skin = [each["shown_skin"] for each in models]
+        rows.append([
+            name.replace("_", " "), percent(found["beyond"], 0), fixed(found["LBS"]["total"], 2),
+            ", ".join(fixed(each["total"], 3) for each in models),
+            ", ".join(fixed(each["steps"]["energy"], 1, 1e-3) for each in models),
+            ", ".join(percent(each["mean"], 3) for each in skin),
+            ", ".join(percent(each["worst"], 2) for each in skin),
+        ])  # fmt: skip
+    header = ("body", "beyond [%]", "LBS [J]", "energy [J]", "steps miss [mJ]", "skin that shows [%]",
+              "in the worst frame [%]")  # fmt: skip
+    return table(header, rows)

@@ -26,6 +26,7 @@ from ..arrays.renamed import TrainedJoints, known_as
 from ..errors import SetupError
 from ..motions.colliders import MetColliders, left_out, unseen
 from ..motions.freedom import freedom, is_held
+from ..motions.held import HeldBones
 from ..motions.keys import has_keys, need_tracks
 from ..motions.sampling import SampledTake, need_company, prepare_takes, sample
 from ..motions.shapes import tell_changing_shapes
@@ -207,6 +208,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if self.to_timeline and (solves or is_held(garment)):
             need_movable(armature, joints.proxies)
         (self.take,) = prepare_takes(armature, [Source(TIMELINE, "Timeline")])
+        self.held = HeldBones.of(garment, joints, self.take.frames, self.trained_joints)
         self.scene = None
         if self.on:
             self.scene = self.on.moved(gather(garment, joints=joints))
@@ -264,6 +266,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             file = self.on.worn.file
         scene, self.sees = file.scene, file.config.proximity_points > 0
         self.trained, self.model_rate = scene.garment.mesh, file.config.fps
+        self.trained_joints = scene.joint_names
         self.in_fabric = played_options(garment) if file.fabrics else []
         self.prim = split_location(scene.garment.mesh.path)[1]
         if self.on:
@@ -309,14 +312,21 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             met, self.left_out = read.found, left_out(read)
             self.meets = bool(met)
         yield from self.keys.sample()
-        world = world_over(bpy.context.scene, self.take.frames, motion.fps, met)
-        write_motion(self.work.folder / MOTION, motion, self.character.skeleton(ROOT), world)
+        world, skeleton = (
+            world_over(bpy.context.scene, self.take.frames, motion.fps, met),
+            self.character.skeleton(ROOT),
+        )
+        if self.held.hand:
+            yield from sample(armature, self.held.joints, [self.held.hand])
+            motion, skeleton = self.held.with_proxies(motion, skeleton)
+        write_motion(self.work.folder / MOTION, motion, skeleton, world)
         if self.go_on:
             yield from self.write_start()
         garment, _ = self.pair.objects()
         free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
-        if hold > 1 or (free < 1).any():
-            write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold)
+        if hold > 1 or (free < 1).any() or self.held.parts:
+            parts, groups = self.held.parts, self.held.groups
+            write_direction(self.work.folder / MOTION, self.prim, free, self.take.frames.start, hold, parts, groups)
         stage = self.model.parent / STAGE
         garment, _ = self.pair.objects()
         followed = followed_bodies(garment)

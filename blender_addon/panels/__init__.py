@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from .classes import ClassesPanel
 from .garment import FabricPanel, GarmentPanel
-from .playback import BakingPanel, PlaybackPanel, PlayedFabricPanel
+from .playback import BakingPanel, HeldProxyPanel, PlaybackPanel, PlayedFabricPanel
 from .preflight import FindingList, PreflightPanel
 from .quality import QualityPanel
 from .rig import RigPanel
@@ -25,6 +25,7 @@ CLASSES = (
     TrainingPanel,
     EnergiesPanel,
     BakingPanel,
+    HeldProxyPanel,
     PlaybackPanel,
     PlayedFabricPanel,
     QualityPanel,

@@ -9,6 +9,7 @@ from ssilk_core.errors import SsilkError
 from ssilk_core.scene.fabric_range import FACTORS
 
 from ..motions.colliders import unmet, unseen
+from ..motions.freedom import has_held_parts
 from ..motions.keys import has_keys
 from ..playback import playing
 from ..playback.fabrics import played_factors
@@ -17,8 +18,9 @@ from ..playback.models import fabrics_of, no_model, sees_colliders
 from ..playback.overrides import overriding
 from ..playback.solving import SOLVED
 from ..preferences import no_certificates
+from ..scene.armature import owners_of
 from ..scene.garment import armature_of
-from .base import PlayableGarmentPanel, draw_text, saying_errors
+from .base import PlayableGarmentPanel, SidebarPanel, draw_text, saying_errors
 
 
 def solved_line(played: Live) -> str:
@@ -94,6 +96,8 @@ class PlaybackPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout.prop(context.object.ssilk, "live_quality")
         if unsolved := unsolved_line(context.object):
             draw_text(layout, unsolved, icon="INFO")
+        if has_held_parts(context.object):
+            draw_text(layout, "Parts that are held by themselves are free here; a bake holds them", icon="INFO")
         if line:
             draw_text(layout, line)
 
@@ -162,6 +166,10 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout.prop(context.object.ssilk, "model")
         draw_text(layout, model_line(context.object))
         layout.prop(context.object.ssilk, "free")
+        layout.prop_search(context.object.ssilk, "part", context.object, "vertex_groups")
+        if context.object.ssilk.part:
+            layout.prop(context.object.ssilk, "part_free")
+        layout.prop(context.object.ssilk, "hand_pose")
         layout.prop(context.object.ssilk, "hold")
         layout.prop(context.object.ssilk, "loop")
         layout.prop(context.object.ssilk, "colliders")
@@ -180,3 +188,21 @@ class BakingPanel(PlayableGarmentPanel, bpy.types.Panel):
         layout.operator("ssilk.show_covered", icon="HIDE_OFF")
         if line := overridden_line(context.object):
             draw_text(layout, line, icon="ERROR")
+
+
+class HeldProxyPanel(SidebarPanel, bpy.types.Panel):
+    """Of the armature: the sliders of the proxy that is chosen in Pose Mode."""
+
+    bl_idname = "SSILK_PT_held_proxy"
+    bl_label = "Held Proxy"
+    section = "6-bake"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        bone = context.active_pose_bone
+        return bone is not None and bone.name in owners_of(bone.id_data.data)
+
+    @saying_errors
+    def draw(self, context: bpy.types.Context) -> None:
+        self.layout.prop(context.active_pose_bone, "ssilk_free")
+        self.layout.prop(context.active_pose_bone, "ssilk_posed")

@@ -131,6 +131,26 @@ class GarmentSettings(bpy.types.PropertyGroup):
         subtype="FACTOR",
         override=SHOTS,
     )
+    part: StringProperty(
+        name="Part",
+        description="Vertex group that has a slider of its own: the proxies that move it are held with it",
+        override=SHOTS,
+    )
+    part_free: FloatProperty(
+        name="Part Free",
+        description="How much the network moves the vertex group: at 0 its bones carry it",
+        default=1.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        override=SHOTS,
+    )
+    hand_pose: PointerProperty(
+        type=bpy.types.Action,
+        name="Posed By",
+        description="Action with keys of proxies, which these follow as far as their slider Posed says",
+        override=SHOTS,
+    )
     hold: IntProperty(
         name="Hold Frames",
         description="For how many frames each pose of the garment is held: 2 for animation on twos",
@@ -180,10 +200,28 @@ CLASSES = (*training.CLASSES, *fabric.CLASSES, *played.CLASSES, BoneMatch, Garme
 
 
 def attach() -> None:
-    """Give every object the settings."""
+    """Give every object the settings, and every bone those of a proxy, which Blender keys without a group alone."""
     bpy.types.Object.ssilk = PointerProperty(type=GarmentSettings, override=SHOTS)
+    bpy.types.PoseBone.ssilk_free = FloatProperty(
+        name="Free",
+        description="How much the network moves this proxy: at 0 it goes where the garment's bones carry its cloth",
+        default=1.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        override=SHOTS,
+    )
+    bpy.types.PoseBone.ssilk_posed = FloatProperty(
+        name="Posed",
+        description="How far this proxy follows the action that poses proxies by hand (Posed By)",
+        default=0.0,
+        min=0.0,
+        max=1.0,
+        subtype="FACTOR",
+        override=SHOTS,
+    )
 
 
 def detach() -> None:
     """Remove them; chosen values stay in the file."""
-    del bpy.types.Object.ssilk
+    del bpy.types.Object.ssilk, bpy.types.PoseBone.ssilk_free, bpy.types.PoseBone.ssilk_posed

@@ -358,6 +358,26 @@ WORDS = {
         "Zugleich für weichen und steifen, leichten und schweren Stoff trainieren, wie es alle Vorgaben sind, sodass "
         "der Stoff beim Abspielen gewählt werden kann"
     ),
+    "Part": "Teil",
+    "Vertex group that has a slider of its own: the proxies that move it are held with it": (
+        "Vertexgruppe mit einem eigenen Regler: Die Proxys, die sie bewegen, werden mit ihr gehalten"
+    ),
+    "Part Free": "Teil frei",
+    "How much the network moves the vertex group: at 0 its bones carry it": (
+        "Wie sehr das Netzwerk die Vertexgruppe bewegt: bei 0 tragen sie ihre Knochen"
+    ),
+    "Posed By": "Posiert von",
+    "Action with keys of proxies, which these follow as far as their slider Posed says": (
+        "Aktion mit Keyframes von Proxys; diese folgen ihr so weit, wie ihr Regler „Posiert“ sagt"
+    ),
+    "How much the network moves this proxy: at 0 it goes where the garment's bones carry its cloth": (
+        "Wie sehr das Netzwerk diesen Proxy bewegt: bei 0 geht er dorthin, wo Knochen seinen Stoff tragen"
+    ),
+    "Posed": "Posiert",
+    "How far this proxy follows the action that poses proxies by hand (Posed By)": (
+        "Wie weit dieser Proxy der Aktion folgt, die Proxys von Hand posiert (Posiert von)"
+    ),
+    "Held Proxy": "Gehaltener Proxy",
     "Hold Frames": "Bilder halten",
     "For how many frames each pose of the garment is held: 2 for animation on twos": (
         "Wie viele Bilder lang jede Pose des Kleidungsstücks gehalten wird: 2 für Animation auf Zweiern"

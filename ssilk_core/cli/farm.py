@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 
 from ..delivery.bake import BakeTask, LayerFolder, plan_layers
 from ..delivery.bake.layered import certified_over, in_levels, tell_layers
-from ..delivery.farm.job import FarmJob, submitted
+from ..delivery.farm.job import NAME, FarmJob, is_job, submitted
 from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
-from ..events import Countdown, Failed, GarmentEvent, Reporter, Result, Started
+from ..events import Countdown, Failed, GarmentEvent, Message, Reporter, Result, Started
 from .options import NumberRange, add_bake, layer_options, requests_of
 
 if TYPE_CHECKING:
@@ -71,8 +71,11 @@ def _absolute(task: BakeTask) -> BakeTask:
 
 
 def _write(job: FarmJob, options: argparse.Namespace, report: Reporter) -> int:
-    fixed = BundleOptions(memory=options.memory, timeout=options.timeout)
+    fixed, place = BundleOptions(memory=options.memory, timeout=options.timeout), options.bundle / NAME
+    before = place.read_bytes() if is_job(place) else b""
     write_bundle(options.bundle, job, options.output, fixed)
+    if before and before != place.read_bytes():
+        report(Message(f"{place}: the job that was there is replaced by this one", "warning"))
     output = ["-p", f"Output={options.output.absolute()}"] if options.output else []
     detail = {
         "bundle": str(options.bundle),

@@ -65,6 +65,17 @@ def add_garment(verb: argparse.ArgumentParser) -> None:
     )
 
 
+class _Property(argparse.Action):
+    """Keeps each NAME=VALUE of an option; refuses a second value of one name."""
+
+    def __call__(self, parser: object, namespace: object, values: object, option_string: str | None = None) -> None:
+        """Keep one more."""
+        kept, name = getattr(namespace, self.dest), str(values).partition("=")[0]
+        if other := next((each for each in kept if each.partition("=")[0] == name), None):
+            raise argparse.ArgumentError(self, f"'{other}' and '{values}' are two values of '{name}'; give one")
+        setattr(namespace, self.dest, [*kept, values])
+
+
 def add_fabric(verb: argparse.ArgumentParser) -> None:
     """Add the options of the fabric."""
     verb.add_argument(
@@ -75,7 +86,7 @@ def add_fabric(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--material",
-        action="append",
+        action=_Property,
         default=[],
         metavar="NAME=VALUE",
         help=f"change a property of the fabric (repeatable): {', '.join(setting_names(Fabric))}",
@@ -92,7 +103,7 @@ def add_known_fabric(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--material",
-        action="append",
+        action=_Property,
         default=[],
         metavar="NAME=VALUE",
         help="change a property of that fabric (repeatable): density=0.3 in its unit, or bending=2x for twice that "

@@ -214,6 +214,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     fabric = shared.fabric(options, scene.garment, report)
     if fabric.friction:
         report(Message(f"friction = {fabric.friction:g} is left out; {FRICTION}", "warning"))
+    fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
+    if fabrics:
+        report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
@@ -233,9 +236,6 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         if not options.graded:
             was, now = now, was
         report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
-    fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
-    if fabrics:
-        report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
     over = InnerModel.load_all(options.over, options.output)
     family = _family(options, scene, report) if options.family else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
@@ -315,12 +315,15 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
     """Return the network and the schedule that the options ask for; check what they ask of the fabric, too.
 
     Raises:
-        SsilkError: a setting that does not exist, or a value that it cannot have; or --graded without --family.
+        SsilkError: a setting or a word of --fabrics that does not exist, or a value that it cannot have; or --graded
+            without --family.
     """
     if options.graded and not options.family:
         fail("--graded", "no --family", "garments are graded to further bodies", "name these, or leave it out")
     preset = preset_named(options.preset or default_preset(options.device))
-    shared.asked_fabric(options)
+    fabric = shared.asked_fabric(options)
+    if options.fabrics is not None:
+        FabricRange.of(fabric, options.fabrics)
     return _settings(options.settings, preset.model, preset.train)
 
 

@@ -92,11 +92,8 @@ class ModelFile:
         fabric = fabric_with(self.fabric, factors, fabric.name)
         return replace(self, fabric=fabric, parameters={**self.parameters, **biases}, fabrics=None)
 
-    def on_body(self, coordinates: Floats, seen: Floats | None = None) -> ModelFile:
+    def on_body(self, coordinates: Floats) -> ModelFile:
         """Return the model for one body of its family, at coordinates (K,) (`network.bodies`).
-
-        Args:
-            seen: what the networks see as such (K,), where bodies so far off were not trained for.
 
         Raises:
             SsilkError: these are no coordinates of its family.
@@ -111,7 +108,7 @@ class ModelFile:
         if not coordinates.any():
             return self.on_base()
         scene = self.bodies.family.scene_at(self.scene, coordinates)
-        biases = self.bodies.biases(self.parameters, coordinates if seen is None else seen)
+        biases = self.bodies.biases(self.parameters, coordinates)
         parameters = {**self.parameters, **biases}
         return replace(self, scene=scene, parameters=parameters, bodies=None)
 

@@ -104,6 +104,21 @@ def rounds(motion: Motion, skeleton: Skeleton, cycle: Cycle, count: int) -> Moti
     return replace(many, rotations=rotations, translations=translations, **felt)
 
 
+def led(motion: Motion, skeleton: Skeleton, cycle: Cycle, period: int) -> Motion:
+    """Return a round with one frame more before it: the last of a round that leads up to it.
+
+    Args:
+        motion: frames of a round, at any rate.
+        period: after how many of them it repeats.
+    """
+    own = motion.picked(np.array([period - 1, *range(motion.frame_count)]))
+    rotations, translations, roots = own.rotations.copy(), own.translations.copy(), skeleton.parents < 0
+    back = np.array([np.cos(cycle.angle / 2), 0.0, -np.sin(cycle.angle / 2), 0.0])
+    rotations[0, roots] = multiply_quaternions(back, rotations[0, roots])
+    translations[0, roots] = cycle.back(translations[0, roots])
+    return replace(own, rotations=rotations, translations=translations, start=motion.start - 1)
+
+
 def _closed(motion: Motion, skeleton: Skeleton, cycle: Cycle) -> Motion:
     """Return the frames of a round with what the last one misses spread over them."""
     ends = motion.picked(np.array([0, -1]))

@@ -97,10 +97,10 @@ class FabricRange:
 
     @classmethod
     def of(cls, own: Fabric, words: Sequence[str]) -> FabricRange:
-        """Return what spans all that words name: presets, and factors F that mean 1/F to F; `USUAL` for no word.
+        """Return what spans all that words name: presets, and a factor F that means 1/F to F; `USUAL` for no word.
 
         Raises:
-            SsilkError: a word is neither.
+            SsilkError: a word is neither, or a second factor.
         """
         most, presets = 1.0, []
         for word in words or [f"{USUAL:g}"]:
@@ -114,7 +114,9 @@ class FabricRange:
             if not (isfinite(factor) and 1 < factor <= MOST):
                 allowed = f"a factor above 1, to {MOST:g}, means fabrics from 1/F to F times the model's own"
                 fail("--fabrics", f"the factor {word}", allowed, "such as --fabrics 4, or name presets")
-            most = max(most, factor)
+            if most > 1:
+                fail("--fabrics", f"the factors {most:g} and {factor:g}", "one range has one", "give the wider one")
+            most = factor
         corners = [factors_of(own, fabric_named(name)) for name in presets]
         whole = np.stack([np.full(len(FACTORS), 1 / most), np.full(len(FACTORS), most), *corners])
         return cls(tuple(whole.min(axis=0).tolist()), tuple(whole.max(axis=0).tolist()), tuple(presets))

@@ -124,3 +124,41 @@ def test_a_cycle_is_baked_as_a_loop(ready, trained, capfd):
     assert looped < 1e-6 < 1e-5 < at_rest  # by as much as this toy remembers of where it started
     assert "the loop's last frame is within" in capfd.readouterr().out
     assert "A solver does not come back to its start: switch Loop off" in refused(ready, trained, quality="hero")
+
+
+def test_proxies_are_held_and_posed_each_by_itself(ready, trained):
+    """A proxy that hangs from a bone of the character is where an action poses it, and the garment's others move."""
+    rig = ready.data.objects["Rig"]
+    free = bake(ready, trained)
+    bone = next(
+        bone
+        for bone in rig.pose.bones
+        if bone.name.startswith("Skirt_proxy") and bone.parent.name in ("Hips", "Spine")
+    )
+    bone.ssilk_posed = 1.0
+    assert "Choose the action that poses proxies by hand" in refused(ready, trained)
+    played = rig.animation_data.action
+    by_hand = ready.data.actions.new("By Hand")
+    rig.animation_data.action = by_hand
+    bone.location, bone.rotation_quaternion = (0.1, 0.2, 0.0), (0.8, 0.6, 0.0, 0.0)
+    for path in ("location", "rotation_quaternion"):
+        bone.keyframe_insert(path, frame=1)
+    rig.animation_data.action = played
+    bone.location, bone.rotation_quaternion = (0, 0, 0), (1, 0, 0, 0)
+    trained.ssilk.hand_pose = by_hand
+    for frame, value in {10: 0.0, 20: 1.0}.items():
+        bone.ssilk_posed = value
+        bone.keyframe_insert("ssilk_posed", frame=frame)
+    posed = bake(ready, trained)
+    assert np.abs(posed[:10] - free[:10]).max() < NEAR and np.abs(posed[19:] - free[19:]).max() > 0.05
+    assert abs(np.dot(bone.rotation_quaternion, (0.8, 0.6, 0, 0))) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(bone.location, (0.1, 0.2, 0), atol=1e-4)
+
+
+def test_a_vertex_group_is_held(ready, trained):
+    every = [vertex.index for vertex in trained.data.vertices]
+    trained.vertex_groups.new(name="All of it").add(every, 1.0, "REPLACE")
+    trained.ssilk.part, trained.ssilk.part_free = "All of it", 0.0
+    apart = bake(ready, trained)
+    trained.ssilk.part, trained.ssilk.free = "", 0.0
+    assert np.abs(bake(ready, trained) - apart).max() < 1e-4

@@ -46,7 +46,7 @@ def registered_strings(bpy) -> set[str]:
             rna = getattr(getattr(bpy.ops, module), name).get_rna_type()
             found.add(rna.description)
         found |= of_properties(rna, declared(kind))
-    return found
+    return found | of_properties(bpy.types.PoseBone.bl_rna, {"ssilk_free", "ssilk_posed"})
 
 
 def drawn_strings() -> set[str]:

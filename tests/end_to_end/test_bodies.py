@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 import torch
 from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import worn
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
@@ -296,6 +298,10 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
     assert run(f"{BAKE} --stage large.usda -o large_shot.usda") == 0
     told = capsys.readouterr()
     assert "beyond the bodies of the training" in told.out + told.err
+    file = load_model("family.safetensors")
+    large = worn(file, open_stage("large.usda"), None)
+    seen = file.on_body(file.bodies.family.bodies.place_of(large.scene.character).coordinates)
+    assert all(np.array_equal(value, seen.parameters[name]) for name, value in large.file.parameters.items())
     write_member(world / "huge.usda", lambda points: points * [2.2, 1, 2.2])
     assert run(f"{BAKE} --stage huge.usda -o huge_shot.usda") == 2
     told = capsys.readouterr().err

@@ -7,11 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pxr import Sdf, Usd, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake import BakeRequest, load_rollout
+from ssilk_core.delivery.bake.direction import DirectedPoses
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.network.runtime import Player
+from ssilk_core.scene.assets import GarmentPose
+from ssilk_core.scene.kinematics import deform
 
 FRAMES = 24
 BAKE = ["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion"]
@@ -162,6 +167,126 @@ def test_a_refined_garment_is_held_where_skinning_has_it(stage, more):
     found = baked("held.usdc", "clip.usda", "--refine", "2", *more)
     assert np.abs(found[:9] - skinned[:9]).max() < 5.1e-3
     assert np.abs(found[-1] - skinned[-1]).max() > 0.02
+
+
+def hold_parts(path, values: dict[str, dict[int, float]]) -> None:
+    """Key parts of the garment in a shot, by the names of attributes."""
+    clip = Usd.Stage.Open(str(path))
+    over = clip.OverridePrim("/Hero/Skirt")
+    for name, keys in values.items():
+        attribute = over.CreateAttribute(name, Sdf.ValueTypeNames.Float)
+        for code, value in keys.items():
+            attribute.Set(value, code)
+    clip.GetRootLayer().Save()
+
+
+def proxies_of(path) -> list[str]:
+    home = Usd.Stage.Open(str(path))
+    return list(home.GetPrimAtPath("/Hero/Skirt").GetAttribute("ssilk:proxyJoints").Get())
+
+
+def test_proxies_that_are_all_held_are_as_a_garment_that_is_held(stage):
+    """They begin anew where the garment does, and mix in the world in place of their parents' axes."""
+    leaves = [name.rpartition("/")[2] for name in proxies_of("rigged.usda")]
+    hold_parts("clip.usda", {f"ssilk:free:{leaf}": {8: 0.0, 14: 1.0} for leaf in leaves})
+    apart, plain = baked("apart.usdc"), "clip.usda"
+    clip = Usd.Stage.Open(plain)
+    for leaf in leaves:
+        clip.GetPrimAtPath("/Hero/Skirt").RemoveProperty(f"ssilk:free:{leaf}")
+    clip.GetRootLayer().Save()
+    direct(plain, free={8: 0.0, 14: 1.0})
+    whole = baked("whole.usdc")
+    np.testing.assert_allclose(apart[:9], whole[:9], atol=1e-5)
+    np.testing.assert_allclose(apart[14:], whole[14:], atol=1e-5)
+    assert np.abs(apart - whole).max() < 0.02
+
+
+def test_a_group_is_held_and_the_rest_of_the_garment_moves_as_before(stage):
+    home = Usd.Stage.Open("rigged.usda")
+    mesh = UsdGeom.Mesh(home.GetPrimAtPath("/Hero/Skirt"))
+    side = np.array(mesh.GetPointsAttr().Get())[:, 0]
+    subset = UsdGeom.Subset.Define(home, "/Hero/Skirt/right")
+    subset.CreateElementTypeAttr("point")
+    subset.CreateIndicesAttr(np.flatnonzero(side > 0).tolist())
+    home.GetRootLayer().Save()
+    plain, skinned = baked("plain.usdc"), baked("lbs.usdc", "clip.usda", "--lbs")
+    hold_parts("clip.usda", {"ssilk:free:right": {8: 0.0, 18: 1.0}})
+    found = baked("held.usdc")
+    right, left = side > 0.2, side < -0.2
+    first, then = slice(0, 9), slice(18, None)
+    off = [np.linalg.norm(found[first] - each[first], axis=-1).mean(axis=0) for each in (skinned, plain)]
+    # The toy's proxies are few: one of four is in the middle of both sides.
+    assert off[0][right].mean() < 0.8 * off[1][right].mean() and off[1][left].mean() < 0.8 * off[0][left].mean()
+    np.testing.assert_allclose(found[then], plain[then], atol=1e-5)  # the network went on as if nothing was held
+    assert main([*BAKE, "clip.usda", "-o", "layers"]) == 0
+    np.testing.assert_allclose(points_of("layers/shots/clip/shot.usda"), found, atol=1e-5)
+
+
+def test_a_player_in_numpy_holds_parts_as_a_bake_does(stage):
+    leaf = proxies_of("rigged.usda")[-1].rpartition("/")[2]
+    hold_parts("clip.usda", {f"ssilk:free:{leaf}": {8: 0.0, 14: 1.0}})
+    rollout = load_rollout(BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="clip.usda"))
+    player = Player.load("lively.safetensors")
+
+    def rolled(first: int, stop: int, step: int):
+        return player.play(rollout.motion.picked(slice(first, stop, step))).poses()
+
+    directed = DirectedPoses(rollout.direction, player.deformer(), rolled).poses(0, FRAMES)
+    found, wanted = (GarmentPose.joined(list(poses)) for poses in (directed, rollout.poses()))
+    assert found.weights.shape[1] > len(player.deformer().shapes)
+    points = [deform(rollout.deformer, rollout.motion, pose) for pose in (found, wanted)]
+    np.testing.assert_allclose(*points, atol=1e-4)
+
+
+def test_a_refined_garment_is_held_in_part(stage):
+    """Where a vertex follows free proxies alone it is the solver's, where held ones the network's with these held."""
+    leaves = [name.rpartition("/")[2] for name in proxies_of("rigged.usda")]
+    some = ["clip.usda", "--range", "8-12"]
+    refined = baked("refined.usdc", *some, "--refine", "1")
+    hold_parts("clip.usda", {f"ssilk:free:{leaf}": {10: 0.0, 12: 1.0} for leaf in leaves[:3]})
+    network, found = baked("network.usdc", *some), baked("held.usdc", *some, "--refine", "1")
+    np.testing.assert_allclose(found[4], refined[4], atol=5.1e-3)
+    off, free = (np.linalg.norm(found[:3] - each[:3], axis=-1).max(axis=0) for each in (network, refined))
+    assert off.min() < 1e-3 < 0.01 < off.max() and free.max() > 0.02
+
+
+def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):
+    first, *_ = proxies_of("rigged.usda")
+    clip, leaf = Usd.Stage.Open("clip.usda"), first.rpartition("/")[2]
+    animation = UsdSkel.Animation(clip.GetPrimAtPath("/Clip"))
+    animation.GetJointsAttr().Set([*animation.GetJointsAttr().Get(), first])
+    animation.GetScalesAttr().Set([Gf.Vec3h(1)] * 4)
+    for attribute, own in (
+        (animation.GetRotationsAttr(), Gf.Quatf(0.8, 0.6, 0, 0)),
+        (animation.GetTranslationsAttr(), Gf.Vec3f(0.1, -0.2, 0.3)),
+    ):
+        for code in attribute.GetTimeSamples():
+            attribute.Set([*attribute.Get(code), own], code)
+    clip.GetRootLayer().Save()
+    free = baked("free.usdc")
+    hold_parts("clip.usda", {f"ssilk:posed:{leaf}": {4: 0.0, 10: 1.0, 14: 1.0, 20: 0.0}})
+    found = baked("posed.usdc")
+    np.testing.assert_allclose(found[[0, 4, 20, 23]], free[[0, 4, 20, 23]], atol=1e-5)
+    assert np.abs(found[10:15] - free[10:15]).max() > 0.05
+    local, _ = poses_of("posed.usdc")
+    wanted = np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatf(0.8, 0.6, 0, 0)), Gf.Vec3d(0.1, -0.2, 0.3))).reshape(-1)
+    np.testing.assert_allclose(local[10:15, :16], np.tile(wanted, (5, 1)), atol=1e-5)  # it hangs from a joint
+
+
+@pytest.mark.parametrize(
+    ("values", "more", "complaint"),
+    [
+        ({"ssilk:free:Sleeve": {0: 0.0}}, [], "ssilk:free:Sleeve names neither a proxy of the model nor a subset"),
+        ({"ssilk:posed:LEAF": {0: 1.5}}, [], "is 1.5 at time code 0; 0, the network's, to 1, posed by hand"),
+        ({"ssilk:posed:LEAF": {0: 1.0}}, [], "and this animation has no such joint"),
+        ({"ssilk:free:LEAF": {0: 0.0}}, ["--start-cloth", "shot.usda@0"], "a start and proxies that are held"),
+    ],
+)
+def test_parts_that_cannot_be_held_are_refused_in_one_sentence(stage, capsys, values, more, complaint):
+    leaf = proxies_of("rigged.usda")[0].rpartition("/")[2]
+    hold_parts("clip.usda", {name.replace("LEAF", leaf): keys for name, keys in values.items()})
+    assert main([*BAKE, "clip.usda", "-o", "refused.usdc", *more]) == 2
+    assert complaint in capsys.readouterr().err
 
 
 def test_a_layer_on_the_garment_of_the_shot_comes_before_its_own_stage(stage):

@@ -27,9 +27,10 @@ def test_layers_of_artists_are_read():
             "/Shot/cape/Animation.blendShapeWeights",
             "/Set/Floor.points",
             "/Hero/Cape.ssilk:free",
+            "/Hero/Cape.ssilk:free:left",
             "/Hero/Brooch.ssilk:rideVertices",
         ),
-        ([12], [], [1020, 1028, 1050, 1058], []),
+        ([12], [], [1020, 1028, 1050, 1058], [20, 40, 70, 80], []),
         strict=True,
     ):
         layer = Sdf.Layer.CreateAnonymous(".usda")

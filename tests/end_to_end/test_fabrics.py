@@ -139,6 +139,26 @@ def test_fabrics_travel_in_jobs(copy):
     assert '"wool"' in held.replace('\\"', '"') and "bending=2x" in held
 
 
+def test_a_job_tells_what_its_tasks_lack_and_replaces_no_files_of_others(copy, capsys):
+    """What one task lacks is told; what all lack is refused."""
+    farm = "farm ranged.safetensors model.safetensors --stage rigged.usda --motion sway.usda --bundle job"
+    assert run(f"{farm} --fabric silk") == 0
+    assert "model.safetensors: --fabric silk for a model of one fabric" in capsys.readouterr().err
+    before = Path("job/job.json").read_bytes()
+    for words, text in (
+        ("--fabric silk --range 0-999", "--range 0-999"),
+        ("--range 0-999", "sway.usda has samples from time code"),
+        ("--material bendin=2x", "networks see no factor of it"),
+    ):
+        assert run(f"{farm} {words}") == 2
+        assert text in capsys.readouterr().err
+    assert Path("job/job.json").read_bytes() == before
+    assert run(farm) == 0 and "the job that was there is replaced" in capsys.readouterr().err
+    assert run(farm) == 0 and "replaced" not in capsys.readouterr().err
+    Path("job/job.json").write_text('{"name": "of another program"}')
+    assert run(farm) == 2 and "and no job of 'ssilk farm'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
@@ -147,6 +167,7 @@ def test_fabrics_travel_in_jobs(copy):
         ("--material bending=x", "a factor is a number before the x"),
         ("--material density=0x", "finite and not negative"),
         ("--material stretch=-1x", "finite and not negative"),
+        ("--material bending=2x --material bending=3x", "'bending=2x' and 'bending=3x' are two values of 'bending'"),
         ("--lbs --fabric silk", "linear blend skinning has no fabric"),
     ],
 )
@@ -163,11 +184,13 @@ def test_a_model_of_one_fabric_refuses_others_in_every_command(copy, capsys):
         f"bake {base} --motion sway.usda -o layers --material bending=2x",
         f"evaluate {base} --motions . --fabric silk --no-probes --clips sway",
         "export model.safetensors -o model.onnx --fabric silk",
+        f"farm {base} --motion sway.usda --fabric silk --bundle job",
     ):
         assert run(words) == 2
         said = capsys.readouterr().err
         assert "it was trained for one fabric" in said and "--start-from MODEL --fabrics" in said
     assert not Path("shot.usdc").exists() and not Path("model.onnx").exists()
+    assert not Path("job").exists()
 
 
 def test_beyond_the_range_is_told(copy, capsys):
@@ -190,6 +213,15 @@ def test_onnx_holds_the_fabric_it_was_exported_for(copy, capsys):
         return sorted(part.raw_data for part in onnx.load(name).graph.initializer)
 
     assert weights("silk.onnx") == weights("alone.onnx") != weights("own.onnx")
+
+
+@pytest.mark.parametrize(
+    ("words", "text"), [("2 8", "the factors 2 and 8"), ("silkk", "'silkk', neither a preset nor a factor")]
+)
+def test_words_of_a_range_are_checked_before_anything_is_read(copy, capsys, words, text):
+    assert run(f"train rigged.usda --motions sway.usda -o new.safetensors --fabrics {words}") == 2
+    told = capsys.readouterr()
+    assert text in told.err and "read" not in told.out + told.err
 
 
 def test_lists_name_ranges(tmp_path, capsys):

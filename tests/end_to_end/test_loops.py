@@ -18,7 +18,7 @@ from ssilk_core.delivery.bake import BakeRequest, bake, verify
 from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.looped import seam_words
 
-from .test_direction import direct, lively, points_of
+from .test_direction import direct, hold_parts, lively, points_of, proxies_of
 
 ROUND, FPS = 24, 30.0
 BAKE = ["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion"]
@@ -146,8 +146,8 @@ def test_a_round_is_told_of_a_shot_with_more_shapes_than_the_network_has(stage):
 @pytest.mark.parametrize(
     "more",
     [["--hold", "2"], ["--fps", "60"], ["--fps", "28.75"], ["--samples-per-frame", "2"], ["--quality", "game"],
-     ["--wind", "0,0,0"], ["--latent-iterations", "1"]],
-    ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents"],
+     ["--wind", "0,0,0"], ["--latent-iterations", "1"], ["--refine", "2"]],
+    ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents", "refined"],
 )  # fmt: skip
 def test_a_loop_goes_with_other_wishes(stage, more):
     found = baked("loop.usdc", "cycle.usda", "--loop", *more)
@@ -164,6 +164,17 @@ def test_a_held_span_within_the_round_stays_held(stage, capsys):
     told = [int(number) for number in re.findall(r"(\d+) poses are held or let go", capsys.readouterr().err)]
     assert told == [13, 13]  # frames 5 to 17, of one round
     assert off[8:13].max() < 8e-3 < off[0]
+
+
+def test_a_part_that_is_held_is_held_in_each_round(stage, capsys):
+    name = f"ssilk:free:{proxies_of('rigged.usda')[0].rpartition('/')[2]}"
+    free = baked("free.usdc", "cycle.usda", "--loop")
+    hold_parts("cycle.usda", {name: {0: 0.5, 10: 0.0, ROUND: 0.5}})
+    found = baked("loop.usdc", "cycle.usda", "--loop")
+    assert seam_of(found) < 1e-5 < 1e-2 < np.abs(found - free).max()
+    hold_parts("cycle.usda", {name: {ROUND: 0.75}})
+    assert main([*BAKE, "cycle.usda", "-o", "refused.usdc", "--loop"]) == 2
+    assert "ssilk:free of a part is 0.5 in the first frame and 0.75 in the last" in capsys.readouterr().err
 
 
 def test_the_garment_may_say_it_and_layers_keep_it(stage):
@@ -230,7 +241,7 @@ def say_often() -> None:
         (stop_early, ["--loop"], "it is no cycle: its end is up to "),
         (jump, ["--loop"], "its root jumps; a loop has no cuts"),
         (None, ["--loop", "--range", "0-2"], "3 frames; a loop has at least 4"),
-        (None, ["--loop", "--refine", "2"], "a loop that is refined"),
+        (None, ["--loop", "--quality", "hero"], "a loop that the solver carries on"),
         (None, ["--loop", "--pre-roll", "1"], "a loop with a run-up"),
         (None, ["--loop", "--handles", "2"], "a loop with handles"),
         (None, ["--loop", "--hold", "5"], "poses that are held for 5 samples, in a round of 24"),

@@ -122,6 +122,7 @@ def test_the_solver_refines_what_goes_on(copy):
     ("words", "text"),
     [
         ("--start-cloth none.usdc", "none.usdc"),
+        ("--start-cloth first.usdc@abc", "'abc' after '@' is no time code"),
         ("--start-cloth first.usdc@99", "a start at time code 99; it lasts from 0 to 14"),
         ("--start-cloth first.usdc --range 15-29", "it lasts from 0 to 14, and the shot begins at 15"),
         ("--start-cloth whole.usdc --range 14-29", "it lasts from 0 to 29, and the shot begins at 14"),

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel
@@ -56,10 +58,10 @@ def shot(home, tmp_path) -> Usd.Stage:
     return stage
 
 
-def read(shot: Usd.Stage, home: Usd.Stage, who: str = "One"):
+def read(shot: Usd.Stage, home: Usd.Stage, who: str = "One", proxies: Sequence[str] = ()):
     files = (stage.GetRootLayer().realPath for stage in (shot, home))
     source, stage = files
-    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, "/Hero/Cape", motion())
+    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, "/Hero/Cape", motion(), proxies)
 
 
 def test_each_of_a_crowd_is_held_by_its_own_prim_at_the_time_codes_of_the_shot(shot, home):
@@ -88,6 +90,44 @@ def test_a_clip_says_it_by_an_over_at_the_path_of_the_garment(home, tmp_path):
     found = read_direction(path, home.GetRootLayer().realPath, "/Hero/Cape", motion())
     np.testing.assert_allclose(found.free, np.linspace(0, 1, FRAMES))
     assert found.hold == 2
+
+
+def define_subset(home: Usd.Stage, kind: str, rows: list[int]) -> None:
+    """Give the cape two triangles, and a subset of these or of its four points."""
+    cape = UsdGeom.Mesh(home.GetPrimAtPath("/Hero/Cape"))
+    cape.CreateFaceVertexCountsAttr([3, 3])
+    cape.CreateFaceVertexIndicesAttr([0, 1, 2, 2, 1, 3])
+    subset = UsdGeom.Subset.Define(home, "/Hero/Cape/left")
+    subset.CreateElementTypeAttr(kind)
+    subset.CreateIndicesAttr(rows)
+    home.GetRootLayer().Save()
+
+
+@pytest.mark.parametrize(("kind", "rows", "vertices"), [("point", [0, 3], [0, 3]), ("face", [1], [1, 2, 3])])
+def test_parts_are_proxies_or_subsets_each_with_values_of_its_own(shot, home, kind, rows, vertices):
+    define_subset(home, kind, rows)
+    shot.Reload()
+    cape = shot.GetPrimAtPath("/Crowd/One/Cape")
+    for name, keys in {"free:left": {20: 0, 28: 1}, "posed:Fold": {20: 0.25}, "free:Fold": {20: 1}}.items():
+        attribute = cape.CreateAttribute(f"ssilk:{name}", Sdf.ValueTypeNames.Float)
+        for code, value in keys.items():
+            attribute.Set(value, code)
+    shot.GetRootLayer().Save()
+    found = {part.name: part for part in read(shot, home, proxies=["Hips/Fold"]).parts}
+    assert set(found) == {"left", "Fold"} and not found["left"].posed and found["Fold"].posed
+    np.testing.assert_array_equal(found["left"].vertices, vertices)
+    np.testing.assert_allclose(found["left"].share, [1, 0.75, 0.5, 0.25, 0])
+    assert found["Fold"].vertices is None and (found["Fold"].share == 0.25).all()
+    assert not read(shot, home, "Two").parts
+
+
+def test_a_subset_of_vertices_that_are_not_there_is_refused(shot, home):
+    define_subset(home, "point", [0, 4])
+    home.GetPrimAtPath("/Hero/Cape").CreateAttribute("ssilk:free:left", Sdf.ValueTypeNames.Float).Set(0.0)
+    home.GetRootLayer().Save()
+    shot.Reload()
+    with pytest.raises(SsilkError, match=r"a subset of points \[0, 4\], .*of which there are 4"):
+        read(shot, home)
 
 
 def test_two_garments_that_may_be_meant_are_refused(shot, home):

@@ -17,8 +17,8 @@ LBS_SKIN = ("primvars:ssilk:plainJointIndices", "primvars:ssilk:plainJointWeight
 # Of a PhysicsScene, in the stage's units of length and its axes: wind and the RMS speed of gusts [1/s], size, seed.
 WIND, GUSTS, GUST_LENGTH, GUST_SEED = "ssilk:wind", "ssilk:gusts", "ssilk:gustLength", "ssilk:gustSeed"
 # Of a garment in a shot: 1 where it moves freely, 0 where it is held to linear blend skinning; frames of each pose;
-# whether the shot is a cycle.
-FREE, HOLD, LOOP = "ssilk:free", "ssilk:hold", "ssilk:loop"
+# whether the shot is a cycle. Of a part of it, named after another colon: FREE, and 1 where it is as posed by hand.
+FREE, HOLD, LOOP, POSED = "ssilk:free", "ssilk:hold", "ssilk:loop", "ssilk:posed"
 # Of what rides on a garment: the garment's mesh, three vertices of it that carry the rider, whether it is soft.
 RIDES_ON, RIDE_VERTICES, RIDE_SOFT = "ssilk:ridesOn", "ssilk:rideVertices", "ssilk:rideSoft"
 # Of a baked garment: those of its proxy joints that carry riders.

@@ -88,8 +88,9 @@ def _is_own(file: ModelFile, character: Character) -> bool:
 def worn_by(file: ModelFile, character: Character, known: Character) -> WornModel:
     """Put a model on a character.
 
-    A model for one body fits that body. One of a family fits any body of it. What its networks see of a body ends at
-    `TRAINED` beyond the members. A body beyond `FARTHEST`, or one that the members do not add up to, is refused.
+    A model for one body fits that body. One of a family fits any body of it. A body beyond `FARTHEST`, or one that
+    the members do not add up to, is refused. Up to there networks see bodies as they are, those beyond `TRAINED` too:
+    where what they saw ended there, the cloth lay on another body (docs/training.md).
 
     Args:
         known: the same character, with those meshes at least that the model's family knows.
@@ -107,11 +108,7 @@ def worn_by(file: ModelFile, character: Character, known: Character) -> WornMode
     if not place.coordinates.any() and away.max() < BIND_TOLERANCE:
         one = file.on_body(place.coordinates)
         return WornModel(one, replace(one.scene, character=in_order_of(base, character)), _unlike(place, own))
-    seen = place.coordinates
-    if place.beyond > TRAINED:
-        nearest = bodies.nearest(seen)
-        seen = nearest + (seen - nearest) * (TRAINED / place.beyond)
-    one = file.on_body(place.coordinates, seen)
+    one = file.on_body(place.coordinates)
     bare = replace(own, bodies=(), stand_ins=())  # as model files have it
     one = replace(one, scene=replace(one.scene, character=bare))
     told = tuple(_told(bodies, place, own))
@@ -165,7 +162,7 @@ def _told(bodies: BodyFamily, place: BodyPlace, character: Character) -> list[Ev
     told: list[Event] = [Message(text), *_unlike(place, character)]
     if place.beyond > TRAINED:
         text = f"it is {place.beyond:.0%} beyond the bodies of the training, which went to {TRAINED:.0%}"
-        told.append(Message(f"{path}: {text}; the network sees it no farther off", "warning"))
+        told.append(Message(f"{path}: {text}; its cloth may fit less well", "warning"))
     return told
 
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A garment as an animator directs it: held to linear blend skinning for a while, and its poses held on twos.
+"""A garment as an animator directs it: held to linear blend skinning or a pose by hand, and its poses held on twos.
 
 Where it is held in full nothing is rolled out. The network starts anew in the last frame of that, at rest, as after a
 cut: a garment is often held because the motion had flung or tangled it, and a state that went on below would bring
-that back. Its poses are then mixed with the held ones, so that nothing jumps wherever the network begins.
+that back. Its poses are then mixed with the held ones, so that nothing jumps wherever the network begins. Proxies may
+be held each by itself (`scene.held_parts`): the network goes on below while any of them is free.
 
 On twos the motion is seen at the frames that are held alone, with straight ways between. A character that is itself
 animated on twos would jerk the cloth otherwise.
@@ -11,18 +12,26 @@ animated on twos would jerk the cloth otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, Skeleton
+from ...errors import fail
+from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, Scene, Skeleton
 from ...scene.held import HeldGarment
+from ...scene.held_parts import HeldParts, PartShapes, placed_apart, shares_of_group
 from ...scene.kinematics import split_at_cuts
+from .request import BakeRequest
+
+if TYPE_CHECKING:
+    from ssilk_usd.reading.direction import SaidPart
 
 CHUNK = 256  # frames in memory at once
+MOSTLY = 0.5  # share of a hand's pose from which on a proxy has to be in it; others may be at rest there
 
 Rolled = Callable[[int, int, int], Iterator[GarmentPose]]
 
@@ -36,12 +45,28 @@ class Direction:
         hold: samples that each pose is held.
         motion: the character's, at these samples.
         first: the sample from which held poses are counted.
+        parts: where proxies are held each by itself; None where none is.
+        shapes: the blendshapes that this takes; None likewise.
     """
 
     free: Floats
     hold: int
     motion: Motion
     first: int
+    parts: HeldParts | None = None
+    shapes: PartShapes | None = None
+
+    def of(self, deformer: Deformer) -> Direction:
+        """Return it with the blendshapes that a garment takes whose proxies are held each by itself."""
+        if self.parts is None:
+            return self
+        free = self.free[:, None] * self.parts.free
+        return replace(self, shapes=PartShapes.of(deformer, free, self.free))
+
+    @property
+    def moves(self) -> Floats:
+        """What the network moves of the proxy that is most free, 0 to 1, shape (S,)."""
+        return self.free if self.parts is None else self.free * self.parts.free.max(axis=1, initial=0)
 
     def runs(self, skeleton: Skeleton) -> list[Ints]:
         """Return the samples at which poses are made (K,), for each part of the motion that holds them evenly.
@@ -64,6 +89,41 @@ class Direction:
     def shown(self, made: Ints) -> NDArray[np.intp]:
         """Return which of the poses that are made at samples (K,) each sample shows, shape (S,)."""
         return np.maximum(np.searchsorted(made, np.arange(self.motion.frame_count), side="right") - 1, 0)
+
+
+def held_parts(
+    said: Sequence[SaidPart], deformer: Deformer, scene: Scene, request: BakeRequest, motion: Motion
+) -> HeldParts:
+    """Return how proxies are held each by itself; a proxy's own value comes before those of groups.
+
+    Args:
+        scene: of the model, with the proxies' own names, which a target may change.
+        motion: the character's, at whose samples they are held.
+
+    Raises:
+        SsilkError: the model has no proxies, or one is held to a pose by hand that the request's motion has not.
+    """
+    from ssilk_usd.reading.direction import read_hand_pose
+
+    names, shares, needed = scene.rig.joint_names, list[Floats](), list[str]()
+    if not names:
+        fail(said[0].where, "a part of a garment without proxies", "parts are held by proxies", "key ssilk:free")
+    leaves = np.array([name.rpartition("/")[2] for name in names])
+    for posed in (False, True):
+        share = np.zeros((motion.frame_count, len(names)))
+        asked = [part for part in said if part.posed == posed]
+        for part in asked:
+            if part.vertices is not None:
+                share = np.maximum(share, shares_of_group(deformer, part.vertices) * part.share[:, None])
+        for part in asked:
+            if part.vertices is None:
+                share[:, leaves == part.name] = part.share[:, None]
+        needed += [name for name, most in zip(names, share.max(axis=0)) if posed and most > MOSTLY]
+        shares.append(share)
+    hand = np.tile(np.eye(4), (*shares[1].shape, 1, 1))
+    if needed:
+        hand = read_hand_pose(request.motion, scene, motion, request.root, needed)
+    return HeldParts(shares[0], shares[1], hand)
 
 
 def free_stretches(free: Floats) -> list[tuple[int, int]]:
@@ -103,17 +163,36 @@ class DirectedPoses:
 
     def _made(self, samples: Ints) -> GarmentPose:
         """Return the poses that are made at evenly spaced samples (K,)."""
-        free = self.direction.free[samples]
-        if (free == 1).all():
+        free, apart = self.direction.free[samples], self.direction.parts is not None
+        if (free == 1).all() and not apart:
             return self._network(samples, 0, len(samples), not (self.direction.free == 1).all())
         held = self._held_at(samples)
         assert held.translations is not None
         rotations, weights, moved = held.rotations.copy(), held.weights.copy(), held.translations.copy()
-        for first, stop in free_stretches(free):
+        for first, stop in free_stretches(self.direction.moves[samples]):
             part = slice(first, stop)
-            mixed = self._held.blended(held.part(part), self._network(samples, first, stop, True), free[part])
+            mixed = self._network(samples, first, stop, True)
+            if not apart:
+                mixed = self._held.blended(held.part(part), mixed, free[part])
             rotations[part], weights[part], moved[part] = mixed.rotations, mixed.weights, mixed.translations
-        return GarmentPose(0, rotations, weights, moved)
+        mixed = GarmentPose(0, rotations, weights, moved)
+        return self._apart(samples, held, mixed) if apart else mixed
+
+    def _apart(self, samples: Ints, held: GarmentPose, network: GarmentPose) -> GarmentPose:
+        """Return the poses at samples (K,) of a garment whose proxies are held each by itself."""
+        direction, free, found = self.direction, self.direction.free[samples], []
+        assert direction.parts is not None and direction.shapes is not None
+        for at in range(0, len(samples), CHUNK):
+            part, rows = slice(at, at + CHUNK), samples[at : at + CHUNK]
+            base, own = (replace(each.part(part), start=0) for each in (held, network))
+            parts = direction.parts.of(partial(np.take, indices=rows, axis=0))
+            parts = replace(parts, skinned=1 - free[part, None] * (1 - parts.skinned))
+            rotations, moved = placed_apart(self.deformer, direction.motion.picked(rows), base, own, parts)
+            away = own.weights.astype(np.float64) - base.weights
+            whole = base.weights + free[part, None] * away
+            weights = np.concatenate([whole, direction.shapes.weights(away, rows)], axis=1)
+            found.append(GarmentPose(at, rotations, weights, moved))
+        return GarmentPose.joined(found)
 
     def _network(self, samples: Ints, first: int, stop: int, moves: bool) -> GarmentPose:
         rolled = self.rolled(int(samples[first]), int(samples[stop - 1]) + 1, self.direction.hold)
@@ -128,6 +207,8 @@ class DirectedPoses:
         for at in range(0, len(samples), CHUNK):
             rows = samples[at : at + CHUNK]
             pose, off = self._held.pose(motion.picked(rows))
-            self.off += off[self.direction.free[rows] < 1].tolist()
+            parts, free = self.direction.parts, self.direction.free[rows]
+            free = free if parts is None else free * (1 - parts.skinned[rows].max(axis=1, initial=0))
+            self.off += off[free < 1].tolist()
             found.append(replace(pose, start=at))
         return GarmentPose.joined(found)

@@ -18,12 +18,13 @@ from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
 from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Skeleton
 from ...scene.cycles import rounds
+from ...scene.held_parts import HeldParts
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
-from .direction import Direction
+from .direction import Direction, held_parts
 from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -156,7 +157,7 @@ class LoadedGarment:
             reduction=reduction,
             riders=self.riders,
             told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
-            direction=None if request.lbs else self._directed(request, read),
+            direction=kept._directed(request, read) if kept.model else None,
             loop=loop,
         ).begun()
 
@@ -258,39 +259,48 @@ class LoadedGarment:
         """Return how the shot directs the garment; None where it moves freely throughout."""
         from ssilk_usd.reading.direction import SaidDirection, read_direction
 
+        assert self.model is not None
         garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
         if garment is not None:  # a model may know its garment by a name alone
-            said = read_direction(request.motion, request.stage, garment, read.whole)
-        if read.loop is not None:
-            return self._directed_in_loop(request, read, read.loop, said)
+            names = self.model.scene.rig.joint_names
+            said = read_direction(request.motion, request.stage, garment, read.whole, names)
+        parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole) if said.parts else None
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
             fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
-        if said.free is None and hold == 1:
+        if read.loop is not None:
+            return self._directed_in_loop(request, read, read.loop, said, parts)
+        if said.free is None and hold == 1 and parts is None:
             return None
         samples, count = request.samples_per_frame, read.whole.frame_count
         first = read.lead + (read.frames.before * samples if read.frames else 0)
         free = np.ones(count) if said.free is None else said.free
-        return Direction(free, hold * samples, read.whole, first) if hold > 1 else Direction(free, 1, read.whole, 0)
+        hold, first = (hold * samples, first) if hold > 1 else (1, 0)
+        return Direction(free, hold, read.whole, first, parts)
 
     def _directed_in_loop(
-        self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection
+        self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection, parts: HeldParts | None
     ) -> Direction | None:
         hold = (request.hold or said.hold) * request.samples_per_frame
         hold = 1 if hold == request.samples_per_frame else hold
         if loop.period % hold:
             found = f"poses that are held for {hold} samples, in a round of {loop.period}"
             fail(request.motion, found, "they have to begin anew with each round", "give --hold 1, or another range")
-        if said.free is None and hold == 1:
+        if said.free is None and hold == 1 and parts is None:
             return None
         free = np.ones(read.whole.frame_count) if said.free is None else said.free
-        if loop.cycle.closed and abs(free[-1] - free[0]) > FREE_TOLERANCE:
-            found = f"ssilk:free is {free[0]:g} in the first frame and {free[-1]:g} in the last"
-            fail(request.motion, found, "a loop ends as it begins", "key it so")
+        keyed = [("ssilk:free", free[:, None])]
+        if parts is not None:
+            keyed += [("ssilk:free of a part", 1 - parts.skinned), ("ssilk:posed of a part", parts.posed)]
+        for name, values in keyed if loop.cycle.closed else ():
+            if (off := np.abs(values[-1] - values[0])).max(initial=0) > FREE_TOLERANCE:
+                first, last = (values[row, int(off.argmax())] for row in (0, -1))
+                found = f"{name} is {first:g} in the first frame and {last:g} in the last"
+                fail(request.motion, found, "a loop ends as it begins", "key it so")
         rate = loop.motion.fps / read.sampled.fps
         motion = _sampled(loop.motion, read.sampled.fps, np.arange(loop.samples) * rate)
-        return Direction(loop.tiled(free), hold, motion, 0)
+        return Direction(loop.tiled(free), hold, motion, 0, parts and parts.of(loop.tiled))
 
     def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
@@ -378,7 +388,10 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     """Return a rollout of another model of the same garment."""
     assert rollout.model is not None
     model, deformer = _network_like(rollout.model, file, rollout.request)
-    return replace(rollout, model=model, deformer=deformer, is_fading=False).begun()
+    direction = rollout.direction
+    if direction is not None and model.scene.rig.joint_names != rollout.model.scene.rig.joint_names:
+        direction = replace(direction, parts=None, shapes=None)  # it may lack a proxy that is held
+    return replace(rollout, model=model, deformer=deformer, direction=direction, is_fading=False).begun()
 
 
 def _network_like(like: GarmentModel, file: ModelFile, request: BakeRequest) -> tuple[GarmentModel, Deformer]:

@@ -113,9 +113,9 @@ def _refuse_rate(request: BakeRequest, frames: int, fps: float) -> NoReturn:
 def need_alone(request: BakeRequest) -> None:
     """Raise `SsilkError` where a loop is asked for together with what it does not go with."""
     name = "--loop" if request.loop else f"{request.motion}: ssilk:loop"
-    if request.refine:
-        fail(name, "a loop that is refined", "the solver does not come back to where it began",
-             "leave --refine and --quality hero out")  # fmt: skip
+    if request.feedback:
+        found, allowed = "a loop that the solver carries on", "it does not come back to where it began"
+        fail(name, found, allowed, "leave --feedback and --quality hero out: --refine N alone refines a loop")
     if request.handles:
         fail(name, "a loop with handles", "what comes before and after it is the round itself", "leave --handles out")
     if request.pre_roll:

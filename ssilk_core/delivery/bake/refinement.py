@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, tee
-from typing import TYPE_CHECKING
+from itertools import chain, islice, tee
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -16,8 +16,10 @@ from ...events import Countdown, Message, Reporter, silent
 from ...network.settings import STRONGEST_PULL
 from ...physics.constants import GRAVITY
 from ...scene.assets import Deformer, Floats, Motion
+from ...scene.cycles import led
+from ...scene.held_parts import shares_of_proxies
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
-from .direction import free_stretches
+from .direction import Direction, free_stretches
 from .result import RefinementSummary, ShotShapes, Verification
 from .rollout import BakeRollout, Refinement
 from .world import tell_surrounded
@@ -96,8 +98,13 @@ def _refined_frames(rollout: BakeRollout, report: Reporter) -> Iterator[_Frame]:
         left_out, played = rollout.lead, rollout.with_lead()
         report(Message("the solver puts the garment to rest first, which takes as long as many frames"))
     told, count = Countdown(played.motion.frame_count, report), played.motion.frame_count
-    free = np.ones(count) if played.direction is None else played.direction.free[played.lead : played.lead + count]
-    frames = _directed_frames(played, free, report) if (free < 1).any() else _solved_frames(played, 0, count, report)
+    direction, rows = played.direction, slice(played.lead, played.lead + count)
+    if direction is not None and direction.parts is not None:
+        frames = _frames_in_part(played, direction, rows, report)
+    elif direction is not None and (direction.free[rows] < 1).any():
+        frames = _directed_frames(played, direction.free[rows], report)
+    else:
+        frames = _solved_frames(played, 0, count, report)
     for number, frame in enumerate(frames):
         told()
         if number >= left_out:
@@ -112,8 +119,7 @@ def _directed_frames(played: BakeRollout, free: Floats, report: Reporter) -> Ite
     """
     stretches = free_stretches(free)
     if not stretches:
-        found, allowed = "the garment is held in all frames", "--refine solves for cloth that moves freely"
-        fail(played.request.motion, found, allowed, "leave --refine out, or key ssilk:free")
+        _refuse_held(played)
     deformer, motion = lbs_deformer(played.deformer.scene), played.motion
     done = 0
     for first, stop in [*stretches, (len(free), len(free))]:
@@ -122,6 +128,27 @@ def _directed_frames(played: BakeRollout, free: Floats, report: Reporter) -> Ite
         for share, points, frame in zip(free[first:stop], _skinned(deformer, motion, first, stop), solved):
             yield _Frame(points + share * (frame.points - points), frame.change)
         done = stop
+
+
+def _frames_in_part(played: BakeRollout, direction: Direction, rows: slice, report: Reporter) -> Iterator[_Frame]:
+    """Yield frames between refined ones and those of the network, where proxies are held each by itself."""
+    assert direction.parts is not None
+    stretches, done = free_stretches(direction.moves[rows]), 0
+    if not stretches:
+        _refuse_held(played)
+    free = direction.free[rows, None] * direction.parts.free[rows]
+    follow, held = shares_of_proxies(played.deformer), played.network_vertices()
+    for first, stop in [*stretches, (len(free), len(free))]:
+        yield from (_Frame(points, None) for points in islice(held, first - done))
+        solved = _solved_frames(played, first, stop, report) if first < stop else ()
+        for share, points, frame in zip(free[first:stop] @ follow.T, islice(held, stop - first), solved):
+            yield _Frame(points + share[:, None] * (frame.points - points), frame.change)
+        done = stop
+
+
+def _refuse_held(played: BakeRollout) -> NoReturn:
+    found, allowed = "the garment is held in all frames", "--refine solves for cloth that moves freely"
+    fail(played.request.motion, found, allowed, "leave --refine out, or key ssilk:free")
 
 
 def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Iterator[Floats]:
@@ -133,12 +160,25 @@ def _skinned(deformer: Deformer, motion: Motion, first: int, stop: int) -> Itera
 def _solved_frames(played: BakeRollout, first: int, stop: int, report: Reporter) -> Iterator[_Frame]:
     """Yield frames that the solver refines, from its start in the first of them on."""
     motion = played.motion
-    # What is cut out is normalised again, which changes its last digits.
-    part = motion if stop - first == motion.frame_count else motion.clip(first, stop)
+    if stop - first == motion.frame_count:
+        part, network = _led(played)
+    else:  # what is cut out is normalised again, which changes its last digits
+        part, network = motion.clip(first, stop), islice(played.network_vertices(), first, stop)
     world = played.around.over(part).read(report)
-    network = islice(played.network_vertices(), first, stop)
-    for frame in _refiner(played).frames(part, network, world):
+    frames = _refiner(played).frames(part, network, world)
+    for frame in islice(frames, part.frame_count - (stop - first), None):
         yield _Frame(frame.points, frame.change)
+
+
+def _led(played: BakeRollout) -> tuple[Motion, Iterator[Floats]]:
+    """Return the motion and the network's vertices, in a loop with the frame that leads up to them: the drag of the
+    first one looks back on it."""
+    loop, motion, network = played.loop, played.motion, played.network_vertices()
+    if loop is None:
+        return motion, network
+    own = list(network)
+    before = loop.cycle.back(own[loop.period - 1])
+    return led(motion, played.deformer.scene.character.skeleton, loop.cycle, loop.period), chain([before], own)
 
 
 def _decomposed(rollout: BakeRollout, points: Sequence[Floats], add_shapes: bool) -> Decomposition:
@@ -194,8 +234,13 @@ def verify_energies(rollout: BakeRollout, points: Iterable[Floats], report: Repo
     """
     energies, (judged, measured) = [], tee(points)
     told = Countdown(rollout.motion.frame_count, report)
-    world = rollout.around.over(rollout.motion).read(silent)
-    changes = _refiner(rollout).changes(rollout.motion, rollout.network_vertices(), judged, world)
+    motion, network = _led(rollout)
+    more = motion.frame_count - rollout.motion.frame_count
+    if more:
+        network, again = tee(network)
+        judged = chain(islice(again, more), judged)
+    world = rollout.around.over(motion).read(silent)
+    changes = islice(_refiner(rollout).changes(motion, network, judged, world), more, None)
     for frame, (change, vertices) in enumerate(zip(changes, measured)):
         spacing = float(np.finfo(np.float32).eps) * np.abs(vertices).max()
         rounding = ROUNDING_ENERGY + len(vertices) * ROUNDING_STIFFNESS * spacing**2

@@ -221,7 +221,7 @@ class BakeRollout:
         """Yield the poses of samples of `whole`, counted from `start`, and list where the rollout was lost."""
         rolled = partial(self._rolled, roller=roller, lost=lost, start=start)
         if self.direction is not None:
-            directed = DirectedPoses(self.direction, self._unfaded, rolled)
+            directed = DirectedPoses(self.direction, self._network_deformer, rolled)
             for pose in directed.poses(start, stop):
                 self.held_off[:] = directed.off  # now: a loop may ask for no more
                 yield pose
@@ -306,7 +306,16 @@ class BakeRollout:
         return fitted_start(self.model, Motion(self.source.path, fps, *poses, **felt), first, points)
 
     def begun(self) -> BakeRollout:
-        """Return the rollout with a blendshape for what latents miss of its first cloth, where that is seen."""
+        """Return the rollout with blendshapes of its own: those of proxies that are held each by itself, or one
+        for what latents miss of its first cloth, where that is seen."""
+        if self.direction is not None and self.direction.parts is not None:
+            if self.start_cloth is not None:
+                fail("--start-cloth", "a start and proxies that are held by themselves", "one of both",
+                     "leave --start-cloth out, and ssilk:free:NAME and ssilk:posed:NAME of the garment")  # fmt: skip
+            direction = self.direction.of(self.deformer)
+            assert direction.shapes is not None
+            shapes = np.concatenate([self.deformer.shapes, direction.shapes.offsets])
+            return replace(self, deformer=replace(self.deformer, shapes=shapes), direction=direction)
         if self.start_cloth is None or self.model is None:
             return self
         from ...scene.decomposition.rest import rest_residuals
@@ -324,10 +333,11 @@ class BakeRollout:
         return begun
 
     @property
-    def _unfaded(self) -> Deformer:
-        """The garment without the blendshape that fades, which no pose of the network has."""
-        own = self.deformer
-        return replace(own, shapes=own.shapes[:-1]) if self.is_fading else own
+    def _network_deformer(self) -> Deformer:
+        """The garment with the blendshapes of the network alone."""
+        assert self.model is not None
+        count = self.model.decoder.shape_count + int(self.model.decoder.has_constant)
+        return replace(self.deformer, shapes=self.deformer.shapes[:count])
 
     def _faded(self, pose: GarmentPose) -> GarmentPose:
         """Return poses with the weight of what the first frame lacks: none where skinning holds the garment."""
@@ -461,6 +471,9 @@ class BakeRollout:
     def _network_decoded(self, pose: GarmentPose) -> Floats:
         if self.model is None:
             return deform(self.deformer, self.motion, pose)
+        if self.direction is not None and self.direction.shapes is not None:  # which the network does not know
+            shapes = self.deformer.shapes[: pose.weights.shape[1]]  # a certificate may add some
+            return deform(replace(self.deformer, shapes=shapes), self.motion, pose)
         from ...network.rollout import decode
 
         return decode(self.model, self.motion, pose)

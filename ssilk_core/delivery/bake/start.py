@@ -11,7 +11,7 @@ import numpy as np
 from ...errors import fail
 from ...files import sha256, split_location
 from ...scene.assets import Floats, Garment
-from .request import BakeRequest, split_start
+from .request import AT, BakeRequest, split_start
 
 SLACK = 1e-6  # of a time code
 FAR = 0.01  # [m] RMS, from which on latents do not reach the cloth: it is warned of
@@ -50,6 +50,7 @@ def read_start(text: str, garment: Garment, fps: float, begins: float) -> StartC
     from ssilk_usd.shots.trajectories import MeshTrajectories
 
     place, code = split_start(text)
+    _need_code(text)
     cache = MeshTrajectories(place, garment.mesh.vertex_count, garment.mesh.faces)
     first, last = float(cache.times[0]), float(cache.times[-1])
     if code is None:
@@ -77,6 +78,15 @@ def read_start(text: str, garment: Garment, fps: float, begins: float) -> StartC
     if not np.isfinite(points).all():
         fail(place, "points that are not finite", "all must be finite", "write it again")
     return StartCloth(points, moves, f"{place} at {code:.9g}", sha256(Path(split_location(place)[0])))
+
+
+def _need_code(text: str) -> None:
+    """Raise `SsilkError` where "FILE[:/PRIM]@CODE" names a file that is there, and something else than a code."""
+    place, at, code = text.rpartition(AT)
+    there = [Path(split_location(each)[0]).is_file() for each in (place, text)]
+    if at and there == [True, False] and split_start(text)[1] is None:
+        found = f"'{code}' after '{AT}' is no time code"
+        fail(f"--start-cloth {text}", found, "a number names a frame of it", f"such as {place}{AT}100")
 
 
 def fading(frames: range, fps: float) -> Floats:

@@ -16,6 +16,7 @@ from ...events import Message, Reporter
 from ...files import replacing
 from ...scene.plain import from_plain
 from ..bake import BakeRequest, BakeTask
+from ..bake.asked import tell_impossible
 from ..bake.inputs import InputContents, InputFiles, InputHashes
 from ..bake.layered import in_levels
 
@@ -34,7 +35,12 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     """Return tasks pinned to what their inputs hold now, so that nobody bakes other files that come in their place.
 
     Those that are certified over others come after these, as the steps of a bundle count them. A task with an input
-    that cannot be read is kept, with a warning: it fails alone until the job is submitted again.
+    that cannot be read, or that has not what is asked of it, is kept, with a warning: it fails alone until the job is
+    submitted again.
+
+    Raises:
+        SsilkError: no task can be baked, because a model has not the fabric that is asked for, or a motion not the
+            range.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
@@ -43,6 +49,7 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
             found[path] = files.contents(name, path)
         except SsilkError as error:
             report(Message(str(error), "warning"))
+    tell_impossible(tasks, found, report)
     return FarmJob(tuple(_pinned(task, found) for level in in_levels(tasks) for task in level), found)
 
 
@@ -53,6 +60,15 @@ def write_job(path: str | Path, job: FarmJob) -> None:
     head = json.dumps({"ssilk": __version__, "inputs": inputs}, indent=1).removesuffix("\n}")
     with replacing(path, keep_same=True) as temporary:
         temporary.write_text(f'{head},\n "tasks": [\n{lines}\n]}}\n')
+
+
+def is_job(path: Path) -> bool:
+    """Return whether a file begins as `write_job` begins one."""
+    head = b'{\n "ssilk": '
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        return stream.read(len(head)) == head
 
 
 def _entry(task: BakeTask) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from ...events import Event, Failed, GarmentEvent, Message, Progress, Result, St
 from ...files import replacing, split_location
 from ..bake import BakeTask
 from ..bake.layered import in_levels
-from .job import NAME, FarmJob, write_job
+from .job import NAME, FarmJob, is_job, write_job
 
 TEMPLATE, VALUES, ASSETS = "template.json", "parameter_values.json", "asset_references.json"
 CHUNK, CHUNK_SECONDS = 10, 300  # tasks of a chunk at first, and how long one should take; both are parameters
@@ -50,9 +50,17 @@ def write_bundle(folder: Path, job: FarmJob, output: Path | None, options: Bundl
     """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
-        SsilkError: it cannot be written.
+        SsilkError: it cannot be written, or would replace files of another program.
     """
     tasks = job.tasks
+    held = [name for name in (NAME, TEMPLATE, VALUES, ASSETS) if (folder / name).is_file()]
+    if held and not is_job(folder / NAME):
+        fail(
+            f"--bundle {folder}",
+            f"it holds {', '.join(held)}, and no job of 'ssilk farm'",
+            "a bundle has a folder of its own, or replaces one that 'ssilk farm' wrote",
+            "name another folder",
+        )
     write_job(folder / NAME, job)
     _write(folder / TEMPLATE, template(tasks, options))
     values = [] if output is None else [{"name": "Output", "value": str(output.absolute())}]

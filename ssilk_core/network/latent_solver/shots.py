@@ -19,8 +19,8 @@ from ...errors import fail
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.simulate.characters import PosedCharacters
 from ...physics.simulate.cubature import spread_evenly
+from ...physics.simulate.history import StepHistory
 from ...physics.simulate.incremental_potential import StepInputs
-from ...physics.simulate.simulator import StepHistory
 from ...scene.assets import Motion
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import motion_transforms

@@ -34,9 +34,9 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import split_at_cuts
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.characters import PosedCharacters
+from ..simulate.history import StepHistory
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from, need_finite
-from ..simulate.simulator import StepHistory
 from ..world.surroundings import Surroundings
 from .clearing import SkinClearing
 

@@ -7,15 +7,13 @@ a shot whose step is solved goes on with its next one.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Hashable
+from collections.abc import Callable, Generator, Hashable, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from .characters import PosedCharacters
+from .history import StepHistory
 from .newton import Search, Solution
-
-if TYPE_CHECKING:
-    from .simulator import Simulator, StepHistory
 
 EVERY = 8  # iterations, after which solved steps go on
 
@@ -27,12 +25,14 @@ class Asked:
     """A step of one shot that is to be solved.
 
     Attributes:
-        simulator: whose time step it has.
+        dt: its length [s].
+        search: returns the search for the ends of such steps, by numbers of N shots.
         past: before the step.
         poses: at its end.
     """
 
-    simulator: Simulator
+    dt: float
+    search: Callable[[PosedCharacters, StepHistory, Sequence[int]], Search]
     past: StepHistory
     poses: PosedCharacters
 
@@ -41,7 +41,7 @@ class Asked:
         """What all steps that are solved together have in common: their length, and what is known of them."""
         past, world = self.past, self.poses.world
         known = past.before is None, past.friction is None, past.pierced is None
-        return self.simulator.dt, *known, world is not None and world.has_colliders
+        return self.dt, *known, world is not None and world.has_colliders
 
 
 Course = Generator[Asked, Solution, T]
@@ -95,11 +95,8 @@ def _iterate(steps: _Steps) -> list[tuple[int, Solution]]:
     if steps.waiting:
         numbers, asked = zip(*steps.waiting)
         steps.waiting = []
-        search = asked[0].simulator.search(
-            type(asked[0].poses).concatenated([each.poses for each in asked]),
-            type(asked[0].past).concatenated([each.past for each in asked]),
-            numbers,
-        )
+        poses = PosedCharacters.concatenated([each.poses for each in asked])
+        search = asked[0].search(poses, StepHistory.concatenated([each.past for each in asked]), numbers)
         if steps.search:
             steps.search.join(search)
         else:

@@ -33,12 +33,11 @@ from ...scene.kinematics import bind_pose, slerp
 from ..collision import limb_axes
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
-from ..framed import Framed
 from ..self_contact import ClothNeighbours
 from ..world.surroundings import PosedWorld, Surroundings
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
-from .friction import Friction
+from .history import StepHistory
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Search, Solution, SolverOptions, minimise_from
 from .outfit import OutfitPotential, WornGarment
@@ -113,43 +112,6 @@ class SimulatedFrame:
     residual: float
     iterations: int
     fixed: int
-
-
-@dataclass(frozen=True, eq=False)
-class StepHistory(Framed):
-    """The previous states of N shots.
-
-    Attributes:
-        last, before: positions one and two steps ago in world space [m], float64, shape (V, 3, N); `before` is None
-            in the second step. After shorter steps it is where the last velocity leads back to in a whole one.
-        root: the character's root one step ago [m], float64, shape (3, N).
-        lbs: the garment under linear blend skinning one step ago, relative to that root, shape (V, 3, N).
-        neighbours: which cloth may touch which, where that is looked at.
-        friction: of what presses at the last positions, for the next step; None without.
-        matrices: skinning matrices one step ago (`PosedCharacters.matrices`), between which and the next ones the
-            body is posed in shorter steps; None where no step is to be split. `moves` likewise
-            (`PosedCharacters.moves`).
-        pierced: the cloth that limbs were through at the last positions, which a shorter step holds on to.
-    """
-
-    last: Tensor
-    before: Tensor | None
-    root: Tensor
-    lbs: Tensor
-    neighbours: ClothNeighbours | None = None
-    friction: Friction | None = None
-    matrices: Tensor | None = None
-    pierced: PiercedCloth | PiercedOutfit | None = None
-    moves: Tensor | None = None
-
-    @property
-    def local(self) -> Tensor:
-        """The last positions relative to the root at that time, shape (V, 3, N)."""
-        return (self.last - self.root).to(self.lbs.dtype)
-
-    def follow_lbs(self, poses: PosedCharacters) -> Tensor:
-        """Return the last positions moved along with linear blend skinning, relative to the roots of `poses`."""
-        return self.local - self.lbs + poses.lbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +270,7 @@ class Simulator:
 
     def _stepped(self, past: StepHistory, poses: PosedCharacters) -> Course[tuple[StepHistory, Solution]]:
         """Return the state of one shot after that of the past, and its solution."""
-        solution, before = (yield Asked(self, past, poses)), past.last
+        solution, before = (yield Asked(self.dt, self.search, past, poses)), past.last
         if self.splits and past.matrices is not None and poses.world is None:  # no world is posed in between
             stuck = ~(solution.residual <= self.options.solver.tolerance)
             if past.pierced and (now := self._pierced(solution.x, poses)):

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from ...physics.simulate import Simulator
 from ...physics.simulate.characters import PosedCharacters
-from ...physics.simulate.simulator import StepHistory, Stepped
+from ...physics.simulate.history import StepHistory
+from ...physics.simulate.simulator import Stepped
 from ...scene.assets import Motion
 from ...scene.kinematics import first_place
 from .kept_parts import NOTHING_KEPT, KeptParts

@@ -17,23 +17,34 @@ from .measures import (
     bake_at_rate,
     jumps,
     ride,
+    roll_out_fabric,
     roll_out_frames,
+    roll_out_gravity,
+    roll_out_height,
     roll_out_motion,
     roll_out_nan,
     roll_out_path,
     roll_out_precision,
+    roll_out_prop,
     roll_out_random_poses,
     roll_out_rotated,
+    roll_out_vertices,
+    roll_out_wind,
     simulate_fabric,
+    simulate_factor,
+    simulate_friction,
     simulate_gravity,
+    simulate_prop,
     simulate_slivers,
+    simulate_wind,
     train_at_size,
     train_fabric,
     train_slivers,
     train_vertex_count,
 )
-from .outcome import CaseMeasurement, CaseOutcome, Verdict
+from .outcome import CaseMeasurement, CaseOutcome, DoesNotApply, Verdict
 from .subject import StressSubject
+from .surroundings import appearing, passing, steady, switched
 
 UPWARD, FORWARD = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -69,6 +80,10 @@ class Case:
         """Return whether the case's name contains one of `words`; True if there are none."""
         return not words or any(word in self.label for word in words)
 
+    def allows(self, verdict: Verdict) -> bool:
+        """Return whether a verdict is acceptable."""
+        return verdict in (*self.allowed, "does not apply")
+
     def run(self, subject: StressSubject) -> CaseOutcome:
         """Run the case and return its outcome."""
         began = time.perf_counter()
@@ -80,6 +95,8 @@ class Case:
             measured = self.measure(subject)
         except SsilkError as error:
             return "refuses", str(error), CaseMeasurement()
+        except DoesNotApply as error:
+            return "does not apply", str(error), CaseMeasurement()
         except (RuntimeError, ValueError, ArithmeticError, IndexError, MemoryError) as error:
             return "breaks", f"{type(error).__name__}: {error}".partition("\n")[0], CaseMeasurement()
         return measured.verdict, measured.note, measured
@@ -90,14 +107,28 @@ FRAME_RATES = (5, 12, 24, 60, 120, 240)
 STIFFNESSES = (1e-3, 1.0, 1e3, 1e6)  # [N/m]
 SLIVER_HEIGHTS = (1e-2, 1e-4, 1e-6, 1e-8, 0.0)  # ratio of height to base
 VERTEX_COUNTS = (100, 10_000, 200_000)
+FACTORS = (0.1, 10.0)  # of each stiffness
 PRECISIONS = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 
 CASES = (
     *(Case("length", f"{count:,} frames", roll_out_frames(count)) for count in (10_000, 100_000)),
     *(Case("rate", f"{fps} frames per second", bake_at_rate(fps)) for fps in FRAME_RATES),
-    Case("gravity", "none", simulate_gravity(0.0), MAY_FALL_BACK),
-    Case("gravity", "tenfold", simulate_gravity(10.0), MAY_FALL_BACK),
+    *(
+        Case("gravity", name, roll_out_gravity(factor))
+        for name, factor in (("none", 0.0), ("tenfold", 10.0), ("upwards", -1.0))
+    ),
+    Case("gravity", "none, simulated", simulate_gravity(0.0), MAY_FALL_BACK),
+    Case("gravity", "tenfold, simulated", simulate_gravity(10.0), MAY_FALL_BACK),
     Case("gravity", "sideways", roll_out_rotated(FORWARD, angle=pi / 2)),
+    *(Case("wind", f"{speed:g} m/s", roll_out_wind(steady(speed))) for speed in (20.0, 60.0)),
+    Case("wind", "60 m/s from one frame to the next", roll_out_wind(switched(60.0))),
+    Case("wind", "40 m/s with gusts of 20 m/s", roll_out_wind(steady(40.0), 20.0)),
+    Case("wind", "60 m/s, simulated", simulate_wind(60.0), MAY_FALL_BACK),
+    Case("wind", "101 m/s", roll_out_wind(steady(101.0)), ("refuses",)),
+    Case("props", "through the body at 2 m/s", roll_out_prop(passing(2.0))),
+    Case("props", "in one frame amid cloth", roll_out_prop(appearing)),
+    Case("props", "through the body at 10 m/s, simulated", simulate_prop(passing(10.0)), MAY_FALL_BACK),
+    Case("props", "in one frame amid cloth, simulated", simulate_prop(appearing), MAY_FALL_BACK),
     Case("motion", "upside down", roll_out_rotated(FORWARD, angle=pi)),
     Case("motion", "a teleport of 30 m each second", roll_out_path(jumps)),
     Case("motion", "a ride at 50 m/s", roll_out_path(ride)),
@@ -111,7 +142,15 @@ CASES = (
     Case("motion", "other such poses in each frame", roll_out_random_poses(1e-3)),
     Case("motion", "NaN in frame 7", roll_out_nan(7), ("refuses",)),
     *(Case("size", f"{metres:g} m", train_at_size(metres)) for metres in (1e-3, 100.0)),
+    *(Case("size", f"{metres:g} m high, played", roll_out_height(metres), MAY_FALL_BACK) for metres in (0.01, 20.0)),
     *(Case("fabric", f"{stiffness:g} N/m", train_fabric(stiffness)) for stiffness in STIFFNESSES),
+    *(
+        Case("fabric", f"{name} times {factor:g}, played", roll_out_fabric(**{name: factor}))
+        for name in ("stretch", "shear", "bending", "density", "drag")
+        for factor in FACTORS
+    ),
+    Case("fabric", "bending times 0.001, density times 1000, played", roll_out_fabric(bending=1e-3, density=1e3)),
+    Case("fabric", "no density, played", roll_out_fabric(density=0.0), ("refuses",)),
     *(
         Case("slivers", f"{height:g} as high as long", train_slivers(height), (*MAY_FALL_BACK, "refuses"))
         for height in SLIVER_HEIGHTS
@@ -120,8 +159,15 @@ CASES = (
         Case("simulator", f"{stiffness:g} N/m", simulate_fabric(stiffness), MAY_FALL_BACK)
         for stiffness in STIFFNESSES
     ),
+    *(
+        Case("simulator", f"{name} times {factor:g}", simulate_factor(name, factor), MAY_FALL_BACK)
+        for name in ("stretch", "shear", "bending", "contact", "tether", "stitch")
+        for factor in FACTORS
+    ),
+    *(Case("simulator", f"friction {value:g}", simulate_friction(value), MAY_FALL_BACK) for value in (0.0, 2.0)),
     Case("simulator", "slivers 0.0001 as high as long", simulate_slivers(1e-4), MAY_FALL_BACK),
     *(Case("vertices", f"{count:,}", train_vertex_count(count)) for count in VERTEX_COUNTS),
+    Case("vertices", "50,000, played", roll_out_vertices(50_000)),
     *(
         Case("precision", str(dtype).removeprefix("torch."), roll_out_precision(dtype), MAY_FALL_BACK)
         for dtype in PRECISIONS

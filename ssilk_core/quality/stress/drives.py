@@ -7,8 +7,9 @@ spin or a teleport, wraps a motion and returns a new one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,13 +27,14 @@ Turn = Callable[[Floats], Floats]  # times [s] (N,) to quaternions (N, 4)
 class ProceduralMotion:
     """A motion of `frames` frames at `fps`, where `at` returns rotations and translations at times [s] (N,).
 
-    `loop` is its period [s], or zero if it does not repeat.
+    `loop` is its period [s], or zero if it does not repeat; `felt` what cloth feels in each frame (`Motion.felt`).
     """
 
     fps: float
     frames: int
     at: Callable[[Floats], Sampled]
     loop: float = 0.0
+    felt: Mapping[str, Any] = field(default_factory=dict)
 
     def motion(self, start: int = 0, stop: int | None = None) -> Motion:
         """Return the frames from `start` to `stop` (exclusive), by default all.
@@ -41,7 +43,8 @@ class ProceduralMotion:
             SsilkError: a frame has NaN.
         """
         stop = self.frames if stop is None else min(stop, self.frames)
-        return Motion("stress", self.fps, *self.at(np.arange(start, stop) / self.fps), start)
+        felt = {name: values[start:stop] for name, values in self.felt.items()}
+        return Motion("stress", self.fps, *self.at(np.arange(start, stop) / self.fps), start, **felt)
 
     def blocks(self, size: int = BLOCK) -> Iterator[Motion]:
         """Yield all frames, `size` at a time."""

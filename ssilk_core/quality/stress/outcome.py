@@ -9,9 +9,13 @@ from typing import Literal
 
 from .meter import Extent
 
-Verdict = Literal["works", "falls back", "refuses", "breaks"]
+Verdict = Literal["works", "falls back", "refuses", "does not apply", "breaks"]
 HEADER = ("extreme", "what happens", "frames", "bounded", "speed [m/s]", "off linear blend skinning [m]", "latent",
           "energy growth", "error", "s")  # fmt: skip
+
+
+class DoesNotApply(Exception):
+    """Raised by a case that a model has no input for; it says why, without a stop."""
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,11 @@ import torch
 
 from ...network.checkpoint import ModelFile, network
 from ...network.model.network import GarmentModel
-from ...scene.assets import Motion, Scene
+from ...scene.assets import Floats, Motion, Scene
 from ...scene.fabrics import Fabric
 from .drives import ProceduralMotion, loop_clip, sway
+from .meter import positions
+from .worlds import resize_garment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +27,7 @@ class Effort:
         steps: optimiser steps of trial trainings.
         simulated: frames of trial simulations.
         vertices: largest number of vertices of a trial garment.
+        patch: vertices of the patch of a garment that is simulated; None for the whole garment.
     """
 
     seconds: float = 20.0
@@ -32,10 +35,11 @@ class Effort:
     steps: int = 60
     simulated: int = 10
     vertices: int = 200_000
+    patch: int | None = None
 
 
 FULL = Effort()
-QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000)
+QUICK = Effort(seconds=3.0, frames=0.1, steps=12, simulated=3, vertices=20_000, patch=600)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +69,16 @@ class StressSubject:
     @cached_property
     def model(self) -> GarmentModel:
         return self.in_precision(torch.float32)
+
+    @cached_property
+    def free(self) -> Floats:
+        """Where the network has its cloth over `base`, relative to the root [m], shape (F, V, 3)."""
+        return positions(self.model, self.base)
+
+    @cached_property
+    def cloth(self) -> Scene:
+        """The scene with what is simulated of the garment."""
+        return self.scene if self.effort.patch is None else resize_garment(self.scene, self.effort.patch)
 
     def in_precision(self, dtype: torch.dtype) -> GarmentModel:
         """Return the network with all parameters and buffers in `dtype`."""

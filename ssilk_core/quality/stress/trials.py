@@ -12,21 +12,19 @@ from torch import Tensor
 
 from ...network.model.network import GarmentModel
 from ...network.settings import ModelConfig
-from ...physics.constants import GRAVITY
 from ...physics.energy import GarmentEnergy
 from ...physics.simulate import SimulationOptions, Simulator
 from ...physics.skinning import Skinning
-from ...scene.assets import PINNED, Motion, Scene
+from ...scene.assets import PINNED, Floats, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
 from ...training.job import TrainJob
 from ...training.parts import build_parts
 from ...training.settings import TrainConfig
 from .drives import ProceduralMotion
-from .meter import Extent, ExtentMeter, extent, matrices_about_root
+from .meter import MAX_LBS_DISTANCE, Extent, ExtentMeter, extent, matrices_about_root
 
 TRIAL_MODEL = ModelConfig(latent=16, widths=(32, 32), shapes=8)
 PERTURBATION = 1e-3  # [garment sizes] displacement of points at which forces in two precisions are compared
-MAX_ELASTIC_DISTANCE = 1e4  # [garment sizes] that the softest fabric may stretch physically
 
 
 @dataclass(frozen=True)
@@ -68,18 +66,21 @@ def train_trial(scene: Scene, fabric: Fabric, drive: ProceduralMotion, steps: in
     return Trial(extent(model, fabric, drive), int(stepper.skipped.count), steps, error)
 
 
-def simulate_trial(scene: Scene, fabric: Fabric, motion: Motion, gravity: float = GRAVITY) -> tuple[Extent, float]:
-    """Simulate a motion under a gravity [m/s2]; return its extent and the largest residual of a frame [g].
+def simulate_trial(
+    scene: Scene, fabric: Fabric, motion: Motion, world: ShotWorld | None = None, most: float = MAX_LBS_DISTANCE
+) -> tuple[Extent, float, Floats]:
+    """Simulate a motion in a world; return its extent, the largest residual of a frame [g], and points [m] (F, V, 3).
 
-    Frames whose final residual exceeds the solver's tolerance count as recovered.
+    The garment is bounded within `most` times its size. Frames whose final residual exceeds the solver's tolerance
+    count as recovered.
     """
-    options = SimulationOptions(fps=motion.fps, gravity=(0.0, -gravity, 0.0))
+    options = SimulationOptions(fps=motion.fps)
     meter = ExtentMeter(scene, fabric, motion.fps)
-    frames = list(Simulator(scene, fabric, options).frames([motion]))
-    residual = [frame.residual for frame in frames]
-    meter.add(motion, np.stack([frame.points for frame in frames]))
+    frames = list(Simulator(scene, fabric, options).frames([motion], [world]))
+    residual, points = [frame.residual for frame in frames], np.stack([frame.points for frame in frames])
+    meter.add(motion, points)
     unsolved = sum(value > options.solver.tolerance for value in residual)
-    return meter.extent(len(frames), recovered=unsolved, max_distance=MAX_ELASTIC_DISTANCE), max(residual)
+    return meter.extent(len(frames), recovered=unsolved, max_distance=most), max(residual), points
 
 
 def gradient_error(scene: Scene, fabric: Fabric, motion: Motion) -> float:

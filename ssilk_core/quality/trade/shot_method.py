@@ -23,7 +23,7 @@ from ...network.sampling import sample_pose
 from ...physics.refine import RefineOptions, Refiner
 from ...physics.simulate import Simulator
 from ...physics.simulate.characters import PosedCharacters
-from ...physics.simulate.simulator import StepHistory
+from ...physics.simulate.history import StepHistory
 from ...scene.assets import Floats, GarmentPose, Motion
 from ...scene.decomposition import Decomposition, decompose
 from ...scene.kinematics import deform, first_place, resample, sample_motion

@@ -24,9 +24,9 @@ from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.physics import loops
 from ssilk_core.physics.collision import SmoothedDistance, contacts
 from ssilk_core.physics.constants import GRAVITY
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import Motion, Scene
 from ssilk_core.scene.fabrics import Fabric
 

@@ -14,10 +14,10 @@ from ssilk_core.physics.intersections.pairs import intersections_between
 from ssilk_core.physics.self_contact import SelfContact
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, WornGarment
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.outfit import OutfitPotential
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,

@@ -15,9 +15,9 @@ from scipy.optimize import brentq
 from ssilk_core.errors import SsilkError
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, simulate
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions
-from ssilk_core.physics.simulate.simulator import StepHistory
 from ssilk_core.physics.world.air import MovingAir
 from ssilk_core.physics.world.colliders import voting_points
 from ssilk_core.physics.world.felt import felt_gravity

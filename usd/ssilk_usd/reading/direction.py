@@ -4,28 +4,52 @@ whether the shot is a cycle.
 
 All are attributes of the garment's prim, in the shot or in the character's stage: `ssilk:free`, a number that may be
 keyed, `ssilk:hold`, a whole number, and `ssilk:loop`, a bool. A shot that plays a clip alone may have an `over` at
-the garment's path.
+the garment's path. `ssilk:free:NAME` says so of a part of the garment, and `ssilk:posed:NAME` that its proxies are as
+the shot's own animation has them. NAME is a proxy, by the last part of its joint's path, or a UsdGeomSubset of the
+mesh.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import fail
 from ssilk_core.files import split_location
-from ssilk_core.scene.assets import Floats, Motion
-from ssilk_core.scene.kinematics import MAX_HOLD
+from ssilk_core.scene.assets import Floats, Ints, Motion, Scene
+from ssilk_core.scene.held_parts import hand_pose
+from ssilk_core.scene.kinematics import MAX_HOLD, local_transforms, sample_motion
 
-from ..names import FREE, HOLD, LOOP
+from ..names import FREE, HOLD, LOOP, POSED
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, location, open_stage
 from ..opening.times import change_times
 from .mesh import is_garment
-from .motion import find_animation
+from .motion import find_animation, read_motion
+from .skin import match_joints
 
 ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SaidPart:
+    """How a part of a garment is held.
+
+    Attributes:
+        where: the attribute, for messages.
+        name: of the part.
+        share: by which it is held at each frame of the motion, 0 to 1, shape (F,).
+        posed: whether to a pose by hand, in place of linear blend skinning.
+        vertices: of a subset, shape (N,); None where the part is a proxy.
+    """
+
+    where: str
+    name: str
+    share: Floats
+    posed: bool
+    vertices: Ints | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,23 +59,29 @@ class SaidDirection:
     Attributes:
         free: at each frame of the motion, 0 to 1, shape (F,); None where it is 1 throughout.
         hold: frames that each pose is held.
+        parts: those that are held by themselves.
     """
 
     free: Floats | None
     hold: int
+    parts: tuple[SaidPart, ...] = ()
 
 
 @explains_damage
-def read_direction(source: str, stage: str, garment: str, motion: Motion) -> SaidDirection:
+def read_direction(
+    source: str, stage: str, garment: str, motion: Motion, proxies: Sequence[str] = ()
+) -> SaidDirection:
     """Return how a garment is directed over a motion.
 
     Args:
         source: of the motion, "file[:/Prim/Path]".
         stage: the character's file.
         garment: path of the garment in it.
+        proxies: of the model, joint paths.
 
     Raises:
-        SsilkError: a value is no number or out of range, or several prims of the shot may be the garment.
+        SsilkError: a value is no number or out of range, several prims of the shot may be the garment, or a part is
+            neither a proxy nor a subset.
     """
     file, _ = split_location(source)
     shot, home = open_stage(file), open_stage(stage)
@@ -59,7 +89,43 @@ def read_direction(source: str, stage: str, garment: str, motion: Motion) -> Sai
     free = next((prim for prim in prims if has_value(prim, FREE)), None)
     hold = next((prim for prim in prims if has_value(prim, HOLD)), None)
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
-    return SaidDirection(_free(free, seconds) if free else None, _hold(hold) if hold else 1)
+    parts = tuple(_parts(prims, seconds, {name.rpartition("/")[2] for name in proxies}))
+    return SaidDirection(_free(free, seconds) if free else None, _hold(hold) if hold else 1, parts)
+
+
+@explains_damage
+def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, needed: Sequence[str]) -> Floats:
+    """Return where the animation of a shot has a garment's proxies, as `HeldParts.hand`; those it lacks are at rest.
+
+    Args:
+        motion: at whose frames.
+        root: the character, as for `read_motion`.
+        needed: proxies that it must have, joint paths.
+
+    Raises:
+        SsilkError: it lacks one.
+    """
+    skeleton, rig = scene.character.skeleton, scene.rig
+    file, prim = split_location(source)
+    shot = open_stage(file)  # prims live as long as it
+    animation, _ = find_animation(shot, prim, root)
+    animated = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
+    for name, found in zip(needed, match_joints(tuple(needed), animated)):
+        if found < 0:
+            what = f"{POSED} asks for proxy '{name}' as it was posed, and this animation has no such joint"
+            fail(location(animation), what, "it needs the proxies among its joints", "animate it, or say ssilk:free")
+    rest = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
+    whole = replace(
+        skeleton,
+        joint_names=(*skeleton.joint_names, *rig.joint_names),
+        parents=scene.parents,
+        bind_transforms=scene.bind_transforms,
+        rest_transforms=np.concatenate([skeleton.rest_transforms, rest]),
+    )
+    every = read_motion(source, whole, root=root)
+    at = (motion.start + np.arange(motion.frame_count)) / motion.fps * every.fps - every.start
+    poses = sample_motion(every, at.clip(0, every.frame_count - 1))
+    return hand_pose(scene, Motion(every.path, motion.fps, *poses))
 
 
 @explains_damage
@@ -98,8 +164,59 @@ def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd
     return worn or ([there] if there else [])
 
 
+def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Iterator[SaidPart]:
+    """Yield the parts that any of a garment's prims says to be held; the first that says it of a part counts."""
+    told = set[str]()
+    for prim in prims:
+        for attribute in (*prim.GetPropertiesInNamespace(FREE), *prim.GetPropertiesInNamespace(POSED)):
+            what = attribute.GetName()
+            if what in told or not has_value(prim, what):
+                continue
+            told.add(what)
+            name, posed = what.rpartition(":")[2], what.startswith(POSED)
+            values = _keyed(prim, what, seconds)
+            vertices = None if name in proxies else _subset(prims, name)
+            if name not in proxies and vertices is None:
+                known = f"its proxies are {', '.join(sorted(proxies)[:3])}, ..." if proxies else "it has no proxies"
+                found = f"{what} names neither a proxy of the model nor a subset of the garment"
+                fail(location(prim), found, f"{known}; a UsdGeomSubset may name vertices", "rename it")
+            share = values if posed else 1 - values
+            if share.any():
+                yield SaidPart(f"{location(prim)}.{what}", name, share, posed, vertices)
+
+
+def _subset(prims: Sequence[Usd.Prim], name: str) -> Ints | None:
+    """Return the vertices of a subset of a garment; None where it has none of this name."""
+    found = next((child for prim in prims if (child := UsdGeom.Subset(prim.GetChild(name)))), None)
+    if found is None:
+        return None
+    rows = np.array(found.GetIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
+    meshes = [prim for prim in prims if has_value(prim, "faceVertexIndices")]  # an over may have none
+    if not meshes:
+        fail(location(found.GetPrim()), "a subset of a mesh without faces", "a garment has some", "look at the stage")
+    mesh = UsdGeom.Mesh(meshes[0])
+    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64).reshape(-1)
+    kind, most = found.GetElementTypeAttr().Get(), int(corners.max(initial=-1)) + 1
+    if kind == UsdGeom.Tokens.face:
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get(Usd.TimeCode.EarliestTime()), dtype=np.int64)
+        chosen, most = rows, len(counts)
+        rows = corners[np.isin(np.repeat(np.arange(most), counts), rows)]
+    else:
+        chosen = rows
+    if kind not in (UsdGeom.Tokens.face, UsdGeom.Tokens.point) or not ((chosen >= 0) & (chosen < most)).all():
+        allowed = f"points or faces are allowed, of which there are {most}"
+        fail(location(found.GetPrim()), f"a subset of {kind}s {chosen[:3].tolist()}, ...", allowed, "choose it again")
+    return np.unique(rows)
+
+
 def _free(prim: Usd.Prim, seconds: Floats) -> Floats | None:
-    attribute, second = prim.GetAttribute(FREE), prim.GetStage().GetTimeCodesPerSecond()
+    values = _keyed(prim, FREE, seconds)
+    return None if (values == 1).all() else values
+
+
+def _keyed(prim: Usd.Prim, name: str, seconds: Floats) -> Floats:
+    """Return a number from 0 to 1 at each time (F,)."""
+    attribute, second = prim.GetAttribute(name), prim.GetStage().GetTimeCodesPerSecond()
     codes = seconds * second if change_times([attribute]) else seconds[:1] * second
     found = [attribute.Get(Usd.TimeCode(float(code))) for code in codes]
     try:
@@ -107,14 +224,15 @@ def _free(prim: Usd.Prim, seconds: Floats) -> Floats | None:
     except (TypeError, ValueError):
         values = np.zeros(0)
     if values.shape != codes.shape:
-        fail(location(prim), f"{FREE} is {str(found[0])[:40]}", "a number from 0 to 1 is needed")
+        fail(location(prim), f"{name} is {str(found[0])[:40]}", "a number from 0 to 1 is needed")
     bad = ~((values >= -ROUNDING) & (values <= 1 + ROUNDING))
     if bad.any():
         at = int(np.argmax(bad))
-        allowed = "0, held to linear blend skinning, to 1, free, are allowed"
-        fail(location(prim), f"{FREE} is {values[at]:g} at time code {codes[at]:g}", allowed)
-    values = np.broadcast_to(values.clip(0, 1), seconds.shape)
-    return None if (values == 1).all() else values
+        held = "held to linear blend skinning, to 1, free"
+        ends = "the network's, to 1, posed by hand" if name.startswith(POSED) else held
+        allowed = f"0, {ends}, are allowed"
+        fail(location(prim), f"{name} is {values[at]:g} at time code {codes[at]:g}", allowed)
+    return np.broadcast_to(values.clip(0, 1), seconds.shape)
 
 
 def _hold(prim: Usd.Prim) -> int:

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.files import replacing
-from ssilk_core.scene.assets import Character, Floats, Garment, Mesh, Motion, ProxyRig, ShotWorld, Skeleton
+from ssilk_core.scene.assets import Character, Floats, Garment, Ints, Mesh, Motion, ProxyRig, ShotWorld, Skeleton
 
 from ..names import FREE, GARMENT, HOLD
 from ..units import StageUnits
@@ -123,21 +123,36 @@ def write_motion(path: str | Path, motion: Motion, skeleton: Skeleton, world: Sh
         save(layer, path)
 
 
-def write_direction(path: str | Path, garment: str, free: Floats, start: float, hold: int) -> None:
+def write_direction(
+    path: str | Path,
+    garment: str,
+    free: Floats,
+    start: float,
+    hold: int,
+    parts: Mapping[str, Floats] | None = None,
+    groups: Mapping[str, Ints] | None = None,
+) -> None:
     """Add to a motion's file how a garment is directed over its frames (`reading.direction`).
 
     Args:
         garment: path of its prim.
         free: 0 where it is held to 1 where it moves freely, from the time code `start` on, shape (F,).
         hold: frames that each pose is held.
+        parts: likewise of parts, shape (F,) each, by the name of the attribute.
+        groups: vertices of those that are no proxies, shape (N,) each, by name.
     """
     stage = Usd.Stage.Open(str(path))
     prim = stage.OverridePrim(garment)
     if hold != 1:
         prim.CreateAttribute(HOLD, Sdf.ValueTypeNames.Int).Set(hold)
-    attribute = prim.CreateAttribute(FREE, Sdf.ValueTypeNames.Float)
-    for frame, value in enumerate(free.tolist()):
-        attribute.Set(value, start + frame)
+    for name, values in {FREE: free, **(parts or {})}.items():
+        attribute = prim.CreateAttribute(name, Sdf.ValueTypeNames.Float)
+        for frame, value in enumerate(values.tolist()):
+            attribute.Set(value, start + frame)
+    for name, vertices in (groups or {}).items():
+        subset = UsdGeom.Subset.Define(stage, f"{garment}/{name}")
+        subset.CreateElementTypeAttr(UsdGeom.Tokens.point)
+        subset.CreateIndicesAttr(Vt.IntArray(vertices.tolist()))
     stage.GetRootLayer().Save()
 
 

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether inputs have what requests ask of them, before anything is baked."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+
+from ...errors import SsilkError
+from ...events import Message, Reporter
+from ...network.checkpoint import load_model
+from .fabrics import in_fabric
+from .request import BakeRequest
+from .task import BakeTask
+
+
+def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
+    """Warn of fabrics that models have not, and of ranges that motions have not.
+
+    Args:
+        readable: inputs that can be read: others fail for that.
+
+    Raises:
+        SsilkError: no task is left.
+    """
+    lost: set[str] = set()
+    for asked, need in ((_fabric, _need_fabric), (_range, _need_range)):
+        groups: dict[tuple[str, ...], list[BakeTask]] = {}
+        for task in tasks:
+            if (key := asked(task.request)) and key[0] in readable:
+                groups.setdefault(key, []).append(task)
+        for alike in groups.values():
+            try:
+                need(alike[0].request)
+            except SsilkError as error:
+                lost |= {task.name for task in alike}
+                if len(lost) == len(tasks):
+                    raise
+                report(Message(str(error), "warning"))
+
+
+def _fabric(request: BakeRequest) -> tuple[str, ...]:
+    asked = [request.fabric] if request.fabric else []
+    return (request.model, *asked, *request.material) if asked or request.material else ()
+
+
+def _need_fabric(request: BakeRequest) -> None:
+    in_fabric(load_model(request.model), request.model, request.fabric, request.material)
+
+
+def _range(request: BakeRequest) -> tuple[str, ...]:
+    return (request.motion, request.root or "", request.range) if request.range else ()
+
+
+def _need_range(request: BakeRequest) -> None:
+    from ssilk_usd.reading.frame_range import read_frame_range
+
+    read_frame_range(request.motion, request.time_range, root=request.root)
