@@ -29,7 +29,7 @@ TABLES: dict[str, Callable[[], str]] = {
         results.overview, results.other_methods, results.trainings, results.own_start, results.rest,
         results.playing, results.extremes, dial.dial,
         farm.cluster, farm.fuzzed, farm.disturbed, farm.disk, farm.disk_workers, farm.large_job,
-        guides.targets, guides.growth, guides.presets, guides.drape, guides.bodies,
+        guides.targets, guides.growth, guides.presets, guides.drape, guides.bodies, guides.peers,
     )
 }  # fmt: skip
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from ssilk_core.training.settings import PRESETS
 
 from .forms import digits, fixed, percent, result, table
@@ -68,6 +70,21 @@ def drape() -> str:
                      STATED_DRAPE.get(name, "")])  # fmt: skip
     header = ("preset", "weight [g/m²]", "bending length [mm]", "drape coefficient [%]", "stated elsewhere [%]")
     return table(header, rows)
+
+
+def peers() -> str:
+    """The simulator beside the engine newton."""
+    rows = []
+    for found in result("peers").values():
+        times, terms = np.quantile(found["milliseconds"], (0.5, 0.25, 0.75)), found["terms"]
+        shares = [f"{np.mean(found[name]):.2f}, {np.max(found[name]):.1f}" for name in ("shares", "inside")]
+        energies = sum(terms.values()), terms["stretch"], terms["inertia"]
+        rows.append(
+            [found["method"], found["cloth"], *map(digits, map(float, times)), *shares, *map(digits, energies)]
+        )
+    header = ("method", "cloth through cloth", "ms a frame", "a quarter below", "above", "intersect [%]",
+              "inside the body [%]", "total [J]", "stretch [J]", "inertia [J]")  # fmt: skip
+    return table(header, rows, 2)
 
 
 def bodies() -> str:

@@ -18,7 +18,7 @@ from ..energy.collision import ContactLaw
 from .neighbours import places_among
 
 CLOSING = 0.8  # of a gap, by which it may close in one step
-SLACK = 0.2  # of what pairs begin to touch later than others: these lie near each other at rest, as along seams
+SLACK = 0.2  # of what pairs of one garment begin to touch later than others: they lie near at rest, as along seams
 SLOWED = 40  # rounds in which single vertices are slowed, since each changes how others close
 UNSLOWED = 0.99  # the share above which a vertex counts as not slowed: 0.8 + 0.01 of a gap is still a gap
 TINY = 1e-12  # [m]
@@ -67,6 +67,7 @@ class ClothContacts:
         direction: n, from the second to the first, unit vectors, shape (3, P).
         start: gap at which contact begins [m], shape (P,).
         area: on which pressure acts [m2], shape (P,).
+        slack: by which a pair may come nearer in a step, however near it is [m], shape (P,).
     """
 
     law: ContactLaw
@@ -79,6 +80,7 @@ class ClothContacts:
     direction: Tensor
     start: Tensor
     area: Tensor
+    slack: Tensor
 
     def along(self, x: Tensor) -> Tensor:
         """Return vectors (V, 3, N) along each direction, shape (4, P)."""
@@ -124,7 +126,7 @@ class ClothContacts:
         along = self.along(step)
         first = along.masked_fill(self.second, torch.inf).amin(0)
         closing = along.masked_fill(~self.second, -torch.inf).amax(0) - first
-        share = (self._most(x, yielding) / closing.clamp_min(TINY)).clamp_max(1).expand(4, -1)
+        share = (self._most(x, yielding).clamp_min(TINY) / closing.clamp_min(TINY)).clamp_max(1).expand(4, -1)
         found = torch.ones_like(step[:, 0]).flatten()
         at = self.vertices * self.frames + self.frame
         return found.scatter_reduce_(0, at.flatten(), share.flatten(), "amin").view_as(step[:, 0])
@@ -158,8 +160,7 @@ class ClothContacts:
 
     def _most(self, x: Tensor, yielding: float) -> Tensor:
         """Return by how much each pair may come nearer in a step [m], shape (P,)."""
-        near = SLACK * (self.law.start - self.start)
-        return torch.maximum(CLOSING * self.gap(x), near.clamp_min(yielding))
+        return torch.maximum(CLOSING * self.gap(x), self.slack.clamp_min(yielding))
 
     def select(self, frames: Tensor) -> ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""
@@ -170,7 +171,7 @@ class ClothContacts:
     def concatenated(cls, parts: Sequence[ClothContacts]) -> ClothContacts:
         """Return the contacts in the frames of several, one after the other."""
         before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
-        rows = "vertices", "coefficients", "second", "direction", "start", "area"
+        rows = "vertices", "coefficients", "second", "direction", "start", "area", "slack"
         known = torch.cat([part.known for part in parts])
         frame = torch.cat([part.frame + first for part, first in zip(parts, before)])
         own = (torch.cat([getattr(part, name) for part in parts], dim=-1) for name in rows)
@@ -181,8 +182,8 @@ class ClothContacts:
         return self._kept(self.gap(x) < self.start, self.frame, self.frames)
 
     def _kept(self, kept: Tensor, frame: Tensor, frames: int) -> ClothContacts:
-        rows = (frame, self.vertices, self.coefficients, self.second, self.direction, self.start, self.area)
-        return ClothContacts(self.law, frames, self.known, *(part[..., kept] for part in rows))
+        own = self.vertices, self.coefficients, self.second, self.direction, self.start, self.area, self.slack
+        return ClothContacts(self.law, frames, self.known, *(part[..., kept] for part in (frame, *own)))
 
     def _relative(self, x: Tensor) -> Tensor:
         """Return the gaps as the law counts them."""

@@ -26,7 +26,7 @@ from ...errors import fail
 from ...scene.mesh import topology
 from ..energy.collision import ContactLaw
 from .cloth import TouchingCloth
-from .contacts import ClothContacts
+from .contacts import SLACK, ClothContacts
 from .neighbours import near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
 
@@ -293,8 +293,19 @@ class SelfContact:
         parts = self._faces.contacts(faces, known.faces), self._edges.contacts(edges, known.edges)
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
+        slack = self._slack(joined[1], joined[5])
         unknown = self.reach - 2 * _drift(x, known)
-        return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in joined))
+        return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in [*joined, slack]))
+
+    def _slack(self, vertices: Tensor, start: Tensor) -> Tensor:
+        """Return by which pairs that begin to touch later may come nearer, however near they are [m], shape (P,).
+
+        Between garments there is none: tight cloth that lies on other cloth would be led through it in many steps.
+        """
+        slack = SLACK * (self.law.start - start)
+        if self._garment is None:
+            return slack
+        return slack.masked_fill(self._garment[vertices[0]] != self._garment[vertices[-1]], 0.0)
 
     def _sided(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
         """Return the pairs of a kind that `neighbours` tells of."""

@@ -335,6 +335,21 @@ def test_tight_cloth_stays_over_other_cloth_that_its_tether_pulls_it_through(sce
     assert 0 < gap[inner].min() < 0.004
 
 
+def test_cloth_that_lies_close_on_other_cloth_is_not_led_through_it(scene, toy_grid):
+    points, faces = lying(toy_grid, 0.0, 0.2, 6)
+    count, close = len(points), points + [0.003, 0.0045, 0.002]
+    far = np.concatenate([close, close + [1.0, 0, 0]])  # the second half has a long way to go, in many rounds
+    over = wearing(scene, far, np.concatenate([faces, faces + count]), TIGHT, "/over")
+    potential = outfit([WornGarment(wearing(scene, points, faces, PINNED, "/in"), LIGHT), WornGarment(over, LIGHT)])
+    x = torch.as_tensor(np.concatenate([points, far]))[:, :, None]
+    target = x.clone()
+    target[count:, 1] -= 0.02
+    target[2 * count :, 1] += 0.5
+    came, _ = potential.approach(x, target, StepInputs(None, torch.zeros(3, 1, dtype=torch.float64)), None)
+    assert float((came - x)[2 * count :, 1].min()) > 0.05
+    assert float((came[count : 2 * count, 1] - came[:count, 1]).min()) > 0
+
+
 def test_a_garment_starts_where_it_was_settled_off_another(scene, toy_motion, toy_grid):
     inner, outer, motion = swept(scene, toy_motion, toy_grid)
     beside = outer.garment.mesh.points  # where it was made is on the other side of the inner one, and across it

@@ -272,7 +272,8 @@ def random_contacts(vertices: int, count: int, frames_of: int) -> ClothContacts:
     second = torch.tensor([[False], [True], [True], [True]]).expand(4, count)
     start, area = torch.full((count,), 5.0, dtype=torch.float64), 1e-4 * random(count, seed=5)
     known = torch.full((frames_of,), 0.01, dtype=torch.float64)
-    return ClothContacts(law, frames_of, known, frame, corners, coefficients, second, direction, start, area)
+    rows = frame, corners, coefficients, second, direction, start, area, torch.zeros_like(start)
+    return ClothContacts(law, frames_of, known, *rows)
 
 
 @pytest.mark.parametrize("frames_of", [1, 3])
