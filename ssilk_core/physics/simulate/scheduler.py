@@ -39,9 +39,11 @@ class Asked:
     @property
     def kind(self) -> Hashable:
         """What all steps that are solved together have in common: their length, and what is known of them."""
-        known = (tuple(name for name, value in vars(each).items() if value is None) for each in (self.past, self.poses))
+        past, poses = (
+            tuple(name for name, value in vars(each).items() if value is None) for each in (self.past, self.poses)
+        )
         world = self.poses.world
-        return self.dt, *known, world is not None and world.has_colliders
+        return self.dt, past, poses, world is not None and world.has_colliders
 
 
 Course = Generator[Asked, Solution, T]
