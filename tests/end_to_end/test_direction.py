@@ -271,6 +271,11 @@ def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):
     local, _ = poses_of("posed.usdc")
     wanted = np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatf(0.8, 0.6, 0, 0)), Gf.Vec3d(0.1, -0.2, 0.3))).reshape(-1)
     np.testing.assert_allclose(local[10:15, :16], np.tile(wanted, (5, 1)), atol=1e-5)  # it hangs from a joint
+    hold_parts("clip.usda", {f"ssilk:posed:{leaf}": {10: 0.4, 14: 0.4}})  # less than half
+    rollout = load_rollout(BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="clip.usda"))
+    np.testing.assert_allclose(
+        rollout.direction.parts.hand[:, 0], np.tile(wanted.reshape(4, 4).T, (FRAMES, 1, 1)), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
