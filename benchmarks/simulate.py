@@ -12,7 +12,7 @@ with the nearest body points of the final states.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,7 @@ class Watched(Simulator):
             self.problems.append((found.state.x[..., row], found.inputs.select(row)))
         return found
 
-    def carry_on(self, past: Sequence[StepHistory], steps: Sequence[range], poses_at: PosesAt) -> Iterator[Stepped]:
+    def carry_on(self, past: Iterable[StepHistory], steps: Sequence[range], poses_at: PosesAt) -> Iterator[Stepped]:
         """Take the steps of shots; what is at rest before is not timed."""
         device = self.poser.rest.device
         begun = now(device)

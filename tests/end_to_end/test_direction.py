@@ -271,12 +271,18 @@ def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):
     local, _ = poses_of("posed.usdc")
     wanted = np.array(Gf.Matrix4d(Gf.Rotation(Gf.Quatf(0.8, 0.6, 0, 0)), Gf.Vec3d(0.1, -0.2, 0.3))).reshape(-1)
     np.testing.assert_allclose(local[10:15, :16], np.tile(wanted, (5, 1)), atol=1e-5)  # it hangs from a joint
+    hold_parts("clip.usda", {f"ssilk:posed:{leaf}": {10: 0.4, 14: 0.4}})  # less than half
+    rollout = load_rollout(BakeRequest(model="lively.safetensors", stage="rigged.usda", motion="clip.usda"))
+    np.testing.assert_allclose(
+        rollout.direction.parts.hand[:, 0], np.tile(wanted.reshape(4, 4).T, (FRAMES, 1, 1)), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
     ("values", "more", "complaint"),
     [
         ({"ssilk:free:Sleeve": {0: 0.0}}, [], "ssilk:free:Sleeve names neither a proxy of the model nor a subset"),
+        ({"ssilk:free:a:LEAF": {0: 0.0}}, [], "LEAF names neither a proxy of the model nor a subset"),
         ({"ssilk:posed:LEAF": {0: 1.5}}, [], "is 1.5 at time code 0; 0, the network's, to 1, posed by hand"),
         ({"ssilk:posed:LEAF": {0: 1.0}}, [], "and this animation has no such joint"),
         ({"ssilk:free:LEAF": {0: 0.0}}, ["--start-cloth", "shot.usda@0"], "a start and proxies that are held"),
@@ -286,7 +292,7 @@ def test_parts_that_cannot_be_held_are_refused_in_one_sentence(stage, capsys, va
     leaf = proxies_of("rigged.usda")[0].rpartition("/")[2]
     hold_parts("clip.usda", {name.replace("LEAF", leaf): keys for name, keys in values.items()})
     assert main([*BAKE, "clip.usda", "-o", "refused.usdc", *more]) == 2
-    assert complaint in capsys.readouterr().err
+    assert complaint.replace("LEAF", leaf) in capsys.readouterr().err
 
 
 def test_a_layer_on_the_garment_of_the_shot_comes_before_its_own_stage(stage):

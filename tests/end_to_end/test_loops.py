@@ -17,6 +17,7 @@ from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRequest, bake, verify
 from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.looped import seam_words
+from ssilk_core.delivery.bake.refinement import refined
 
 from .test_direction import direct, hold_parts, lively, points_of, proxies_of
 
@@ -206,6 +207,17 @@ def test_python_gets_the_figures(stage):
     found = bake(request, "loop.usdc").loop
     assert found is not None and found.repeats and found.seam_mm < 0.01 < found.seam_at_rest_mm
     assert found.travel_m == pytest.approx(0.5, abs=0.1) and found.closed
+
+
+@pytest.mark.parametrize("output", ["joints", "points"])
+def test_a_refined_round_is_told_by_its_own_frames_and_the_network_s_rounds(stage, output):
+    hold_parts("cycle.usda", {f"ssilk:free:{proxies_of('rigged.usda')[0].rpartition('/')[2]}": {0: 0.5}})
+    base = {"model": "lively.safetensors", "stage": "rigged.usda", "motion": "cycle.usda", "loop": True}
+    plain = load_rollout(BakeRequest(**base)).loop_summary
+    found = refined(load_rollout(BakeRequest(**base, refine=1, refined_output=output))).loop_summary
+    for name in ("seam_at_rest_mm", "jump_at_rest", "blended_mm"):  # of the network
+        assert getattr(found, name) == pytest.approx(getattr(plain, name), rel=1e-6)
+    assert found.jump > 1.2 * plain.jump
 
 
 def test_without_a_loop_a_shot_says_nothing_of_it(stage):

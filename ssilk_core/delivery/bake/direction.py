@@ -121,7 +121,7 @@ def held_parts(
         needed += [name for name, most in zip(names, share.max(axis=0)) if posed and most > MOSTLY]
         shares.append(share)
     hand = np.tile(np.eye(4), (*shares[1].shape, 1, 1))
-    if needed:
+    if shares[1].any():
         hand = read_hand_pose(request.motion, scene, motion, request.root, needed)
     return HeldParts(shares[0], shares[1], hand)
 

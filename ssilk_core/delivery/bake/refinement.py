@@ -62,7 +62,7 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
         means.changes += [frame.change] if frame.change else []
     if rollout.request.writes_points:
         found = _summary(rollout.request.refine, means.figures(), None)
-        return replace(rollout, refinement=Refinement(tuple(points), (), found))
+        return replace(rollout, refinement=Refinement(tuple(points), (), found, rollout.deformer))
     try:
         shot = _decomposed(rollout, points, add_shapes)
     except SsilkError as error:  # what the solver made is kept
@@ -71,12 +71,11 @@ def refined(rollout: BakeRollout, report: Reporter = silent, *, add_shapes: bool
             fail("--certify", misfit, "what a certificate moves is put on these", "leave --certify out")
         report(Message(f"{error} They are written as points.", "warning"))
         as_points = replace(rollout, request=replace(rollout.request, refined_output="points"))
-        return replace(
-            as_points,
-            refinement=Refinement(tuple(points), (), _summary(rollout.request.refine, means.figures(), None)),
-        )
+        found = _summary(rollout.request.refine, means.figures(), None)
+        return replace(as_points, refinement=Refinement(tuple(points), (), found, rollout.deformer))
     found = _summary(rollout.request.refine, means.figures(), ShotShapes.of(shot))
-    return replace(rollout, deformer=shot.deformer, refinement=Refinement(tuple(points), shot.poses, found))
+    refinement = Refinement(tuple(points), shot.poses, found, rollout.deformer)
+    return replace(rollout, deformer=shot.deformer, refinement=refinement)
 
 
 def refined_points(rollout: BakeRollout, report: Reporter = silent) -> Iterator[Floats]:

@@ -57,11 +57,13 @@ class Refinement:
         points: garment vertices of each frame in the world [m], shape (V, 3).
         poses: poses fitted to them with the rollout's deformer, where joints are written.
         summary: what the solver changed.
+        before: the garment that the network's poses are of.
     """
 
     points: tuple[Floats, ...]
     poses: tuple[GarmentPose, ...]
     summary: RefinementSummary
+    before: Deformer
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,7 +262,7 @@ class BakeRollout:
         found, count = self._looped, self.motion.frame_count
         rest = np.concatenate([self._network_decoded(found.first.part(slice(0, 3))),
                                self._network_decoded(found.first.part(slice(count - 2, count)))])  # fmt: skip
-        return summary(found, self.loop, self.vertices(), list(rest), self.motion.fps)
+        return summary(found, self.loop, self.points(), list(rest), self.motion.fps)
 
     def _rolled(
         self, first: int, stop: int, step: int, roller: LatentRoller | None, lost: list[FrameSpan], start: int
@@ -337,7 +339,12 @@ class BakeRollout:
         """The garment with the blendshapes of the network alone."""
         assert self.model is not None
         count = self.model.decoder.shape_count + int(self.model.decoder.has_constant)
-        return replace(self.deformer, shapes=self.deformer.shapes[:count])
+        return replace(self._unrefined, shapes=self._unrefined.shapes[:count])
+
+    @property
+    def _unrefined(self) -> Deformer:
+        """The garment that the network's poses are of, where refined frames have blendshapes of their own."""
+        return self.deformer if self.refinement is None else self.refinement.before
 
     def _faded(self, pose: GarmentPose) -> GarmentPose:
         """Return poses with the weight of what the first frame lacks: none where skinning holds the garment."""
@@ -472,8 +479,8 @@ class BakeRollout:
         if self.model is None:
             return deform(self.deformer, self.motion, pose)
         if self.direction is not None and self.direction.shapes is not None:  # which the network does not know
-            shapes = self.deformer.shapes[: pose.weights.shape[1]]  # a certificate may add some
-            return deform(replace(self.deformer, shapes=shapes), self.motion, pose)
+            shapes = self._unrefined.shapes[: pose.weights.shape[1]]  # a certificate may add some
+            return deform(replace(self._unrefined, shapes=shapes), self.motion, pose)
         from ...network.rollout import decode
 
         return decode(self.model, self.motion, pose)

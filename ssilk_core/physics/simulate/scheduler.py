@@ -39,9 +39,11 @@ class Asked:
     @property
     def kind(self) -> Hashable:
         """What all steps that are solved together have in common: their length, and what is known of them."""
-        past, world = self.past, self.poses.world
-        known = past.before is None, past.friction is None, past.pierced is None
-        return self.dt, *known, world is not None and world.has_colliders
+        past, poses = (
+            tuple(name for name, value in vars(each).items() if value is None) for each in (self.past, self.poses)
+        )
+        world = self.poses.world
+        return self.dt, past, poses, world is not None and world.has_colliders
 
 
 Course = Generator[Asked, Solution, T]

@@ -16,7 +16,7 @@ is split once more.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
@@ -238,7 +238,7 @@ class Simulator:
 
     def carry_on(
         self,
-        past: Sequence[StepHistory],
+        past: Iterable[StepHistory],
         steps: Sequence[range],
         poses_at: PosesAt,
     ) -> Iterator[Stepped]:
@@ -246,25 +246,27 @@ class Simulator:
         soon as they are solved. `SimulationOptions.batch` shots are under way at once.
 
         Args:
-            past: of each shot alone.
+            past: of each shot alone, which is taken when the shot begins.
             steps: the numbers of the steps that each takes.
         """
         scheduler: Scheduler[tuple[StepHistory, Solution]] = Scheduler()
-        left, later = [iter(each) for each in steps], list(enumerate(past))[::-1]
+        left, later = [iter(each) for each in steps], enumerate(past)
         ready: list[tuple[int, StepHistory]] = []
         taken: dict[int, tuple[int, StepHistory]] = {}
-        while ready or later or len(scheduler):
+        while True:
             begun = [(shot, step, last) for shot, last in ready if (step := next(left[shot], None)) is not None]
-            while later and len(begun) + len(scheduler) < self.options.batch:
-                shot, last = later.pop()
+            while len(begun) + len(scheduler) < self.options.batch and (new := next(later, None)):
+                shot, last = new
                 begun += [(shot, step, last) for step in islice(left[shot], 1)]
+            if not begun and not len(scheduler):
+                return
             poses = poses_at([(shot, step) for shot, step, _ in begun]).split() if begun else []
             for (shot, step, last), at in zip(begun, poses):
                 taken[shot] = step, last
                 scheduler.begin(shot, self._stepped(last, at))
             ready = []
             for shot, (state, solution) in scheduler.run():
-                step, last = taken[shot]
+                step, last = taken.pop(shot)
                 yield Stepped(shot, step, last, state, solution)
                 ready.append((shot, state))
 

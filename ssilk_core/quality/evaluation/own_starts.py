@@ -137,6 +137,8 @@ def departures(
             [mean_square(part, mass.double())[0] for part in missed]
         ).cpu()
         steps[each.shot], last[each.shot] = each.step - STATES + 1, each.state
+        if steps[each.shot] == counts[each.shot]:
+            del last[each.shot]
         advanced(1)
         if kept.due:
             keep()
@@ -158,13 +160,13 @@ def _simulated(
         taken: how many steps of each window are not taken again.
         last: the state after these, where there are any and more are to come.
     """
-    own = history(simulator, [(window, STATES) for window in windows]).split()
     ahead = [range(STATES + count, len(window.x)) for count, window in zip(taken, windows)]
 
     def poses_at(places: Sequence[tuple[int, int]]) -> PosedCharacters:
         return poses_of(simulator, [(windows[number], frame) for number, frame in places])
 
-    return simulator.carry_on([last.get(number, state) for number, state in enumerate(own)], ahead, poses_at)
+    own = (last.get(number) or history(simulator, [(window, STATES)]) for number, window in enumerate(windows))
+    return simulator.carry_on(own, ahead, poses_at)
 
 
 @torch.no_grad()

@@ -120,6 +120,8 @@ def roll_out_wind(wind: Wind, gusts: float = 0.0) -> Measure:
     def measure(subject: StressSubject) -> CaseMeasurement:
         drive = surrounded(subject, subject.base, windy(subject.base.motion(), wind, gusts))
         loose = subject.scene.classes == LOOSE
+        if not loose.any():
+            raise DoesNotApply("no cloth is loose")
         moved = positions(subject.model, drive)[:, loose] - subject.free[:, loose]
         along = float((moved @ WINDWARD).mean())
         if not along > 0:

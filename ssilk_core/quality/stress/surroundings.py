@@ -116,6 +116,8 @@ def appearing(scene: Scene, motion: Motion, cloth: Floats) -> Prop:
     of each `PERIOD`; it goes along with the body, and is gone in one frame."""
     times, every = _course(motion)
     rows, points = np.flatnonzero(scene.classes == LOOSE), scene.garment.mesh.points
+    if not len(rows):
+        raise DoesNotApply("no cloth is loose")
     lowest = cloth[:, rows[points[rows, 1].argsort()[: max(1, len(rows) // 10)]]].mean(axis=1)
     quarter, then = times % every // (every / 4), times // every * every + every / 4
     began = np.searchsorted(times, then).clip(max=len(times) - 1)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Progress
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, quasi_static_states, shots_of, simulate
-from ssilk_core.physics.simulate.characters import split_into_spans
+from ssilk_core.physics.simulate.characters import PosedCharacters, split_into_spans
 from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
@@ -403,6 +403,33 @@ def test_a_shot_that_needs_shorter_steps_leaves_the_others_as_they_are(toy_grid,
     np.testing.assert_allclose([together[1, number] for number in range(4)], alone, atol=2e-5)
     order = list(together)
     assert order.index((1, 2)) < order.index((0, 2))  # which took an arm through the cloth
+
+
+def test_shots_of_which_less_is_known_go_on_beside_others(scene, toy_motion) -> None:
+    """The third shot, whose body does not change its shape, begins while the second one's does."""
+    motion = toy_motion(scene, 3)
+    simulator = Simulator(scene, Fabric("plain"), SimulationOptions(batch=2))
+    poses = [simulator.poser.poses_at([(motion, frame)]) for frame in range(3)]
+    x = poses[0].lbs.double() + poses[0].root
+    plain = StepHistory(x, x, poses[0].root, poses[0].lbs)
+    moved = replace(plain, moves=torch.zeros(len(poses[0].body.points), 3, 1))
+    begun: list[int] = []
+
+    def past():
+        for number, each in enumerate((plain, moved, plain)):
+            begun.append(number)
+            yield each
+
+    def poses_at(places):
+        return PosedCharacters.concatenated([poses[frame] for _, frame in places])
+
+    found: dict[tuple[int, int], torch.Tensor] = {}
+    for each in simulator.carry_on(past(), [range(1, 2), range(1, 3), range(1, 2)], poses_at):
+        assert each.shot in begun and (each.shot < 2 or (0, 1) in found)
+        found[each.shot, each.step] = each.state.last
+    assert set(found) == {(0, 1), (1, 1), (1, 2), (2, 1)}
+    for shot in (1, 2):
+        torch.testing.assert_close(found[shot, 1], found[0, 1], rtol=0, atol=2e-5)
 
 
 def test_single_precision_stays_close(scene, toy_motion) -> None:

@@ -173,7 +173,7 @@ def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Ite
             if what in told or not has_value(prim, what):
                 continue
             told.add(what)
-            name, posed = what.rpartition(":")[2], what.startswith(POSED)
+            name, posed = what.split(":", 2)[2], what.startswith(POSED)
             values = _keyed(prim, what, seconds)
             vertices = None if name in proxies else _subset(prims, name)
             if name not in proxies and vertices is None:
