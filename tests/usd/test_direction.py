@@ -145,6 +145,7 @@ def test_two_garments_that_may_be_meant_are_refused(shot, home):
         ("ssilk:free", Sdf.ValueTypeNames.Float, -0.5, "ssilk:free is -0.5 at time code 20"),
         ("ssilk:hold", Sdf.ValueTypeNames.Float, 2.5, "ssilk:hold is 2.5; a whole number of frames"),
         ("ssilk:hold", Sdf.ValueTypeNames.Bool, True, "ssilk:hold is True; a whole number of frames"),
+        ("ssilk:fre:left", Sdf.ValueTypeNames.Float, 0.0, "an attribute ssilk:fre:left; .*did you mean 'ssilk:free'"),
     ],
 )
 def test_what_is_no_direction_is_refused(shot, home, name, kind, value, complaint):

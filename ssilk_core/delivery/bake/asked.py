@@ -17,23 +17,24 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     """Warn of fabrics that models have not, and of ranges that motions have not.
 
     Args:
-        readable: inputs that can be read: others fail for that.
+        readable: inputs that can be read: tasks with others fail for that.
 
     Raises:
         SsilkError: no task is left.
     """
-    lost: set[str] = set()
+    lost = {task.name for task in tasks if any(path not in readable for path in task.request.inputs.values())}
+    tasks, count = [task for task in tasks if task.name not in lost], len(tasks)
     for asked, need in ((_fabric, _need_fabric), (_range, _need_range)):
         groups: dict[tuple[str, ...], list[BakeTask]] = {}
         for task in tasks:
-            if (key := asked(task.request)) and key[0] in readable:
+            if key := asked(task.request):
                 groups.setdefault(key, []).append(task)
         for alike in groups.values():
             try:
                 need(alike[0].request)
             except SsilkError as error:
                 lost |= {task.name for task in alike}
-                if len(lost) == len(tasks):
+                if len(lost) == count:
                     raise
                 report(Message(str(error), "warning"))
 

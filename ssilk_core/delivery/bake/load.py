@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from ...network.model.network import GarmentModel
 
 VERSION_DIGITS = 12  # of a model's hash, which are its garment's version where none is given
+HAND_TOLERANCE = 1e-3  # [m], and of axes, by which a pose by hand may end elsewhere than it begins in a loop
 FREE_TOLERANCE = 0.01  # of ssilk:free, by which its first and last frame may differ in a loop
 LEAD = 1.0  # [s] of a motion before its shot that are rolled out, so that the garment is on its way when it begins
 
@@ -293,6 +294,10 @@ class LoadedGarment:
         keyed = [("ssilk:free", free[:, None])]
         if parts is not None:
             keyed += [("ssilk:free of a part", 1 - parts.skinned), ("ssilk:posed of a part", parts.posed)]
+            by_hand = parts.hand[:, parts.posed[0] > 0]
+            if loop.cycle.closed and np.abs(by_hand[-1] - by_hand[0]).max(initial=0) > HAND_TOLERANCE:
+                found = "a proxy that is posed by hand ends elsewhere than it begins"
+                fail(request.motion, found, "a loop ends as it begins", "pose it so, or key ssilk:posed as 0 there")
         for name, values in keyed if loop.cycle.closed else ():
             if (off := np.abs(values[-1] - values[0])).max(initial=0) > FREE_TOLERANCE:
                 first, last = (values[row, int(off.argmax())] for row in (0, -1))

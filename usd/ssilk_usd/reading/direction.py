@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
@@ -86,6 +87,8 @@ def read_direction(
     file, _ = split_location(source)
     shot, home = open_stage(file), open_stage(stage)
     prims = _prims(shot, home, source, garment, motion)
+    for prim in prims:
+        _refuse_misspelt(prim)
     free = next((prim for prim in prims if has_value(prim, FREE)), None)
     hold = next((prim for prim in prims if has_value(prim, HOLD)), None)
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
@@ -162,6 +165,17 @@ def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd
         fail(str(shot.GetRootLayer().identifier), what, "one is needed", "rename or deactivate the others")
     there = shot.GetPrimAtPath(garment)
     return worn or ([there] if there else [])
+
+
+def _refuse_misspelt(prim: Usd.Prim) -> None:
+    """Refuse attributes whose names are nearly those that direct a garment: they would direct nothing."""
+    known = FREE, HOLD, LOOP, POSED
+    for attribute in prim.GetPropertiesInNamespace("ssilk"):
+        name = attribute.GetName()
+        base = ":".join(name.split(":", 2)[:2])
+        if base not in known and (near := get_close_matches(base, known, n=1, cutoff=0.88)):
+            allowed = f"{', '.join(known)} direct a garment"
+            fail(location(prim), f"an attribute {name}", allowed, f"did you mean '{near[0]}'?")
 
 
 def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Iterator[SaidPart]:
