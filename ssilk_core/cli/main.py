@@ -33,7 +33,7 @@ VERBS = {
     "skin": "Turn a point cache into joints and blendshapes on the character's skeleton, and verify them.",
     "evaluate": "Measure trained garments on whole clips: energies, against the simulator, and what energies hide.",
     "trade": "Measure what speed and size cost in accuracy, for all that can be changed without training again.",
-    "stress": "Test a trained garment under extreme motions, rates, winds, props, sizes, fabrics, meshes and precisions.",
+    "stress": "Test a trained garment under extremes of motion, wind, props, size, fabric, mesh and precision.",
     "report": "Write a page (.html) about a shot or a model: energies over time, worst frames, tables, provenance.",
     "verify": "Check a shot, and compare it, re-skinned by UsdSkel alone, with the decoder's vertices or its cache.",
     "view": "Film a shot (.mp4), lay out its moments on a sheet (.png), or write a page that plays it (.html).",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Test a trained garment under extreme motions, rates, winds, props, sizes, fabrics, meshes and precisions.
+"""Test a trained garment under extremes of motion, wind, props, size, fabric, mesh and precision.
 
 A table says for each case whether all values stay bounded, how far vertices go, how the energy grows, how large the
 error is, and what happens: it works, falls back to rest, is refused with a sentence, or does not apply to this model.
