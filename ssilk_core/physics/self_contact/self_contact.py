@@ -130,10 +130,6 @@ class ClothNeighbours:
         own = kept.nonzero()[:, 0]
         return ClothNeighbours.joined([(own, self.select(own)), (frames, other)]) if len(own) else other
 
-    def first(self, frames: int) -> ClothNeighbours:
-        """Return those of the first frames."""
-        return self.select(torch.arange(frames, device=self.at.device))
-
 
 @dataclass(frozen=True, eq=False)
 class PairKind:
