@@ -20,7 +20,7 @@ class Framed:
 
     SHARED: ClassVar[frozenset[str]] = frozenset()
 
-    def _own(self) -> dict[str, Any]:
+    def own(self) -> dict[str, Any]:
         """Return the fields that each frame has a value of."""
         return {
             each.name: getattr(self, each.name)
@@ -30,7 +30,7 @@ class Framed:
 
     def select(self, frames: Tensor) -> Self:
         """Return the frames with indices (M,), in ascending order."""
-        chosen = {name: _selected(value, frames) for name, value in self._own().items()}
+        chosen = {name: _selected(value, frames) for name, value in self.own().items()}
         return replace(self, **chosen)  # type: ignore[type-var]
 
     def first(self, count: int) -> Self:
@@ -44,7 +44,7 @@ class Framed:
 
     @property
     def _first_tensor(self) -> Tensor:
-        return next(value for value in self._own().values() if isinstance(value, Tensor))
+        return next(value for value in self.own().values() if isinstance(value, Tensor))
 
     @property
     def _device(self) -> torch.device:
@@ -55,7 +55,7 @@ class Framed:
         """Return the frames of several, one after the other; what is None is so in all."""
         if len(parts) == 1:
             return parts[0]
-        own = [part._own() for part in parts]
+        own = [part.own() for part in parts]
         values = {name: _concatenated([each[name] for each in own]) for name in own[0]}
         return replace(parts[0], **values)  # type: ignore[type-var]
 

@@ -37,6 +37,7 @@ from ..self_contact import ClothContacts, ClothNeighbours, SelfContact, Touching
 from ..self_contact.contacts import Slopes
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
+from .captured_potential import CapturedPotential
 from .contact_stiffness import ContactStiffness
 from .friction import CREEP, Friction
 from .hessian import NO_CORNERS, Hessian
@@ -80,6 +81,12 @@ class StepInputs(Framed):
     pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether all of it is tensors of fixed sizes: the cloth of one garment meets its body, and nothing rubs."""
+        changing = self.neighbours, self.contacts, self.friction, self.world
+        return all(each is None for each in changing) and not isinstance(self.pierced, PiercedOutfit)
+
 
 class IncrementalPotential:
     """The incremental potential of one garment; positions are (V, 3, N).
@@ -118,7 +125,8 @@ class IncrementalPotential:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
-        self.__dict__.pop("_elastic_tables", None)
+        for name in ("_elastic_tables", "captured"):
+            self.__dict__.pop(name, None)
 
     @property
     def garments(self) -> list[tuple[slice, Fabric]]:
@@ -129,6 +137,11 @@ class IncrementalPotential:
     def self_contact(self) -> SelfContact:
         """What knows where the garment touches itself; nothing is spent on it where nobody asks."""
         return self._self_contact()
+
+    @cached_property
+    def captured(self) -> CapturedPotential:
+        """What a GPU computes of it at once."""
+        return CapturedPotential(self)
 
     @property
     def block_pattern(self) -> BlockPattern:
