@@ -12,7 +12,8 @@ from torch import Tensor
 
 
 class Framed:
-    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, or None.
+    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, None, or
+    numbers that all frames share.
 
     Attributes:
         SHARED: names of fields that all frames share.
@@ -60,13 +61,17 @@ class Framed:
         return replace(parts[0], **values)  # type: ignore[type-var]
 
 
-def _selected(value: Tensor | Framed | None, frames: Tensor) -> Tensor | Framed | None:
+def _selected(value: Any, frames: Tensor) -> Any:
     if isinstance(value, Tensor):
         return value[..., frames]
-    return None if value is None else value.select(frames)
+    return value if _is_shared(value) else value.select(frames)
 
 
-def _concatenated(values: list[Any]) -> Tensor | Framed | None:
+def _concatenated(values: list[Any]) -> Any:
     if isinstance(values[0], Tensor):
         return torch.cat(values, dim=-1)
-    return None if values[0] is None else type(values[0]).concatenated(values)
+    return values[0] if _is_shared(values[0]) else type(values[0]).concatenated(values)
+
+
+def _is_shared(value: Any) -> bool:
+    return value is None or isinstance(value, (int, float))
