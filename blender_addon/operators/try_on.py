@@ -10,9 +10,8 @@ import numpy as np
 from bpy.props import IntProperty
 
 from ..arrays.try_on import KNOTS
-from ..errors import SetupError
 from ..outside.work import Work
-from ..preferences import interpreter, preferences, unready
+from ..preferences import interpreter, preferences
 from ..quality import tried_on
 from ..scene.garment import armature_of, unusable, unusable_here
 from ..scene.gather import gather
@@ -20,7 +19,6 @@ from ..scene.handover import hand_over, loading_usd
 from ..scene.objects import Pair
 from ..scene.other_bodies import points_of_stage, points_with_keys
 from ..settings.try_on import KEYS
-from . import tasks
 from .reporting import RefusingOperator, ReportingOperator
 from .rig import RigOperator
 
@@ -39,7 +37,7 @@ class TryOn(RigOperator, bpy.types.Operator):
         garment, settings = context.object, context.object.ssilk.try_on
         armature, python = armature_of(garment), interpreter(preferences(context))
         self.gathered, pair, path = gather(garment), Pair.of(garment, armature), settings.stage
-        self.ends: list[np.ndarray] = []
+        self.mark, self.ends = tried_on.mark_of(garment), list[np.ndarray]()
         self.body = f"'{Path(path).name}'"
         if settings.body == KEYS:
             values = {item.key: item.value for item in settings.keys if item.key}
@@ -58,15 +56,9 @@ class TryOn(RigOperator, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, work: Work) -> str:
         garment, _ = self.handover.pair.objects()
-        now = gather(garment)
-        if any(
-            mesh.vertex_count != other.vertex_count
-            for mesh, other in zip(now.meshes.values(), self.gathered.meshes.values())
-        ) or list(now.meshes) != list(self.gathered.meshes):
-            raise SetupError(f"'{garment.name}' or a body of it was edited meanwhile; try it on again.")
         with np.load(work.folder / CARRIED) as made:
             cloth, proxies = made["cloth"], made["proxies"]
-        tried = tried_on.TriedOn(self.body, cloth, self.ends, proxies)
+        tried = tried_on.TriedOn(self.body, self.mark, cloth, self.ends, proxies)
         garment.ssilk.try_on.share = 1.0
         tried_on.show(garment, self.gathered, tried)
         moved = 1000 * np.linalg.norm(cloth[KNOTS.index(1.0)] - self.gathered.garment.mesh.points, axis=1)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Carry a garment onto other bodies, as `ssilk rig --onto` does. Run by the Python that has ssilk.
 
-`python try_on.py STAGE GARMENT IN.npz OUT.npz`: IN holds for each body mesh, as `points.` and the name
-of its prim, where K bodies have its points (K, S, 3), and in `told` which of the K is told of. OUT gets where the garment's vertices and its proxies lie on each,
-`cloth` (K, V, 3) and `proxies` (K, P, 3). All in metres, y up.
+`python try_on.py STAGE GARMENT IN.npz OUT.npz`: IN holds for each body mesh, as `points.` and the name of its prim,
+where K bodies have its points (K, S, 3), and in `told` which of the K is told of. OUT gets where the garment's
+vertices and its proxies lie on each, `cloth` (K, V, 3) and `proxies` (K, P, 3). All in metres, y up.
 """
 
 import sys
@@ -46,8 +46,9 @@ def put_on(stage, prim, given, made, report):
 
 if __name__ == "__main__":
     say = JsonReporter(sys.stdout)
+    stage, prim, given, made = sys.argv[1:]
     try:
-        put_on(*sys.argv[1:], say)
+        put_on(stage, prim, given, made, say)
     except SsilkError as error:
         say(Failed(str(error)))
         sys.exit(2)

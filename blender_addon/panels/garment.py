@@ -149,7 +149,7 @@ class TryOnPanel(UsableGarmentPanel, bpy.types.Panel):
     @saying_errors
     def draw(self, context: bpy.types.Context) -> None:
         layout, garment, settings = self.layout, context.object, context.object.ssilk.try_on
-        layout.row(align=True).prop(settings, "body", expand=True)
+        layout.prop(settings, "body")
         if settings.body == KEYS:
             draw_body_keys(layout, settings)
         else:

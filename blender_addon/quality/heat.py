@@ -123,8 +123,9 @@ def measuring(
     need_unmasked(bodies)
     need_enabled(bodies)
     surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies]
-    for surface in surfaces:
-        depths.append((yield from scaled(depths_in(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
+    for number, surface in enumerate(surfaces):
+        steps = depths_in(points, *surface)
+        depths.append((yield from scaled(steps, number / len(surfaces), 1 / len(surfaces))))
     return HeatMap(kind, scale * np.max(depths, axis=0))
 
 

@@ -35,6 +35,7 @@ ROLE = "ssilk_role"  # custom property of the copies
 CLOTH, BODY, PROXIES = "cloth", "body", "proxies"
 MARK = "ssilk_mark"  # custom property of the empty: of the shapes that garment and bodies had
 NAME = "ssilk_body"  # custom property of the empty: the body, in words
+LENGTH = 0.05  # [m] of the lines that show proxies
 PATIENCE = 0.15  # seconds after a change of the slider before what is inside is measured
 _told: tuple[object, str] = (None, "")  # what was measured last, and what was found
 _wanted: tuple[int, str, float] | None = None  # a garment by session_uid and name, with the share to be measured
@@ -46,12 +47,14 @@ class TriedOn:
 
     Attributes:
         body: the body at share 1, in words.
+        mark: `mark_of` the garment when this was begun.
         cloth: the garment's vertices, shape (K, V, 3).
         bodies: those of each body mesh at share 1, shape (V, 3).
         proxies: the proxies, shape (K, P, 3); none where the garment has no rig.
     """
 
     body: str
+    mark: str
     cloth: np.ndarray
     bodies: Sequence[np.ndarray]
     proxies: np.ndarray
@@ -71,27 +74,25 @@ def show(garment: bpy.types.Object, scene: GatheredScene, tried: TriedOn) -> Non
     before = find(garment)
     if before:
         stop(before)
-    armature, units = armature_of(garment), scene.units
-    things = [garment, *bodies_of(garment, armature)]
-    meshes, made, widths = list(scene.meshes.values()), [], []
-    shares = np.array(KNOTS)[:, None, None]
-    places = [tried.cloth, *(mesh.points + shares * (end - mesh.points) for mesh, end in zip(meshes[1:], tried.bodies))]
-    for thing, mesh, at, role in zip(things, meshes, places, (CLOTH, *[BODY] * len(meshes))):
+    units, shares, made, widths = scene.units, np.array(KNOTS)[:, None, None], [], []
+    bodies = zip(list(scene.meshes.values())[1:], tried.bodies)
+    places = [tried.cloth, *(mesh.points + shares * (end - mesh.points) for mesh, end in bodies)]
+    for (name, mesh), at, role in zip(scene.meshes.items(), places, (CLOTH, *[BODY] * len(scene.meshes))):
         rest = units.points_from_core(mesh.points)
-        copy = bpy.data.objects.new(f"{thing.name} on {tried.body}", _mesh_of(thing, mesh))
+        copy = bpy.data.objects.new(f"{name} on {tried.body}", _mesh_of(name, mesh))
         copy.data.vertices.foreach_set("co", rest.astype(np.float32).reshape(-1))
         _add_keys(copy, [units.points_from_core(each) for each in at])
         copy[ROLE] = role
         made.append(copy)
         widths.append((rest[:, 0].min(), rest[:, 0].max()))
-    if len(scene.joints.proxies) and tried.proxies.shape[1]:
-        made.append(_lines(garment, armature, scene, tried))
+    if scene.rig:
+        made.append(_lines(scene, tried))
     shown = show_beside(
         garment, made, OWNER, name=f"{garment.name} tried on", empty=f"{garment.name} on {tried.body}, beside",
         width=float(np.max(widths) - np.min(widths)), into=bpy.context.scene.collection,
     )  # fmt: skip
     shown.hide_render = True
-    shown[MARK], shown[NAME] = _mark(garment), tried.body
+    shown[MARK], shown[NAME] = tried.mark, tried.body
     wear(garment)
 
 
@@ -122,9 +123,22 @@ def changed(garment: bpy.types.Object) -> bool:
     """Return whether a garment that is tried on, or its bodies, have another shape than then."""
     shown = find(garment)
     try:
-        return shown is not None and shown.get(MARK) != _mark(garment)
+        return shown is not None and shown.get(MARK) != mark_of(garment)
     except SsilkError:  # it has lost its armature, or its bodies
         return True
+
+
+def mark_of(garment: bpy.types.Object) -> str:
+    """Return what differs once a garment or its bodies have another shape.
+
+    Raises:
+        SetupError: it has no armature, or no body.
+    """
+    mark = 0
+    for thing in (garment, *bodies_of(garment, armature_of(garment))):
+        for part in (rest_points(thing).tobytes(), shape_bytes(thing)):
+            mark = zlib.crc32(part, mark)
+    return f"{mark:08x}"
 
 
 def inside(garment: bpy.types.Object) -> str:
@@ -202,18 +216,19 @@ def _measure() -> float | None:
     return None
 
 
-def _mesh_of(thing: bpy.types.Object, mesh: Mesh) -> bpy.types.Mesh:
-    """Return a mesh of its own with an object's faces and look; without its look where modifiers change its faces."""
-    if len(thing.data.vertices) == mesh.vertex_count:
+def _mesh_of(name: str, mesh: Mesh) -> bpy.types.Mesh:
+    """Return a mesh with the faces and the look of an object; without its look where modifiers change its faces."""
+    thing = bpy.data.objects.get(name)
+    if thing and thing.type == "MESH" and len(thing.data.vertices) == mesh.vertex_count:
         made = own_copy(thing.data)
-        holder = bpy.data.objects.new("", made)
+        holder = bpy.data.objects.new(name, made)
         clear_shapes(holder)
         bpy.data.objects.remove(holder)
         clear_colors(made)
         if thing.matrix_world.determinant() < 0:  # mirrored, and so are its faces
             made.flip_normals()
         return made
-    made = bpy.data.meshes.new(thing.name)
+    made = bpy.data.meshes.new(name)
     corners = np.split(mesh.polygon_indices, np.cumsum(mesh.polygon_counts)[:-1])
     made.from_pydata(mesh.points.tolist(), [], [each.tolist() for each in corners])
     made.shade_smooth()
@@ -229,32 +244,16 @@ def _add_keys(copy: bpy.types.Object, places: Sequence[np.ndarray]) -> None:
         key.points.foreach_set("co", points.astype(np.float32).reshape(-1))
 
 
-def _lines(
-    garment: bpy.types.Object, armature: bpy.types.Object, scene: GatheredScene, tried: TriedOn
-) -> bpy.types.Object:
-    """Return an object with a line for each proxy, as long as its bone."""
-    names, units = scene.joints.proxies, scene.units
-    place = np.array(armature.matrix_world)
-    heads, tails = (
-        np.array([getattr(armature.data.bones[name], f"{end}_local") for name in names]) @ place[:3, :3].T
-        for end in ("head", "tail")
-    )
-    start = heads + place[:3, 3]
-    moved = [units.points_from_core(each) for each in tried.proxies]
-    mesh = bpy.data.meshes.new(f"{garment.name} proxies")
-    pairs = [(index, index + len(names)) for index in range(len(names))]
-    mesh.from_pydata(np.concatenate([start, start + tails - heads]).tolist(), pairs, [])
+def _lines(scene: GatheredScene, tried: TriedOn) -> bpy.types.Object:
+    """Return an object with a line for each proxy, along its bone's y axis as Blender draws bones."""
+    units, binds = scene.units, scene.rig.bind_transforms
+    heads, count = units.points_from_core(binds[:, :3, 3]), len(binds)
+    along = LENGTH * (units.points_from_core(binds[:, :3, 3] + binds[:, :3, 1]) - heads)
+    mesh = bpy.data.meshes.new("Proxies")
+    pairs = [(row, row + count) for row in range(count)]
+    mesh.from_pydata(np.concatenate([heads, heads + along]).tolist(), pairs, [])
     lines = bpy.data.objects.new(f"Proxies on {tried.body}", mesh)
-    _add_keys(lines, [np.concatenate([each, each + tails - heads]) for each in moved])
+    starts = [units.points_from_core(each) for each in tried.proxies]
+    _add_keys(lines, [np.concatenate([start, start + along]) for start in starts])
     lines[ROLE], lines.show_in_front = PROXIES, True
     return lines
-
-
-def _mark(garment: bpy.types.Object) -> str:
-    """Return what differs once a garment or its bodies have another shape."""
-    mark = 0
-    for thing in (garment, *bodies_of(garment, armature_of(garment))):
-        for part in (rest_points(thing).tobytes(), shape_bytes(thing)):
-            mark = zlib.crc32(part, mark)
-    return f"{mark:08x}"
-

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Copies that are shown beside a garment: an empty instances their collection, so that nothing takes them for its own.
+"""Copies that are shown beside a garment: an empty instances their collection.
 
-The view layer does not hold what is instanced: no other operator finds it.
+The view layer does not hold what is instanced, so that no other operator finds it.
 """
 
 from __future__ import annotations

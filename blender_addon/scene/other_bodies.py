@@ -55,7 +55,7 @@ def points_with_keys(
     for name in values:
         if name not in known:
             there = ", ".join(f"'{each}'" for each in known) or "none"
-            raise SetupError(f"No body of '{garment.name}' has a shape key '{name}' (there is {there}); choose another.")
+            raise SetupError(f"No body of '{garment.name}' has a shape key '{name}' (there is {there}); choose one.")
     armature, found = armature_of(garment), []
     for thing, body in zip(bodies_of(garment, armature), scene.character.bodies):
         own = thing.data.shape_keys
@@ -63,8 +63,8 @@ def points_with_keys(
         points = _points_of(thing, armature, scene.joints.character, here) if here else body.mesh.points
         if len(points) != body.mesh.vertex_count:
             raise SetupError(
-                f"'{thing.name}' has {body.mesh.vertex_count} vertices, and {len(points)} with these shape keys; apply "
-                "the modifiers that change how many it has."
+                f"'{thing.name}' has {body.mesh.vertex_count} vertices, and {len(points)} with these shape keys; "
+                "apply the modifiers that change how many it has."
             )
         found.append(points)
     if all(np.abs(points - body.mesh.points).max() < SAME for points, body in zip(found, scene.character.bodies)):
@@ -95,7 +95,7 @@ def _points_of(
 ) -> np.ndarray:
     """Return where a body has its points at rest with other values of shape keys [m], (V, 3); on a copy of it."""
     if thing.show_only_shape_key:
-        raise SetupError(f"'{thing.name}' shows one shape key alone; unpin it (Object Data > Shape Keys), then try on.")
+        raise SetupError(f"'{thing.name}' shows one shape key alone; unpin it (Object Data > Shape Keys).")
     copy = local_copy(thing)
     copy.data = own_copy(thing.data)
     try:

@@ -90,7 +90,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     played: PointerProperty(
         type=PlayedFabric, name="Played Fabric", description="What the garment is played and baked as", override=SHOTS
     )
-    try_on: PointerProperty(type=TryOnSettings, name="Try On", description="The body that it is tried on")
+    try_on: PointerProperty(type=TryOnSettings, name="Try On", description="Which other body it is tried on")
     tightness: FloatProperty(
         name="Tightness",
         description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, "
