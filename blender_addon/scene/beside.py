@@ -75,5 +75,5 @@ def clear_shapes(thing: bpy.types.Object) -> None:
 def _remove_keys(name: str) -> None:
     """Remove what is left of shape keys: Blender frees them since 5.2; before, they stay unused in the file."""
     left = bpy.data.shape_keys.get(name) if name else None
-    if left and not left.users:
+    if left:
         bpy.data.batch_remove([left])
