@@ -174,7 +174,7 @@ def inside_line(garment: bpy.types.Object) -> str:
     _wanted = (garment.session_uid, garment.name, garment.ssilk.try_on.share)
     if not bpy.app.timers.is_registered(_measure):
         bpy.app.timers.register(_measure, first_interval=PATIENCE)
-    return _told[1]
+    return "What is inside the body is measured once the slider rests"
 
 
 def forget() -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import subprocess
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -305,6 +305,51 @@ def test_modifiers_and_drivers_that_shape_a_body_are_heeded(bpy, skirt):
     own = scene.character.bodies[0].mesh.points
     assert len(own) == 2 * len(pillar.data.vertices)
     np.testing.assert_allclose(points, own * (2 / 1.25, 1, 2 / 1.25), atol=1e-5)
+
+
+def test_copies_of_mirrored_objects_face_outward_and_modifiers_count(bpy, skirt):
+    from blender_addon.quality.tried_on import TriedOn, mark_of, show
+    from blender_addon.scene.gather import gather
+    from blender_addon.scene.meshes import triangles_of
+
+    bpy.data.objects["Pillar"].modifiers.new("Subdivision", "SUBSURF").levels = 1
+    bpy.data.objects["Pillar"].modifiers.move(1, 0)
+    skirt.scale.x = -1.0
+    bpy.context.view_layer.update()
+    scene = gather(skirt)
+    cloth, body = (mesh for mesh in scene.meshes.values())
+    there = np.stack([cloth.points * (1 + knot, 1, 1) for knot in KNOTS])
+    tried = TriedOn("a body", mark_of(skirt), there, [body.points * (2, 1, 1)], np.zeros((4, 0, 3)))
+    show(skirt, scene, tried)
+    found = shown_at(bpy, skirt, 1.0)
+    assert set(found) == {"cloth", "body"} and len(found["body"]) == body.vertex_count
+    for role, mesh in (("cloth", cloth), ("body", body)):
+        np.testing.assert_allclose(found[role], scene.units.points_from_core(mesh.points * (2, 1, 1)), atol=1e-6)
+        a, b, c = np.moveaxis(found[role][triangles_of(copies(skirt)[role].data)], 1, 0)
+        assert np.einsum("ti,ti->", np.cross(b - a, c - a), (a + b + c) * (1, 1, 0)) > 0
+
+
+def test_with_a_window_what_is_inside_is_measured_once_the_slider_rests(ready, tried, monkeypatch):
+    from blender_addon.quality import tried_on
+
+    waiting: list[Any] = []
+    timers = SimpleNamespace(
+        is_registered=waiting.__contains__,
+        register=lambda what, **_: waiting.append(what),
+        unregister=waiting.remove,
+    )
+    app = SimpleNamespace(background=False, timers=timers)
+    window = SimpleNamespace(app=app, data=ready.data, context=ready.context, types=ready.types)
+    monkeypatch.setattr(tried_on, "bpy", window)
+    tried.ssilk.try_on.share = 0.2
+    assert "once the slider rests" in tried_on.inside_line(tried)
+    tried.ssilk.try_on.share = 0.4
+    assert "once the slider rests" in tried_on.inside_line(tried)
+    (measure,) = waiting
+    tried.ssilk.try_on.share = 0.6
+    assert measure() == tried_on.PATIENCE  # it moved since
+    assert measure() is None
+    assert tried_on.inside_line(tried) == "Nothing is inside the body"
 
 
 def test_the_path_of_the_stage_stays_true_in_another_folder(bpy, skirt, tmp_path):
