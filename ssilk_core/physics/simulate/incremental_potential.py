@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +28,7 @@ from torch import Tensor
 from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
+from ..captured import Captured
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
@@ -140,7 +142,19 @@ class IncrementalPotential:
     @cached_property
     def captured(self) -> CapturedPotential:
         """What a GPU computes of it at once."""
-        return CapturedPotential(self)
+
+        def state(x: Tensor, inputs: StepInputs) -> list[Tensor]:
+            distance = self.body_distance(x, inputs)
+            return [self.energy(x, inputs, distance), *(distance.tensors() if distance else [])]
+
+        def gradient(x: Tensor, inputs: StepInputs, distance: SmoothedDistance | None) -> list[Tensor]:
+            return [self.gradient(x, inputs, distance)]
+
+        def hessian(x: Tensor, inputs: StepInputs, *others: Any) -> list[Tensor]:
+            matrix = self.hessian(x, inputs, *others)
+            return [matrix.blocks, matrix.inverse_diagonal()]
+
+        return CapturedPotential(Captured(state), Captured(gradient), Captured(hessian))
 
     @property
     def block_pattern(self) -> BlockPattern:
