@@ -2,9 +2,9 @@
 """Bake many shots on a farm: write a bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
-task is one garment in one shot, on one body; with --certify outer garments come after those that they were trained
-over, and are certified over these. Running a job again, anywhere, leaves finished tasks alone. With
---device cuda each host needs a GPU. Both commands take the size of chunks as the job's parameters:
+task is one garment in one shot, on one body; with --refine or --certify outer garments come after those that they
+were trained over, and are refined and certified over these. Running a job again, anywhere, leaves finished tasks
+alone. With --device cuda each host needs a GPU. Both commands take the size of chunks as the job's parameters:
 -p ChunkSize=20 -p ChunkSeconds=600.
 """
 

@@ -274,7 +274,7 @@ def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file
 
 
 def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(copy, capsys):
-    """Whatever the order of the models; the inner garment is as it is without the outer one, which comes out of it."""
+    """Whatever the order of the models; the inner garment is as it is without the outer, which comes out of it."""
     Path("dented.safetensors").replace("coat.safetensors")
     refine, both = "--refine 6", "coat.safetensors skirt.safetensors"
     for model in both.split():
