@@ -276,7 +276,7 @@ def layered_ways() -> dict[str, dict[str, float]]:
         parts = build_parts(job, torch.device("cpu"))
         parts.stepper(job.train, 0).run(job.train.static_iterations)
         files.append(model_file(parts.model, job.fabric, {}))
-    return layered(*files, scene, motions[0].picked(SOME), ROUNDS)
+    return layered(files[0], files[1], scene, motions[0].picked(SOME), ROUNDS)
 
 
 def timed(work: Callable[[], object]) -> float:
