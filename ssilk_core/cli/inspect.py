@@ -58,8 +58,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="training to estimate memory and time for (default: draft on a CPU, else preview)",
     )
     verb.add_argument(
-        "--family", type=Path, nargs="+", default=[], metavar="STAGE",
-        help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
+        "--family", type=Path, nargs="*", metavar="STAGE|SHAPES",
+        help="other characters to compare: bodies of one skeleton and topology, which one model can dress, as 'ssilk "
+             "train' takes them",
     )  # fmt: skip
     verb.add_argument(
         "--onto", type=Path, metavar="STAGE[:/ROOT]",
@@ -160,14 +161,28 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
 
 def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
     """Return what there is to say of the characters of --family beside this one."""
-    if not options.family:
-        return []
-    from ssilk_usd.reading.character import read_character
-
+    if options.family is None:
+        return _parameters(options)
     from ..authoring.bodies.differences import family_findings
 
-    others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
+    others = [shared.read_member(options, member, report) for member in shared.members(options)]
     return list(family_findings([inputs.character, *others]))
+
+
+def _parameters(options: argparse.Namespace) -> list[Finding]:
+    """Return which shapes of the character the stage marks as body parameters, where it marks some."""
+    from ssilk_usd.opening.shaped import body_parameters
+    from ssilk_usd.opening.stage import open_stage
+
+    from ..authoring.preflight.finding import Finding
+
+    known = body_parameters(open_stage(options.stage))
+    marked = [f"{name} ({of.low:g} to {of.high:g})" for name, of in known.items() if of.is_marked]
+    if not marked:
+        return []
+    found = f"shapes are marked as body parameters: {', '.join(marked)}"
+    fix = "--family alone takes them all; --family tall=1 names a body by weights of shapes"
+    return [Finding(severity="info", code="body-parameters", prim=str(options.stage), found=found, fix=fix)]
 
 
 def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:

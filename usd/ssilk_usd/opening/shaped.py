@@ -47,6 +47,9 @@ class BodyParameter:
     joints: Mapping[str, tuple[float, float, float]]
 
 
+UNSAID = BodyParameter(*USUAL_RANGE, is_marked=False, joints={})
+
+
 @dataclass(frozen=True, eq=False)
 class _Skin:
     """A mesh and what moves it.
@@ -95,13 +98,11 @@ def body_parameters(stage: Usd.Stage) -> dict[str, BodyParameter]:
     for root in _roots(stage):
         for mesh in _body_meshes(root):
             for name, shape in _shapes_of(mesh):
-                said = _said(shape)
-                before = found.setdefault(name, said)
-                if said != before and said.is_marked and before.is_marked:
-                    allowed = "those of one name are one body parameter"
-                    fail(_where(shape), f"another '{name}' has other ranges or joint offsets", allowed, "make them one")
-                if said.is_marked:
-                    found[name] = said
+                said, before = _said(shape), found.get(name, UNSAID)
+                if UNSAID not in (said, before) and said != before:
+                    allowed = "blendshapes of one name are one body parameter"
+                    fail(_where(shape), f"another '{name}' has another range or other joint offsets", allowed, "mend one")
+                found[name] = before if said == UNSAID else said
     return found
 
 
@@ -147,6 +148,11 @@ def _shape_character(
         binds = np.array(skeleton.GetBindTransformsAttr().Get(EARLIEST) or [], dtype=np.float64)
         if binds.shape != (len(joints), 4, 4):
             continue  # which readers of the skeleton tell
+        for name in weights:
+            own = [skin for skin in skins if name in skin.offsets]
+            if own and (unknown := [joint for joint in known[name].joints if joint not in map(str, joints)]):
+                found = f"{OFFSET_JOINTS} of '{name}' has '{unknown[0]}'"
+                fail_unknown(where, found, unknown[0], map(str, joints))
         moves = {name: _joint_moves(name, weight, known[name], skins, joints, binds) for name, weight in weights.items()}
         _move_joints(skeleton, binds, sum(moves.values(), np.zeros((len(joints), 3))))
         for skin in skins:
@@ -290,7 +296,7 @@ def _said(shape: Usd.Prim) -> BodyParameter:
         found = f"{len(moved)} {JOINT_OFFSETS}, or not finite ones, for {len(named)} {OFFSET_JOINTS}"
         fail(_where(shape), found, "one for each joint is needed", "mend them")
     said = {name: (float(x), float(y), float(z)) for name, (x, y, z) in zip(named, moved)}
-    return BodyParameter(low, high, given is not None or bool(said), said)
+    return BodyParameter(low, high, given is not None, said)
 
 
 def _where(prim: Usd.Prim) -> str:
