@@ -107,7 +107,9 @@ def _options_of(
 
 def _family(table: Mapping[str, Any]) -> list[Path] | None:
     """Return the bodies of --family as its option has them."""
-    return None if "family" not in table else [] if table["family"] is True else [*map(Path, _listed(table, "family"))]
+    if "family" not in table:
+        return None
+    return [] if table["family"] is True else [*map(Path, _listed(table, "family"))]
 
 
 def _model_names(entry: WardrobeEntry, models: Sequence[str]) -> list[str]:

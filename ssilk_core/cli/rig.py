@@ -50,7 +50,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="STAGE[:/ROOT]|SHAPES",
         help="another body of the same skeleton and topology, to put the garment on, or weights of the stage's own "
-             "blendshapes, such as tall=1,heavy=0.5; with --joints any character",
+        "blendshapes, such as tall=1,heavy=0.5; with --joints any character",
     )
     verb.add_argument(
         "--joints", type=Path, metavar="MAP",
@@ -118,6 +118,7 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
         SsilkError: that body is none of the character's family.
     """
     import numpy as np
+
     from ..authoring.bodies.carry import carry
     from ..authoring.bodies.differences import differences, need_family
     from ..authoring.preflight.fit import describe_left, describe_move

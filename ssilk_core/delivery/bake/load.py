@@ -132,6 +132,7 @@ class LoadedGarment:
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
         kept, reduction = self._cut(source) if request.keep else (self, None)
+        character = self.deformer.scene.character
         provenance = {
             **self.provenance,
             **({"reduced": reduction.to_metadata()} if reduction else {}),
@@ -162,7 +163,7 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=(*self.told, *read.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
+            told=(*self.told, *read.told, *other_bones(motion, read.sampled, character, self.first)),
             direction=kept._directed(request, read) if kept.model else None,
             loop=loop,
         ).begun()

@@ -74,7 +74,8 @@ def _write(path: Path, document: dict[str, Any]) -> None:
 
 
 def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
-    files = sorted({split_body(split_location(path)[0])[0] for task in tasks for path in task.request.inputs.values()})
+    places = {split_location(path)[0] for task in tasks for path in task.request.inputs.values()}
+    files = sorted({split_body(place)[0] for place in places})
     folders = [] if output is None else [str(output.absolute())]
     return {
         "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}

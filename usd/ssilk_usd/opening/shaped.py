@@ -100,8 +100,8 @@ def body_parameters(stage: Usd.Stage) -> dict[str, BodyParameter]:
             for name, shape in _shapes_of(mesh):
                 said, before = _said(shape), found.get(name, UNSAID)
                 if UNSAID not in (said, before) and said != before:
-                    allowed = "blendshapes of one name are one body parameter"
-                    fail(_where(shape), f"another '{name}' has another range or other joint offsets", allowed, "mend one")
+                    told = f"another '{name}' has another range or other joint offsets"
+                    fail(_where(shape), told, "blendshapes of one name are one body parameter", "mend one")
                 found[name] = before if said == UNSAID else said
     return found
 
@@ -137,29 +137,30 @@ def _shape_character(
     cache = UsdSkel.Cache()
     cache.Populate(UsdSkel.Root(root), _PRIMS)
     shaped = {mesh: _offsets(mesh, weights, where) for mesh in _body_meshes(root)}
-    bound: set[Usd.Prim] = set()
     for binding in cache.ComputeSkelBindings(UsdSkel.Root(root), _PRIMS):
         skeleton, joints = binding.GetSkeleton(), cache.GetSkelQuery(binding.GetSkeleton()).GetJointOrder()
         queries = [query for query in binding.GetSkinningTargets() if query.GetPrim() in shaped]
         skins = [found for query in queries if (found := _skin(query, joints, shaped[query.GetPrim()]))]
-        bound |= {skin.mesh.GetPrim() for skin in skins}
-        if not any(skin.offsets for skin in skins):
-            continue
         binds = np.array(skeleton.GetBindTransformsAttr().Get(EARLIEST) or [], dtype=np.float64)
-        if binds.shape != (len(joints), 4, 4):
-            continue  # which readers of the skeleton tell
-        for name in weights:
-            own = [skin for skin in skins if name in skin.offsets]
-            if own and (unknown := [joint for joint in known[name].joints if joint not in map(str, joints)]):
-                found = f"{OFFSET_JOINTS} of '{name}' has '{unknown[0]}'"
-                fail_unknown(where, found, unknown[0], map(str, joints))
-        moves = {name: _joint_moves(name, weight, known[name], skins, joints, binds) for name, weight in weights.items()}
-        _move_joints(skeleton, binds, sum(moves.values(), np.zeros((len(joints), 3))))
+        if binds.shape != (len(joints), 4, 4) or not any(skin.offsets for skin in skins):
+            continue  # readers of the skeleton tell what is malformed
+        moves = {}
+        for name in sorted({name for skin in skins for name in skin.offsets}):
+            _need_joints(known[name], name, joints, where)
+            moves[name] = _joint_moves(name, weights[name], known[name], skins, joints, binds)
+        _move_joints(skeleton, binds, np.sum([*moves.values()], axis=0))
         for skin in skins:
+            shaped.pop(skin.mesh.GetPrim())
             _reshape(skin, moves)
-    for mesh, offsets in shaped.items():
-        if mesh not in bound and offsets:  # a joint carries it, or none
-            _move_points(UsdGeom.Mesh(mesh), sum(offsets.values()), list(offsets))
+    for mesh, offsets in shaped.items():  # a joint carries them, or none
+        if offsets:
+            _move_points(UsdGeom.Mesh(mesh), np.sum([*offsets.values()], axis=0), list(offsets))
+
+
+def _need_joints(parameter: BodyParameter, name: str, joints: Sequence[str], where: str) -> None:
+    for joint in parameter.joints:
+        if joint not in map(str, joints):
+            fail_unknown(where, f"{OFFSET_JOINTS} of '{name}' has '{joint}'", joint, map(str, joints))
 
 
 def _joint_moves(
@@ -191,7 +192,8 @@ def _reshape(skin: _Skin, moves: Mapping[str, Floats]) -> None:
     for name, joints in moves.items():
         own = skin.offsets.get(name)
         total += skinned_moves(joints, skin.indices, skin.weights) if own is None else own
-    _move_points(skin.mesh, total @ np.linalg.inv(skin.to_bind[:3, :3]), list(skin.offsets))
+    offsets = total @ np.linalg.inv(skin.to_bind[:3, :3])
+    _move_points(skin.mesh, np.asarray(offsets, dtype=np.float64), list(skin.offsets))
 
 
 def _move_points(mesh: UsdGeom.Mesh, offsets: Floats, names: Sequence[str]) -> None:
@@ -290,7 +292,8 @@ def _said(shape: Usd.Prim) -> BodyParameter:
     )
     low, high = USUAL_RANGE if given is None else map(float, given)
     if not (np.isfinite([low, high]).all() and low <= 0 <= high and low < high):
-        fail(_where(shape), f"{WEIGHT_RANGE} is ({low:g}, {high:g})", "a range holds 0, the body without it", "mend it")
+        allowed = "a range holds 0, the body without the shape"
+        fail(_where(shape), f"{WEIGHT_RANGE} is ({low:g}, {high:g})", allowed, "mend it")
     named, moved = [str(name) for name in joints or ()], np.array(offsets or [], dtype=np.float64).reshape(-1, 3)
     if len(named) != len(moved) or not np.isfinite(moved).all():
         found = f"{len(moved)} {JOINT_OFFSETS}, or not finite ones, for {len(named)} {OFFSET_JOINTS}"
@@ -313,7 +316,7 @@ def _roots(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 
 
 def _body_meshes(root: Usd.Prim) -> list[Usd.Prim]:
-    """Return the meshes beneath a SkelRoot that are no garments: these are put on a body, which is not their shape."""
+    """Return the meshes beneath a SkelRoot that are no garments: these are put on a body in other ways."""
     meshes = [prim for prim in Usd.PrimRange(root, _PRIMS) if prim.IsA(UsdGeom.Mesh)]
     marks = (CLASS, PROXIES)
     return [
