@@ -24,6 +24,7 @@ from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.layers import ClothLayers
 from ssilk_core.scene.kinematics import bind_pose
+from ssilk_core.training.wardrobe.listing import read_list
 
 from .test_shaped_bodies import add_shape
 from .test_skeletons import JOINTS as OTHER_JOINTS
@@ -774,7 +775,7 @@ def test_a_body_by_shapes_is_baked_as_its_stage_is_and_the_motion_is_played_betw
     assert run("verify by_shapes.usda --stage moved/shapes.usda") == 0
 
 
-def test_jobs_and_evaluations_have_bodies_by_shapes_with_their_names(shapes, capsys):
+def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):
     bodies = "--stage shapes.usda --stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
     assert run(f"farm family.safetensors --motion clip.usda {bodies} --bundle job") == 0
     files = json.loads(Path("job/asset_references.json").read_text())["assetReferences"]["inputs"]["filenames"]
@@ -788,3 +789,37 @@ def test_jobs_and_evaluations_have_bodies_by_shapes_with_their_names(shapes, cap
     results = [json.loads(line)["detail"] for line in capsys.readouterr().out.splitlines() if '"result"' in line]
     assert results and all(detail.get("current") for detail in results), results
     assert run(f"{bake}=0.9") == 2 and "was baked on another body" in capsys.readouterr().err
+
+
+def test_an_evaluation_has_bodies_by_shapes_under_their_names(shapes):
+    (shapes / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    bodies = "--stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
+    assert run(f"evaluate family.safetensors {bodies} --motions clips --no-probes -o by_shapes.json") == 0
+    text = Path("by_shapes.json").read_text()
+    assert '"heavier/Skirt' in text and '"heavier0.5_taller0.2/Skirt' in text
+
+
+def test_a_list_keeps_shapes_and_finds_the_files_of_bodies(shapes):
+    Path("lists").mkdir()
+    table = 'stage = "../shapes.usda"\nmotions = "../clip.usda"\n'
+    listed = {"named": '["taller=1", "../heavier.usda", "../shapes.usda:heavier=0.5"]', "marked": "true"}
+    tables = [f"[{name}]\n{table}family = {family}\n" for name, family in listed.items()]
+    Path("lists/list.toml").write_text("\n".join(tables))
+    named, marked = read_list(Path("lists/list.toml"))
+    assert named.words[-4:] == ("--family", "taller=1", "../heavier.usda", "../shapes.usda:heavier=0.5")
+    assert marked.words[-1] == "--family" and marked.located(Path("lists"))["family"] is True
+    family = named.located(Path("lists"))["family"]
+    assert family == ["taller=1", "lists/../heavier.usda", "lists/../shapes.usda:heavier=0.5"]
+    assert run("inspect lists/list.toml") == 0
+
+
+def test_marks_that_nobody_uses_change_no_byte(shapes):
+    bake = "bake family.safetensors --motion clip.usda -o"
+    assert run(f"{bake} marked.usda --stage shapes.usda") == 0
+    written = Path("marked.usda").read_bytes()
+    stage = Usd.Stage.Open("shapes.usda")
+    stage.GetPrimAtPath("/Hero/Body/Slight").RemoveProperty("ssilk:weightRange")
+    stage.Save()
+    assert run(f"{bake} marked.usda --stage shapes.usda") == 0
+    assert Path("marked.usda").read_bytes() == written

@@ -14,6 +14,9 @@ from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.shown import shown_otherwise
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.scene.family import with_joints
+
+from .test_read import RECIPES, author
 
 JOINTS = ["Hips", "Hips/Spine", "Hips/Spine/Head"]
 HEIGHTS = np.array([80.0, 120.0, 150.0])  # [cm]
@@ -223,3 +226,22 @@ def test_a_shot_does_not_shape_the_body_again_and_what_it_animates_is_told(hero)
         (told,) = shown_otherwise(body, hero)
         assert told.startswith(f"it animates {shapes[:4]}, by which the character's stage sets the body")
     assert not shown_otherwise(hero, hero)
+
+
+@pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
+def test_joints_follow_in_whichever_space_a_program_writes_its_bind_pose(tmp_path, recipe):
+    path = str(tmp_path / "hero.usda")
+    stage = author(Usd.Stage.CreateNew(path), recipe)
+    stage.Save()
+    own = read_character(path)
+    local = np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get(), dtype=float)
+    to_core = np.linalg.lstsq(np.c_[local, np.ones(len(local))], own.bodies[0].mesh.points, rcond=None)[0]
+    add_shape(stage, "Body", "big", 2 * 0.2 * own.bodies[0].mesh.points @ np.linalg.inv(to_core[:3]))
+    stage.Save()
+    its = read_character(f"{path}:big=1")
+    grown = with_joints(own.skeleton, 1.2 * own.skeleton.bind_transforms[:, :3, 3])
+    np.testing.assert_allclose(its.bodies[0].mesh.points, 1.2 * own.bodies[0].mesh.points, atol=1e-5)
+    np.testing.assert_allclose(its.skeleton.bind_transforms, grown.bind_transforms, atol=1e-5)
+    np.testing.assert_allclose(its.skeleton.rest_transforms[1:], grown.rest_transforms[1:], atol=1e-5)
+    turned = [each.skeleton.rest_transforms[0, :3, :3] for each in (its, own)]
+    np.testing.assert_allclose(*turned, atol=1e-6)
