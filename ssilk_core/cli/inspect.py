@@ -115,6 +115,8 @@ def _read(options: argparse.Namespace, report: Reporter) -> PreflightInput:
 
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected, with the preset "draft" where none is asked for."""
+    from ssilk_usd.opening.shaped import body_parameters
+    from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
@@ -123,12 +125,13 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
     shared.tell_shapes(options, motions, report, trained=character)
+    known = body_parameters(open_stage(options.stage)).items()
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
         preset=preset_named(options.preset or "draft"), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
-        inner=_inner(options, character),
+        inner=_inner(options, character), body_ranges={name: (of.low, of.high) for name, of in known if of.is_marked},
     )  # fmt: skip
 
 
@@ -162,27 +165,23 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
 def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
     """Return what there is to say of the characters of --family beside this one."""
     if options.family is None:
-        return _parameters(options)
+        return _parameters(inputs)
     from ..authoring.bodies.differences import family_findings
 
     others = [shared.read_member(options, member, report) for member in shared.members(options)]
     return list(family_findings([inputs.character, *others]))
 
 
-def _parameters(options: argparse.Namespace) -> list[Finding]:
-    """Return which shapes of the character the stage marks as body parameters, where it marks some."""
-    from ssilk_usd.opening.shaped import body_parameters
-    from ssilk_usd.opening.stage import open_stage
-
+def _parameters(inputs: PreflightInput) -> list[Finding]:
+    """Return which shapes of the character its stage marks as body parameters, where it marks some."""
     from ..authoring.preflight.finding import Finding
 
-    known = body_parameters(open_stage(options.stage))
-    marked = [f"{name} ({of.low:g} to {of.high:g})" for name, of in known.items() if of.is_marked]
-    if not marked:
+    if not inputs.body_ranges:
         return []
+    marked = [f"{name} ({low:g} to {high:g})" for name, (low, high) in inputs.body_ranges.items()]
     found = f"shapes are marked as body parameters: {', '.join(marked)}"
     fix = "--family alone takes them all; --family tall=1 names a body by weights of shapes"
-    return [Finding(severity="info", code="body-parameters", prim=str(options.stage), found=found, fix=fix)]
+    return [Finding(severity="info", code="body-parameters", prim=inputs.character.path, found=found, fix=fix)]
 
 
 def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
