@@ -48,8 +48,7 @@ COLUMNS = 118  # of a terminal, which tables fit
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, action="append", required=True,
-                      help="USD file with the character (repeatable: one for each body of a family)")  # fmt: skip
+    verb.add_argument("--stage", type=Path, action="append", required=True, help=shared.BODIES)
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     verb.add_argument("--index", type=Path, metavar="JSON",
@@ -304,7 +303,7 @@ def _results(
     options: argparse.Namespace, asked: EvaluationOptions, opened: Sequence[OpenedModel], listed: ListedClips
 ) -> EvaluationResults:
     """Return the results to write, with their provenance; their inputs are told by content, wherever they lie."""
-    from ..files import sha256
+    from ..files import sha256, split_body
     from ..quality.evaluation.results import EvaluationResults
     from ._measured import contents, measured_inputs
     from ._reference import shots
@@ -335,7 +334,7 @@ def _results(
         {
             "units": "SI",
             "models": {str(path): digest for path, (_, digest) in zip(options.models, inputs["models"])},
-            "stage": {str(stage): sha256(stage) for stage in options.stage},
+            "stage": {str(stage): sha256(split_body(str(stage))[0]) for stage in options.stage},
             "reference": options.reference and str(options.reference),
             "options": settings,
             "hardware": inputs["hardware"],

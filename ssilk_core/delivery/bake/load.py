@@ -18,6 +18,7 @@ from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
 from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Skeleton
 from ...scene.cycles import rounds
+from ...scene.family import has_bones, motion_on
 from ...scene.held_parts import HeldParts
 from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
 from ...scene.posed_alike import shaped_as_in_stage
@@ -26,7 +27,7 @@ from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
 from .direction import Direction, held_parts
 from .fabrics import in_fabric
-from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
+from .inputs import InputContents, InputHashes, model_contents, read_unchanged, shapes_of, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
 from .request import ALLOWED_FPS, BakeRequest
 from .riders import riders_of
@@ -63,6 +64,7 @@ class _ReadMotion:
     frames: FrameRange | None
     hidden: list[tuple[int, bool]]
     loop: Loop | None = None
+    told: tuple[Event, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +85,8 @@ class LoadedGarment:
         told: what was found about the body and riders, to be reported.
         body: which body it lies on (`bodies.WornModel.body`).
         first: the skeleton of the first body of the model's family; None where it lies on no other one of that.
+        taller: height of the hub over the ground, relative to that body's, of a body that weights of the stage's
+            shapes make; None for others.
     """
 
     request: BakeRequest
@@ -100,6 +104,7 @@ class LoadedGarment:
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
+    taller: float | None = None
     played: GarmentRecord | None = None
 
     @property
@@ -127,6 +132,7 @@ class LoadedGarment:
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
         kept, reduction = self._cut(source) if request.keep else (self, None)
+        character = self.deformer.scene.character
         provenance = {
             **self.provenance,
             **({"reduced": reduction.to_metadata()} if reduction else {}),
@@ -157,7 +163,7 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
+            told=(*self.told, *read.told, *other_bones(motion, read.sampled, character, self.first)),
             direction=kept._directed(request, read) if kept.model else None,
             loop=loop,
         ).begun()
@@ -179,7 +185,7 @@ class LoadedGarment:
 
         frames = read_frame_range(request.motion, request.time_range, request.handles, root=root, rate=request.fps)
         if frames is None:
-            source = read_motion(request.motion, character.skeleton, root=root)
+            source, told = self._between_own_bones(read_motion(request.motion, character.skeleton, root=root))
             sampled, begun, handles = _sampled(source, (request.fps or source.fps) * samples, np.zeros(1)), 0, 0
             whole = sampled = shaped(sampled)
         else:
@@ -192,14 +198,23 @@ class LoadedGarment:
             last = min(_floor(frames.count * rate) + frames.after * samples, _floor(frames.later * rate))
             later = max(min(_ceil(last / rate), frames.later), frames.count)
             within = (frames.first - earlier * frames.step, frames.first + later * frames.step)
-            source = read_motion(request.motion, character.skeleton, root=root, within=within)
+            read = read_motion(request.motion, character.skeleton, root=root, within=within)
+            source, told = self._between_own_bones(read)
             whole = _sampled(source, fps, earlier + np.arange(-begun, last + 1) / rate)
             whole = shaped(replace(whole, start=frames.first / frames.step * fps / frames.fps - begun))
             sampled = whole.clip(begun - handles, whole.frame_count)
         hidden = read_hidden(request.motion, sampled, root=root)
         source = shaped(source) if request.latent_iterations else source  # networks do not see it
-        read = _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
-        return self._repeating(request, read) if self._loops(request, source) else read
+        found = _ReadMotion(source, sampled, whole, begun - handles, frames, hidden, told=told)
+        return self._repeating(request, found) if self._loops(request, source) else found
+
+    def _between_own_bones(self, motion: Motion) -> tuple[Motion, tuple[Event, ...]]:
+        """Return a motion of the first body as a body moves that shapes of its stage make: no shot has its bones."""
+        skeleton, first = self.deformer.scene.character.skeleton, self.first
+        if self.taller is None or first is None or has_bones(motion, skeleton) or not has_bones(motion, first):
+            return motion, ()
+        text = "its joints are as far apart as those of the stage's own body, and are played between this one's bones"
+        return motion_on(motion, first, skeleton, self.taller), (Message(f"{motion.path}: {text}"),)
 
     def _loops(self, request: BakeRequest, motion: Motion) -> bool:
         """Return whether a shot is to be a loop; skinning alone repeats by itself."""
@@ -354,7 +369,16 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         told=(*told, *in_words),
         body=on.body,
         first=first.scene.character.skeleton if on.member else None,
+        taller=_taller(first, on) if shapes_of(request.stage) else None,
     )
+
+
+def _taller(file: ModelFile, on: WornModel) -> float | None:
+    """Return how much higher than the first body's the hub of another member is, in parts of it."""
+    if not (on.member and file.bodies):
+        return None
+    bodies = file.bodies.family.bodies
+    return bodies.height_ratio(np.array(on.member[: bodies.size]))
 
 
 def _on_stage(

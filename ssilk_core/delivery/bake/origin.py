@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...errors import fail
-from ...files import relative_path, sha256, split_location
+from ...files import relative_path, sha256, split_body, split_location
 from ...scene.assets import ShotWorld
 from .beneath import OVER
 from .opened import provenance_of
@@ -140,6 +140,8 @@ def read_origin(
             what = f"the {name} that it was baked from is not at {path}"
             fail(str(shot), what, f"--{name} gives its present path")
         found[name] = str(place)
+        if name == "stage" and (shapes := split_body(path)[1]) and not split_body(found[name])[1]:
+            found[name] += f":{shapes}"  # another path of the stage, which is baked as the same body
     start = stored.start_cloth
     if start is not None:
         place, code = split_start(start)
@@ -180,8 +182,8 @@ def _existing(shot: Path, near: str, held: object, *, baked: bool = False) -> Pa
 
 
 def _file(place: Path) -> Path:
-    """Return the file of a place, which may name a prim in it."""
-    return Path(split_location(str(place))[0])
+    """Return the file of a place, which may name a prim in it, or a body by weights of shapes."""
+    return Path(split_body(split_location(str(place))[0])[0])
 
 
 def _is_baked(file: Path, shot: Path) -> bool:

@@ -17,7 +17,7 @@ from ...files import replacing
 from ...scene.plain import from_plain
 from ..bake import BakeRequest, BakeTask
 from ..bake.asked import tell_impossible
-from ..bake.inputs import InputContents, InputFiles, InputHashes
+from ..bake.inputs import InputContents, InputFiles, InputHashes, shapes_of
 from ..bake.layered import in_levels
 
 NAME = "job.json"
@@ -101,7 +101,7 @@ def read_job(path: str | Path, mapping: str | Path | None = None, chosen: str | 
     try:
         tasks = [_mapped(_checked(from_plain(BakeTask, entries[number])), rules) for number in wanted]
         held = document.get("inputs", {})
-        inputs = {_found(path, rules): _contents(files, rules) for path, files in held.items()}
+        inputs = {_found(path, rules): _contents(path, files, rules) for path, files in held.items()}
         return FarmJob(tuple(_pinned(task, inputs) for task in tasks), inputs)
     except (KeyError, TypeError, AttributeError, SsilkError) as error:
         return _no_job(path, f"it is no job ({type(error).__name__}: {error})")
@@ -111,10 +111,11 @@ def _no_job(path: str | Path, found: str) -> NoReturn:
     fail(str(path), found, "a file written by 'ssilk farm' is needed")
 
 
-def _contents(files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> InputContents:
+def _contents(location: str, files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> InputContents:
     if not files or not all(isinstance(digest, str) for digest in files.values()):
         raise TypeError(f"{str(files)[:40]!r} are no files with their hashes")
-    return InputContents(tuple((_found(path, rules), digest) for path, digest in files.items()))
+    held = tuple((_found(path, rules), digest) for path, digest in files.items())
+    return InputContents(held, shapes_of(location))
 
 
 def _pinned(task: BakeTask, inputs: Mapping[str, InputContents]) -> BakeTask:

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from ...errors import fail
 from ...events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
-from ...files import replacing, split_location
+from ...files import replacing, split_body, split_location
 from ..bake import BakeTask
 from ..bake.layered import in_levels
 from .job import NAME, FarmJob, is_job, write_job
@@ -74,7 +74,8 @@ def _write(path: Path, document: dict[str, Any]) -> None:
 
 
 def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
-    files = sorted({split_location(path)[0] for task in tasks for path in task.request.inputs.values()})
+    places = {split_location(path)[0] for task in tasks for path in task.request.inputs.values()}
+    files = sorted({split_body(place)[0] for place in places})
     folders = [] if output is None else [str(output.absolute())]
     return {
         "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}
