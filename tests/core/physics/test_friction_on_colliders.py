@@ -12,11 +12,23 @@ import torch
 from scipy.optimize import brentq
 
 from ssilk_core.physics.energy.collision import ContactLaw
-from ssilk_core.physics.simulate import SimulationOptions, Simulator
+from ssilk_core.physics.simulate import SimulationOptions, Simulator, simulate
 from ssilk_core.physics.simulate.friction import CREEP
 from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.newton import SolverOptions
-from ssilk_core.scene.assets import LOOSE, Collider, Floats, Garment, Mesh, ProxyRig, Scene, ShotWorld, SkinWeights
+from ssilk_core.scene.assets import (
+    LOOSE,
+    PINNED,
+    Collider,
+    Floats,
+    Garment,
+    Mesh,
+    Motion,
+    ProxyRig,
+    Scene,
+    ShotWorld,
+    SkinWeights,
+)
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import bind_pose
 
@@ -135,3 +147,17 @@ def test_a_plane_that_is_gone_rubs_no_more(scene, toy_grid) -> None:
     np.testing.assert_allclose(speed[:last, 0], MU * G * DT * np.arange(1, last + 1), rtol=1e-2)
     np.testing.assert_allclose(speed[last:, 0], speed[last - 1, 0], rtol=1e-6)
     np.testing.assert_allclose(np.diff(speed[last:, 1]), -G * DT, rtol=1e-3)
+
+
+def test_shots_drag_cloth_that_is_held_at_an_edge_each_along_its_own_belt(scene, toy_grid) -> None:
+    cloth, frames = lying(scene, toy_grid, LEVEL), 6
+    far = cloth.garment.mesh.points[:, 2]
+    held = np.where(far > far.max() - 1e-9, PINNED, LOOSE)
+    cloth = replace(cloth, garment=replace(cloth.garment, classes=held))
+    rotated, placed = bind_pose(cloth.character.skeleton)
+    motion = Motion("/still", FPS, np.tile(rotated, (frames, 1, 1)), np.tile(placed, (frames, 1, 1)))
+    ways = [np.outer(np.arange(frames), [speed * DT, 0, 0]) for speed in (0.06, -0.06)]
+    worlds = [*(ShotWorld(FPS, (plane(moved=way),)) for way in ways), None]
+    found = simulate(cloth, CLOTH, [motion] * 3, SimulationOptions(fps=FPS), worlds=worlds)
+    along, against, alone = ((points[-1] - points[0])[:, 0].mean() for points in found)
+    assert along > 1e-3 and against < -1e-3 and abs(alone) < 1e-5
