@@ -42,7 +42,7 @@ from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
 from .captured_potential import CapturedPotential
 from .contact_stiffness import ContactStiffness
-from .friction import CREEP, Friction
+from .friction import CREEP, Friction, corners_of
 from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
@@ -235,8 +235,16 @@ class IncrementalPotential:
             inputs = self.with_contacts(x, inputs, moved=True)
         return x, inputs
 
-    def friction(self, x: Tensor, body: PosedBody, neighbours: ClothNeighbours | None, dt: float) -> Friction | None:
-        """Return the friction in the step of dt [s] after positions x on a body; None for cloth without friction."""
+    def friction(
+        self,
+        x: Tensor,
+        body: PosedBody,
+        neighbours: ClothNeighbours | None,
+        dt: float,
+        world: PosedWorld | None = None,
+    ) -> Friction | None:
+        """Return the friction in the step of dt [s] after positions x on a body, and on the colliders of a world;
+        None for cloth without friction."""
         mu = self.fabric.friction
         if not mu:
             return None
@@ -246,8 +254,6 @@ class IncrementalPotential:
         force = self.cloth.area * self.law.pressure(distance)
         reach = torch.where(force > 0, 2 * distance.abs() + self.law.start, -1.0).float()
         row, frame, corners, weights = self.contacts.touched(samples.float(), reach, body)
-        vertices = torch.as_tensor(self.cloth.samples.corners, device=x.device)[row].T
-        coefficients = torch.as_tensor(self.cloth.samples.weights, dtype=x.dtype, device=x.device)[row].T
         normal = torch.nn.functional.normalize(found.normal[row, :, frame].T, dim=0)
         weights = weights.to(x.dtype)
         on_body = (weights[:, None] * body.points[corners, :, frame].movedim(-1, 1)).sum(0)
@@ -255,17 +261,19 @@ class IncrementalPotential:
             x.shape[-1],
             CREEP * dt,
             frame,
-            torch.cat([vertices, vertices[:1]]),
-            torch.cat([coefficients, torch.zeros_like(coefficients[:1])]),
+            *corners_of(self.cloth, row, x),
             corners,
             weights,
             normal,
             mu * force[row, frame],
             samples[row, :, frame].T - on_body,
         )
-        if neighbours is None:
-            return rubbing
-        return Friction.joined(rubbing, Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+        parts = [rubbing]
+        if world is not None and world.has_colliders:
+            parts.append(Friction.on_world(self.cloth, self.law, x, world, len(body.points), mu, dt))
+        if neighbours is not None:
+            parts.append(Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+        return Friction.joined(*parts)
 
     def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
         """Return for each frame the start (V, 3, N) with the least energy."""

@@ -223,9 +223,6 @@ class Simulator:
                         "air moves cloth by its drag",
                     )
                     fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
-        rubs = any(fabric.friction for _, fabric in self.potential.garments)
-        if rubs and any(world and world.colliders for world in worlds):
-            self.report(Message("friction is that of body and cloth; on floors and props cloth slides", "warning"))
         return Surroundings(worlds, np.array(self.options.gravity))
 
     def _simulate_spans(
@@ -317,7 +314,7 @@ class Simulator:
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
-        friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
+        friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt, poses.world)
         world = solution.x.double() + poses.root
         known = solution.neighbours, friction, poses.matrices
         return StepHistory(world, before, poses.root, poses.lbs, *known, moves=poses.moves)
@@ -402,7 +399,7 @@ class Simulator:
             return StepInputs(poses.body, gravity, skinned=poses.lbs, world=met)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        friction = past.friction and past.friction.after(poses.body.points)
+        friction = past.friction and past.friction.after(poses.body.points, world)
         limbs = poses.body.limbs
         pierced = past.pierced.on(limbs) if past.pierced and limbs else None
         advected = past.local if world is None else self._advected(world, past, poses)
