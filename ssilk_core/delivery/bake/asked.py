@@ -41,11 +41,12 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
 
 def _fabric(request: BakeRequest) -> tuple[str, ...]:
     asked = [request.fabric] if request.fabric else []
-    return (request.model, *asked, *request.material) if asked or request.material else ()
+    rubs = ["feedback"] if request.feedback else []
+    return (request.model, *rubs, *asked, *request.material) if asked or request.material else ()
 
 
 def _need_fabric(request: BakeRequest) -> None:
-    in_fabric(load_model(request.model), request.model, request.fabric, request.material)
+    in_fabric(load_model(request.model), request.model, request.fabric, request.material, request.feedback)
 
 
 def _range(request: BakeRequest) -> tuple[str, ...]:

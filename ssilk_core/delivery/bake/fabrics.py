@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,10 +16,15 @@ from ...scene.fabric_range import FACTORS, fabric_with, factors_of, properties
 from ...scene.fabrics import Fabric, fabric_named
 
 TIMES = "x"  # at the end of a value that is a factor
+RUBS = "friction="  # how a property begins that networks never see, and refinement may know
+FEEDBACK_RUBS = (  # what is allowed, and what to do
+    "refinement knows it where each frame goes on from the last",
+    "bake with --refine N --feedback or --quality hero, or take 'ssilk simulate'",
+)
 
 
 def in_fabric(
-    file: ModelFile, where: str, fabric: str | None, material: Sequence[str]
+    file: ModelFile, where: str, fabric: str | None, material: Sequence[str], rubs: bool = False
 ) -> tuple[ModelFile, tuple[Event, ...]]:
     """Return a model in the fabric that options ask for, and what there is to tell of that.
 
@@ -26,10 +32,21 @@ def in_fabric(
         where: the model's path, for messages.
         fabric: name of a preset; None for the model's own fabric.
         material: "NAME=VALUE" properties of it, or "NAME=FACTORx" of what the model's own fabric has.
+        rubs: what follows the network knows friction, which any model may then be given.
 
     Raises:
-        SsilkError: the model knows one fabric alone, or its networks do not see a property that is asked for.
+        SsilkError: the model knows one fabric alone, its networks do not see a property that is asked for, or
+            nothing knows the friction that is.
     """
+    rough = [each for each in material if each.startswith(RUBS)]
+    if rough:
+        if not rubs:
+            fail(f"--material {rough[0]}", "networks know no friction", *FEEDBACK_RUBS)
+        smooth = [each for each in material if not each.startswith(RUBS)]
+        found, told = in_fabric(file, where, fabric, smooth)
+        found = replace(found, fabric=apply_overrides(found.fabric, rough))
+        text = f"{where}: friction {found.fabric.friction:g} in refinement; the network plays without it"
+        return found, (*told, Message(text))
     if not fabric and not material:
         return file, ()
     if file.fabrics is None:

@@ -64,7 +64,8 @@ class BakeRequest:
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
             numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
         fabric, material: that the garment is of, where its model was trained for a range of fabrics: a preset, and
-            properties as text (`delivery.bake.fabrics`); the model's own by default.
+            properties as text (`delivery.bake.fabrics`); the model's own by default. Friction may be given to any
+            model that is refined with feedback.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
         start_cloth: shot or cache with the cloth that the first frame begins with, "FILE[:/PRIM][@CODE]", at its last
             frame or at a time code (`delivery.bake.start`); None to begin at rest.
