@@ -3,7 +3,7 @@
 
     python benchmarks/wind.py hem --motion FOLDER/02_01.usdc --simulation winds.npz --device cuda
     python benchmarks/wind.py look --motion FOLDER/02_01.usdc --wind 0,0,-4 --simulation look.npz -o s.png
-    python benchmarks/wind.py gusts --motion FOLDER/06_05.usdc --frames 96 --wind 0,0,-5 --gusts 4,6 \
+    python benchmarks/wind.py gusts --motion FOLDER/06_05.usdc --frames 96 --wind 0,0,-5 --gusts 4,6 --azimuth 205
         --simulation gusts.npz --film docs/images/cape_gusts.mp4 --chart docs/images/cape_gusts.png
 
 `hem` plays the first --frames of a motion in still air that moves along, and in winds from ahead, from behind and
@@ -12,8 +12,8 @@ rest in it. Told are how far the lowest tenth of the loose vertices is moved by 
 the network, and by what share of the simulator's mean displacement the network's differs from it, as vectors: in
 all frames, and in the second half, since the simulator does not find its rest in strong wind.
 `look` draws network and simulator side by side. `gusts` does so in a wind with gusts, and tells by how much the gusts
-move the hem beside the even wind: from frame to frame, as the mean of its vertices. --simulation is read, or written where there is no such file, so that
-a GPU can write it.
+move the hem beside the even wind: from frame to frame, as the mean of its vertices. --simulation is read, or written
+where there is no such file, so that a GPU can write it.
 """
 
 from __future__ import annotations
@@ -99,10 +99,10 @@ def gusts(options: argparse.Namespace, subject: Subject, motion: Motion, report:
     assert gusty.air is not None
     worlds = [None, replace(gusty, air=replace(gusty.air, gusts=np.zeros(1))), gusty]
     simulated = simulated_worlds(options.simulation, subject, motion, worlds, report)
-    found, lowest = [simulated, [played(subject, motion, world) for world in worlds]], hem_of(subject)
+    network, lowest = np.stack([played(subject, motion, world) for world in worlds]), hem_of(subject)
     rows = []
     for name, one, other in (("wind", 1, 0), ("wind and gusts", 2, 0), ("gusts", 2, 1)):
-        moved = [(each[one] - each[other])[:, lowest] for each in found]
+        moved = [(each[one] - each[other])[:, lowest] for each in (simulated, network)]
         sizes = (f"{np.linalg.norm(each, axis=-1).mean():.2f}" for each in moved)
         rows.append([name, *sizes, f"{100 * apart(*moved):.0f}" if other == 0 else "–"])
     print(table(["moved by", "simulator [m]", "network [m]", "apart [%]"], rows) + "\n")
@@ -121,7 +121,7 @@ def gusts(options: argparse.Namespace, subject: Subject, motion: Motion, report:
             for at, axis in enumerate(AXES)
         ]  # fmt: skip
         write_chart(options.chart, [panels], size=(3.2, 2.2))
-    draw_rows({"simulator": found[0][2], "network": found[1][2]}, subject.dressed, motion, options, report)
+    draw_rows({"simulator": simulated[2], "network": network[2]}, subject.dressed, motion, options, report)
 
 
 def blown_world(options: argparse.Namespace, motion: Motion) -> ShotWorld:

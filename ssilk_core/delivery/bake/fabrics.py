@@ -43,10 +43,10 @@ def in_fabric(
         if not rubs:
             fail(f"--material {rough[0]}", "networks know no friction", *FEEDBACK_RUBS)
         smooth = [each for each in material if not each.startswith(RUBS)]
-        found, told = in_fabric(file, where, fabric, smooth)
+        found, in_words = in_fabric(file, where, fabric, smooth)
         found = replace(found, fabric=apply_overrides(found.fabric, rough))
         text = f"{where}: friction {found.fabric.friction:g} in refinement; the network plays without it"
-        return found, (*told, Message(text))
+        return found, (*in_words, Message(text))
     if not fabric and not material:
         return file, ()
     if file.fabrics is None:

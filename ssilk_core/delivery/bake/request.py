@@ -62,7 +62,7 @@ class BakeRequest:
             (`delivery.bake.certificate`).
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
-            numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
+            numbers as text (`delivery.bake.world`). Networks see colliders where they were trained with some.
         fabric, material: that the garment is of, where its model was trained for a range of fabrics: a preset, and
             properties as text (`delivery.bake.fabrics`); the model's own by default. Friction may be given to any
             model that is refined with feedback.

@@ -11,8 +11,8 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
-from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.collision.inner_cloth import InnerSurface
+from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.refine import RefineOptions, Refiner
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, simulate
 from ssilk_core.physics.simulate.friction import CREEP
