@@ -23,6 +23,7 @@ class Kind:
 
 MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
+SHOT = Kind("motion file", "each shot is a USD file of its own")
 CHARACTER = Kind("file", "a USD stage with a character is needed")
 KINDS = {
     "model": MODEL,
@@ -48,8 +49,10 @@ def need_inputs(options: argparse.Namespace) -> None:
     for name, kind in KINDS.items():
         value = getattr(options, name, None)
         values = value if isinstance(value, list) else [value] if value else []
-        if options.verb in INDEPENDENT and len(values) > 1:
-            continue
+        if options.verb in INDEPENDENT:
+            if len(values) > 1:
+                continue
+            kind = SHOT if kind is MOTIONS else kind
         for each in values:
             need_input(str(each), kind)
 

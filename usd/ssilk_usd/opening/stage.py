@@ -94,6 +94,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
     """
     if isinstance(source, Usd.Stage):
         return source
+    if Path(source).is_dir():
+        fail(str(source), "this is a folder", "a USD file is needed", "name one of its files")
     if not Path(source).is_file():
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
     if Path(source).suffix == ".safetensors":
