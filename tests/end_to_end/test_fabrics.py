@@ -144,6 +144,8 @@ def test_a_job_tells_what_its_tasks_lack_and_replaces_no_files_of_others(copy, c
     farm = "farm ranged.safetensors model.safetensors --stage rigged.usda --motion sway.usda --bundle job"
     assert run(f"{farm} --fabric silk") == 0
     assert "model.safetensors: --fabric silk for a model of one fabric" in capsys.readouterr().err
+    assert run(f"{farm} --material drag=9x") == 0
+    assert "drag 9 (trained from 0.25 to 4) is beyond the fabrics of its training" in capsys.readouterr().err
     before = Path("job/job.json").read_bytes()
     for words, text in (
         ("--fabric silk --range 0-999", "--range 0-999"),
