@@ -76,6 +76,12 @@ def test_a_garment_without_direction_has_the_bytes_that_it_had(stage):
     assert all("motion_sha256" in line for line in differs), differs  # which says what it was baked from
 
 
+def test_a_bake_warns_of_a_prim_that_directs_nothing(stage, capsys):
+    direct("clip.usda", free={0: 0.0}, prim="/Hero/Skrit")
+    assert main([*BAKE, "clip.usda", "-o", "shot.usdc", "--range", "0-2", "--no-verify"]) == 0
+    assert "warning: clip.usda:/Hero/Skrit: ssilk:free directs nothing" in capsys.readouterr().err
+
+
 def test_a_held_garment_is_where_skinning_has_it_and_is_let_go_without_a_jump(stage, capsys):
     plain, skinned = baked("plain.usdc"), baked("lbs.usdc", "clip.usda", "--lbs")
     direct("clip.usda", free={8: 0.0, 14: 1.0})
@@ -313,7 +319,7 @@ def test_a_layer_on_the_garment_of_the_shot_comes_before_its_own_stage(stage):
     ("free", "hold", "more", "complaint"),
     [
         ({3: 0.0, 5: 1.5}, None, [], "ssilk:free is 1.5 at time code 5; 0, held to linear blend skinning, to 1"),
-        ({3: float("nan")}, None, [], "ssilk:free is nan at time code 0"),
+        ({3: float("nan")}, None, [], "ssilk:free is nan at time code 3"),
         (None, 0, [], "ssilk:hold is 0; a whole number of frames from 1 to 100 is needed"),
         (None, 2, ["--refine", "2"], "poses that are held for 2 frames, and --refine"),
         ({0: 0.0}, None, ["--refine", "2"], "the garment is held in all frames"),

@@ -130,6 +130,33 @@ def test_a_subset_of_vertices_that_are_not_there_is_refused(shot, home):
         read(shot, home)
 
 
+def test_a_part_of_no_such_name_is_told_with_those_that_there_are(shot, home):
+    define_subset(home, "point", [0, 3])
+    home.GetPrimAtPath("/Hero/Cape").CreateAttribute("ssilk:free:lefft", Sdf.ValueTypeNames.Float).Set(0.0)
+    home.GetRootLayer().Save()
+    shot.Reload()
+    text = r"ssilk:free:lefft names neither .*; its subsets: left; its proxies: A, B; did you mean 'left'\?$"
+    with pytest.raises(SsilkError, match=text):
+        read(shot, home, proxies=["Hips/B", "Hips/A"])
+
+
+def test_a_prim_with_a_misspelt_name_is_told_until_the_garment_itself_is_directed(shot, home):
+    shot.OverridePrim("/Crowd/One/Cpae")
+    key(shot, "/Crowd/One/Cpae", {20.0: 0.0})
+    shot.OverridePrim("/Crowd/Prop")
+    key(shot, "/Crowd/Prop", {20.0: 0.0})
+    (told,) = read(shot, home).unheard
+    assert "shot.usda:/Crowd/One/Cpae: ssilk:free directs nothing; the garment is /Hero/Cape" in told
+    key(shot, "/Crowd/One/Cape", {20.0: 0.0})
+    assert not read(shot, home).unheard and len(read(shot, home, "Two").unheard) == 1
+
+
+def test_a_value_that_is_refused_is_the_one_that_was_keyed(shot, home):
+    key(shot, "/Crowd/One/Cape", {20.0: 0.5, 23.0: np.nan, 28.0: 1.0})  # between the frames at 22 and 24
+    with pytest.raises(SsilkError, match="ssilk:free is nan at time code 23;"):
+        read(shot, home)
+
+
 def test_two_garments_that_may_be_meant_are_refused(shot, home):
     twin = UsdGeom.Mesh.Define(shot, "/Crowd/One/Wardrobe/Cape").GetPrim()
     twin.CreateAttribute("ssilk:garment", Sdf.ValueTypeNames.Bool).Set(True)

@@ -127,6 +127,7 @@ class LoadedGarment:
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
         kept, reduction = self._cut(source) if request.keep else (self, None)
+        said = kept._said(request, read) if kept.model else None
         provenance = {
             **self.provenance,
             **({"reduced": reduction.to_metadata()} if reduction else {}),
@@ -157,8 +158,12 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=(*self.told, *other_bones(motion, read.sampled, self.deformer.scene.character, self.first)),
-            direction=kept._directed(request, read) if kept.model else None,
+            told=(
+                *self.told,
+                *other_bones(motion, read.sampled, self.deformer.scene.character, self.first),
+                *(Message(text, "warning") for text in (said.unheard if said else ())),
+            ),
+            direction=kept._directed(request, read, said) if said else None,
             loop=loop,
         ).begun()
 
@@ -256,15 +261,19 @@ class LoadedGarment:
             return motion
         return replace(motion, proximity=seen_proximity(seen, motion, NumpyGarment(self.file)))
 
-    def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
-        """Return how the shot directs the garment; None where it moves freely throughout."""
+    def _said(self, request: BakeRequest, read: _ReadMotion) -> SaidDirection:
+        """Return what stages say of how the garment is directed."""
         from ssilk_usd.reading.direction import SaidDirection, read_direction
 
         assert self.model is not None
-        garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
-        if garment is not None:  # a model may know its garment by a name alone
-            names = self.model.scene.rig.joint_names
-            said = read_direction(request.motion, request.stage, garment, read.whole, names)
+        garment, names = split_location(self.deformer.scene.garment.mesh.path)[1], self.model.scene.rig.joint_names
+        if garment is None:  # a model may know its garment by a name alone
+            return SaidDirection(None, 1)
+        return read_direction(request.motion, request.stage, garment, read.whole, names)
+
+    def _directed(self, request: BakeRequest, read: _ReadMotion, said: SaidDirection) -> Direction | None:
+        """Return how the shot directs the garment; None where it moves freely throughout."""
+        assert self.model is not None
         parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole) if said.parts else None
         hold = request.hold or said.hold
         if hold > 1 and request.refine:

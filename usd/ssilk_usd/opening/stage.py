@@ -25,6 +25,7 @@ from .trial import allowed_seconds, tried
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
+LONGEST_QUOTE = 200  # characters of a damaged file that are told
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 # Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -81,8 +82,11 @@ def _allowed() -> str:
 
 
 def usd_reason(error: Tf.ErrorException) -> str:
-    """Return the first message of a USD error on one line."""
-    return " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
+    """Return the first message of a USD error on one line; of a line of a file that it quotes, the beginning."""
+    if not error.args:
+        return "unknown reason"
+    says, quote, quoted = " ".join(error.args[0].commentary.split()).partition("'")
+    return f"{says}{quote}{quoted[:LONGEST_QUOTE]}..." if len(quoted) > LONGEST_QUOTE else says + quote + quoted
 
 
 @needs_whole_files
