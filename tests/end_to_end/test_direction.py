@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from ssilk_core.delivery.bake import BakeRequest, load_rollout
 from ssilk_core.delivery.bake.direction import DirectedPoses
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.runtime import Player
+from ssilk_core.quality import levels
 from ssilk_core.scene.assets import GarmentPose
 from ssilk_core.scene.kinematics import deform
 
@@ -254,6 +257,23 @@ def test_a_refined_garment_is_held_in_part(stage):
     np.testing.assert_allclose(found[4], refined[4], atol=5.1e-3)
     off, free = (np.linalg.norm(found[:3] - each[:3], axis=-1).max(axis=0) for each in (network, refined))
     assert off.min() < 1e-3 < 0.01 < off.max() and free.max() > 0.02
+
+
+def test_a_smaller_model_keeps_the_proxies_that_are_held_and_a_budget_counts_their_shapes(stage, capsys, monkeypatch):
+    """What is refused names a size that is enough."""
+    monkeypatch.setattr(levels, "SHAPES", (1.0, 0.0))
+    monkeypatch.setattr(levels, "JOINTS", (1.0, 0.0))
+    held, frames = proxies_of("rigged.usda")[0], ["clip.usda", "--range", "4-15", "-o", "small.usdc", "--budget"]
+    hold_parts("clip.usda", {f"ssilk:free:{held.rpartition('/')[2]}": {8: 0.0, 14: 1.0}})
+    assert main([*BAKE, *frames, "1kB"]) == 2
+    least = float(re.search(r"this model needs at least ([\d.]+) kB", capsys.readouterr().err)[1])
+    assert main([*BAKE, *frames, f"{least + 0.1:g}kB"]) == 0
+    assert main(["verify", "small.usdc"]) == 0
+    told, taken = capsys.readouterr().err, Path("small.usdc").stat().st_size / 1000
+    assert "1 proxies" in told and 0.95 * least < taken < 1.02 * least
+    shot = Usd.Stage.Open("small.usdc")
+    rig = next(prim for prim in shot.Traverse() if prim.IsA(UsdSkel.Skeleton))
+    assert [name for name in UsdSkel.Skeleton(rig).GetJointsAttr().Get() if "proxy" in name] == [held]
 
 
 def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):

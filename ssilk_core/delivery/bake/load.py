@@ -24,7 +24,7 @@ from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
-from .direction import Direction, held_parts
+from .direction import Direction, held_parts, held_proxies
 from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -126,8 +126,8 @@ class LoadedGarment:
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
-        kept, reduction = self._cut(source) if request.keep else (self, None)
-        said = kept._said(request, read) if kept.model else None
+        said = self._said(request, read) if self.model else None
+        kept, reduction = self._cut(source, said) if request.keep else (self, None)
         provenance = {
             **self.provenance,
             **({"reduced": reduction.to_metadata()} if reduction else {}),
@@ -287,7 +287,7 @@ class LoadedGarment:
         first = read.lead + (read.frames.before * samples if read.frames else 0)
         free = np.ones(count) if said.free is None else said.free
         hold, first = (hold * samples, first) if hold > 1 else (1, 0)
-        return Direction(free, hold, read.whole, first, parts)
+        return Direction(free, hold, read.whole, first, parts, said=said.parts)
 
     def _directed_in_loop(
         self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection, parts: HeldParts | None
@@ -314,12 +314,13 @@ class LoadedGarment:
                 fail(request.motion, found, "a loop ends as it begins", "key it so")
         rate = loop.motion.fps / read.sampled.fps
         motion = _sampled(loop.motion, read.sampled.fps, np.arange(loop.samples) * rate)
-        return Direction(loop.tiled(free), hold, motion, 0, parts and parts.of(loop.tiled))
+        return Direction(loop.tiled(free), hold, motion, 0, parts and parts.of(loop.tiled), said=said.parts)
 
-    def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
+    def _cut(self, motion: Motion, said: SaidDirection | None) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
-        assert self.model is not None and self.request.keep is not None
-        reducer = Reducer(self.file, [motion])
+        assert self.model is not None and self.request.keep is not None and said is not None
+        held = held_proxies(said.parts, self.deformer, self.model.scene.rig.joint_names)
+        reducer = Reducer(self.file, [motion], held=held)
         found = reducer.reduce(self.request.keep)
         model, deformer = _network_like(self.model, found.file, self.request)
         return replace(self, model=model, deformer=deformer), SizeReduction.of(reducer.whole, found)
@@ -403,8 +404,12 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     assert rollout.model is not None
     model, deformer = _network_like(rollout.model, file, rollout.request)
     direction = rollout.direction
-    if direction is not None and model.scene.rig.joint_names != rollout.model.scene.rig.joint_names:
-        direction = replace(direction, parts=None, shapes=None)  # it may lack a proxy that is held
+    if direction is not None and direction.parts is not None:
+        leaves = {name.rpartition("/")[2] for name in model.scene.rig.joint_names}
+        said = [part for part in direction.said if leaves and (part.vertices is not None or part.name in leaves)]
+        parts = held_parts(said, deformer, model.scene, rollout.request, rollout.whole) if said else None
+        parts = parts.of(rollout.loop.tiled) if parts and rollout.loop else parts
+        direction = replace(direction, parts=parts, shapes=None)
     return replace(rollout, model=model, deformer=deformer, direction=direction, is_fading=False).begun()
 
 

@@ -51,8 +51,8 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
         except SsilkError as error:
             unread.append(error)
     able = any(found.keys() >= set(task.request.inputs.values()) for task in tasks)
-    for error in unread if able else unread[:-1]:
-        report(Message(str(error), "warning"))
+    for fault in unread if able else unread[:-1]:
+        report(Message(str(fault), "warning"))
     if not able:
         raise unread[-1]
     tell_impossible(tasks, found, report)

@@ -279,15 +279,15 @@ def _keyed(prim: Usd.Prim, name: str, seconds: Floats) -> Floats:
     bad = ~((values >= -ROUNDING) & (values <= 1 + ROUNDING))
     if bad.any():
         at = int(np.argmax(bad))
-        found, code = float(values[at]), float(codes[at])
+        wrong, code = float(values[at]), float(codes[at])
         for key in samples_about(attribute, code):  # what somebody has keyed, in place of what is made of it
             if not 0 <= (keyed := float(attribute.Get(key))) <= 1:
-                found, code = keyed, key
+                wrong, code = keyed, key
                 break
         held = "held to linear blend skinning, to 1, free"
         ends = "the network's, to 1, posed by hand" if name.startswith(POSED) else held
         allowed = f"0, {ends}, are allowed"
-        fail(location(prim), f"{name} is {found:g} at time code {code:g}", allowed)
+        fail(location(prim), f"{name} is {wrong:g} at time code {code:g}", allowed)
     return np.broadcast_to(values.clip(0, 1), seconds.shape)
 
 
