@@ -85,6 +85,18 @@ def test_a_bake_warns_of_a_prim_that_directs_nothing(stage, capsys):
     assert "warning: clip.usda:/Hero/Skrit: ssilk:free directs nothing" in capsys.readouterr().err
 
 
+def test_a_garment_of_another_name_than_in_its_training_is_directed_by_its_own(stage, capsys):
+    """Its polygons tell which it is."""
+    layer, edit = Sdf.Layer.FindOrOpen("rigged.usda"), Sdf.BatchNamespaceEdit()
+    edit.Add("/Hero/Skirt", "/Hero/hero_skirt_GEO")
+    assert layer.Apply(edit) and layer.Export("renamed.usda")
+    layer.Reload(force=True)
+    direct("clip.usda", free={0: 0.0}, prim="/Hero/hero_skirt_GEO")
+    words = ["bake", "lively.safetensors", "--stage", "renamed.usda", "--motion", "clip.usda", "-o", "shot.usdc"]
+    assert main([*words, "--range", "0-2", "--no-verify"]) == 0
+    assert "clip.usda: 3 poses are held" in capsys.readouterr().err
+
+
 def test_a_held_garment_is_where_skinning_has_it_and_is_let_go_without_a_jump(stage, capsys):
     plain, skinned = baked("plain.usdc"), baked("lbs.usdc", "clip.usda", "--lbs")
     direct("clip.usda", free={8: 0.0, 14: 1.0})

@@ -61,7 +61,7 @@ def shot(home, tmp_path) -> Usd.Stage:
 def read(shot: Usd.Stage, home: Usd.Stage, who: str = "One", proxies: Sequence[str] = ()):
     files = (stage.GetRootLayer().realPath for stage in (shot, home))
     source, stage = files
-    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, "/Hero/Cape", motion(), proxies)
+    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, ["/Hero/Cape"], motion(), proxies)
 
 
 def test_each_of_a_crowd_is_held_by_its_own_prim_at_the_time_codes_of_the_shot(shot, home):
@@ -87,7 +87,7 @@ def test_a_clip_says_it_by_an_over_at_the_path_of_the_garment(home, tmp_path):
     clip.GetRootLayer().Save()
     path = clip.GetRootLayer().realPath
     write_direction(path, "/Hero/Cape", np.linspace(0, 1, FRAMES), FIRST, 2)
-    found = read_direction(path, home.GetRootLayer().realPath, "/Hero/Cape", motion())
+    found = read_direction(path, home.GetRootLayer().realPath, ["/Hero/Cape"], motion())
     np.testing.assert_allclose(found.free, np.linspace(0, 1, FRAMES))
     assert found.hold == 2
 

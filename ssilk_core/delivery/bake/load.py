@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -206,12 +206,22 @@ class LoadedGarment:
         read = _ReadMotion(source, sampled, whole, begun - handles, frames, hidden)
         return self._repeating(request, read) if self._loops(request, source) else read
 
+    @cached_property
+    def _places(self) -> tuple[str, ...]:
+        """Paths at which stages may direct the garment: that in the character's stage, and that of its training."""
+        from ssilk_usd.opening.stage import open_stage
+        from ssilk_usd.writing.look import look_source
+
+        mesh, stage = self.deformer.scene.garment.mesh, open_stage(self.request.stage)
+        there, trained = look_source(mesh, stage, self.request.root), split_location(mesh.path)[1]
+        found = [*([str(there.prim.GetPath())] if there else []), *([trained] if trained else [])]
+        return tuple(dict.fromkeys(found))  # a model may know its garment by a name alone
+
     def _loops(self, request: BakeRequest, motion: Motion) -> bool:
         """Return whether a shot is to be a loop; skinning alone repeats by itself."""
         from ssilk_usd.reading.direction import read_loop
 
-        garment = split_location(self.deformer.scene.garment.mesh.path)[1]
-        asked = request.loop or (garment is not None and read_loop(request.motion, request.stage, garment, motion))
+        asked = request.loop or read_loop(request.motion, request.stage, self._places, motion)
         if request.lbs or not asked:
             return False
         need_alone(request)
@@ -263,13 +273,12 @@ class LoadedGarment:
 
     def _said(self, request: BakeRequest, read: _ReadMotion) -> SaidDirection:
         """Return what stages say of how the garment is directed."""
-        from ssilk_usd.reading.direction import SaidDirection, read_direction
+        from ssilk_usd.reading.direction import read_direction
 
         assert self.model is not None
-        garment, names = split_location(self.deformer.scene.garment.mesh.path)[1], self.model.scene.rig.joint_names
-        if garment is None:  # a model may know its garment by a name alone
-            return SaidDirection(None, 1)
-        return read_direction(request.motion, request.stage, garment, read.whole, names)
+        return read_direction(
+            request.motion, request.stage, self._places, read.whole, self.model.scene.rig.joint_names
+        )
 
     def _directed(self, request: BakeRequest, read: _ReadMotion, said: SaidDirection) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""

@@ -75,14 +75,14 @@ class SaidDirection:
 
 @explains_damage
 def read_direction(
-    source: str, stage: str, garment: str, motion: Motion, proxies: Sequence[str] = ()
+    source: str, stage: str, garment: Sequence[str], motion: Motion, proxies: Sequence[str] = ()
 ) -> SaidDirection:
     """Return how a garment is directed over a motion.
 
     Args:
         source: of the motion, "file[:/Prim/Path]".
         stage: the character's file.
-        garment: path of the garment in it.
+        garment: paths by which the garment is known, that in the stage first; without any nothing is said.
         proxies: of the model, joint paths.
 
     Raises:
@@ -138,7 +138,7 @@ def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, 
 
 
 @explains_damage
-def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
+def read_loop(source: str, stage: str, garment: Sequence[str], motion: Motion) -> bool:
     """Return whether a shot is said to be a cycle; arguments and errors as `read_direction`."""
     file, _ = split_location(source)
     shot, home = open_stage(file), open_stage(stage)  # prims live as long as these
@@ -151,10 +151,11 @@ def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
     return found
 
 
-def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: str, motion: Motion) -> list[Usd.Prim]:
+def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: Sequence[str], motion: Motion) -> list[Usd.Prim]:
     """Return the garment's prims in the shot, then in the character's stage."""
     _, placed = find_animation(shot, split_location(source)[1] or split_location(motion.path)[1], None)
-    return [*_in_shot(shot, garment, placed), *filter(None, [home.GetPrimAtPath(garment)])]
+    there = [prim for path in garment for prim in _in_shot(shot, path, placed)]
+    return list(dict.fromkeys([*there, *filter(None, map(home.GetPrimAtPath, garment))]))
 
 
 def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd.Prim]:
@@ -183,20 +184,20 @@ def _refuse_misspelt(prim: Usd.Prim) -> None:
             fail(location(prim), f"an attribute {name}", allowed, f"did you mean '{near[0]}'?")
 
 
-def _unheard(stage: Usd.Stage, home: Usd.Stage, garment: str, prims: Sequence[Usd.Prim]) -> Iterator[str]:
+def _unheard(stage: Usd.Stage, home: Usd.Stage, garment: Sequence[str], prims: Sequence[Usd.Prim]) -> Iterator[str]:
     """Yield of prims without a type that direct nothing, and whose names are nearly the garment's.
 
     There is nothing to tell where the stage directs the garment itself: others may be of another character.
     """
-    leaf = garment.rpartition("/")[2]
+    leaves = [path.rpartition("/")[2].lower() for path in garment]
     if any(prim.GetStage() == stage and _directing(prim) for prim in prims):
         return
     for prim in stage.TraverseAll():
         there = home.GetPrimAtPath(prim.GetPath())
         if prim.GetTypeName() or (there and there.GetTypeName()) or prim in prims or not (said := _directing(prim)):
             continue
-        if get_close_matches(prim.GetName().lower(), [leaf.lower()], cutoff=NEAR):
-            text = f"{said[0]} directs nothing; the garment is {garment}, rename the prim if that is meant"
+        if get_close_matches(prim.GetName().lower(), leaves, cutoff=NEAR):
+            text = f"{said[0]} directs nothing; the garment is {garment[0]}, rename the prim if that is meant"
             yield f"{location(prim)}: {text}"
 
 
