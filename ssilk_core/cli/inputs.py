@@ -23,7 +23,7 @@ class Kind:
 
 MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
-SHOT = Kind("motion file", "each shot is a USD file of its own")
+SHOT = Kind("file", "each motion of a shot is a USD file")
 CHARACTER = Kind("file", "a USD stage with a character is needed")
 KINDS = {
     "model": MODEL,

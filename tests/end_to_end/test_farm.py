@@ -100,7 +100,7 @@ def test_a_job_that_no_worker_could_do_is_refused_and_nothing_is_written(farm, c
     base = "farm model.safetensors --stage rigged.usda"
     for words, text in (
         (f"{base} --motion gone.usda clips --bundle new", "clips: this is a folder; a USD file is needed"),
-        (f"{base} --motion clips --bundle new", "clips: a folder, and no motion file; each shot is a USD file"),
+        (f"{base} --motion clips --bundle new", "clips: a folder, and no file; each motion of a shot is a USD file"),
         (f"{base} --motion a.usda -o notes.txt --bundle new", "notes.txt: this is a file; the output is a folder"),
         (f"{base} --motion a.usda --bundle notes.txt", "notes.txt: this is a file; the output is a folder"),
         (f"{WORDS.replace('farm', 'bake', 1)} -o a.usda/layers", "a.usda: this is a file; the output is a folder"),
