@@ -37,6 +37,7 @@ from ..self_contact import ClothContacts, ClothNeighbours, SelfContact, Touching
 from ..self_contact.contacts import Slopes
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
+from .captured_potential import CapturedPotential
 from .contact_stiffness import ContactStiffness
 from .friction import CREEP, Friction
 from .hessian import NO_CORNERS, Hessian
@@ -57,7 +58,8 @@ class StepInputs(Framed):
             garments differently.
         predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
         advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
-        dt: time step [s]. For a quasi-static state it only damps the solver's steps.
+        dt: time step [s], or that of each frame, shape (N,). For a quasi-static state it only damps the solver's
+            steps.
         skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
         neighbours: which cloth may touch which, or None where cloth may pass through cloth.
         contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
@@ -66,19 +68,23 @@ class StepInputs(Framed):
         world: what cloth meets besides the body; None without.
     """
 
-    SHARED = frozenset({"dt"})
-
     body: PosedBody | None
     gravity: Tensor
     predicted: Tensor | None = None
     advected: Tensor | None = None
-    dt: float = 0.1
+    dt: float | Tensor = 0.1
     skinned: Tensor | None = None
     neighbours: ClothNeighbours | None = None
     contacts: ClothContacts | None = None
     friction: Friction | None = None
     pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all of it is tensors of fixed sizes: the cloth of one garment meets its body, and nothing rubs."""
+        changing = self.neighbours, self.contacts, self.friction, self.world
+        return all(each is None for each in changing) and not isinstance(self.pierced, PiercedOutfit)
 
 
 class IncrementalPotential:
@@ -118,7 +124,8 @@ class IncrementalPotential:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
-        self.__dict__.pop("_elastic_tables", None)
+        for name in ("_elastic_tables", "captured"):
+            self.__dict__.pop(name, None)
 
     @property
     def garments(self) -> list[tuple[slice, Fabric]]:
@@ -129,6 +136,11 @@ class IncrementalPotential:
     def self_contact(self) -> SelfContact:
         """What knows where the garment touches itself; nothing is spent on it where nobody asks."""
         return self._self_contact()
+
+    @cached_property
+    def captured(self) -> CapturedPotential:
+        """What a GPU computes of it at once."""
+        return CapturedPotential(self)
 
     @property
     def block_pattern(self) -> BlockPattern:
@@ -260,12 +272,16 @@ class IncrementalPotential:
                 total = total + part.energy(x)
         if inputs.world is not None:
             total = total + self._world_energy(x, inputs.world)
-        if loops.supports(x) and not x.requires_grad:
+        if self._by_loop(x, inputs) and not x.requires_grad:
             return total + self._points(x, inputs, body_distance, False)[0]
         total = total - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
         for weight, target in self._anchors(inputs):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
         return total + self.collision(x, body_distance).sum(0)
+
+    @staticmethod
+    def _by_loop(x: Tensor, inputs: StepInputs) -> bool:
+        return loops.supports(x) and not isinstance(inputs.dt, Tensor)
 
     def _points(
         self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None, wanted: bool
@@ -298,7 +314,7 @@ class IncrementalPotential:
                 total += part.gradient(x)
         if inputs.world is not None:
             total += self._world_gradient(x, inputs.world)
-        if loops.supports(x):
+        if self._by_loop(x, inputs):
             _, slopes, pushes = self._points(x, inputs, body_distance, True)
             total += slopes
             return total + self.cloth.to_vertices(pushes) if body_distance else total
@@ -407,7 +423,10 @@ class IncrementalPotential:
         return elastic_tables(len(self.mass), membrane.corners, weights, areas, corners, numbers)
 
     def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
-        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of the tether, inertia and drag, where present."""
+        """Return stiffness [N/m] and target (V, 3, N) of the tether, inertia and drag, where present.
+
+        Stiffness is (V, 1), or (V, N) where frames have time steps of their own.
+        """
         found = []
         if inputs.skinned is not None and self.fabric.tether:
             found.append((self.tether, inputs.skinned))

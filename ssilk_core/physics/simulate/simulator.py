@@ -374,8 +374,14 @@ class Simulator:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
         return minimise_from(self.potential, start, self.inputs(poses, None), self.options.quasi_static_solver)
 
-    def inputs(self, poses: PosedCharacters, past: StepHistory | None) -> StepInputs:
-        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
+    def inputs(
+        self, poses: PosedCharacters, past: StepHistory | None, dt: float | Tensor | None = None
+    ) -> StepInputs:
+        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots.
+
+        Args:
+            dt: length of the step [s], or that of each, shape (N,); the simulator's own by default.
+        """
         world = poses.world
         gravity = self.gravity.expand(3, poses.root.shape[-1]) if world is None else world.gravity
         met = world if world and world.has_colliders else None
@@ -389,7 +395,8 @@ class Simulator:
         limbs = poses.body.limbs
         pierced = past.pierced.on(limbs) if past.pierced and limbs else None
         advected = past.local if world is None else self._advected(world, past, poses)
-        own = predicted.to(past.lbs.dtype), advected, self.dt, poses.lbs
+        dt = self.dt if dt is None else dt.to(past.lbs.dtype) if isinstance(dt, Tensor) else dt
+        own = predicted.to(past.lbs.dtype), advected, dt, poses.lbs
         return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced, world=met)
 
     def _advected(self, world: PosedWorld, past: StepHistory, poses: PosedCharacters) -> Tensor:
@@ -423,9 +430,13 @@ class Simulator:
                 pushed[:, frame] = torch.as_tensor(blown).to(pushed)
         return fabric.drag / fabric.density * pushed
 
-    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int]) -> Search:
-        """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots."""
-        inputs = self.inputs(poses, past)
+    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int], dt: float | Tensor) -> Search:
+        """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots.
+
+        Args:
+            dt: as in `inputs`.
+        """
+        inputs = self.inputs(poses, past, dt)
         start = self.potential.best_start(self.starts(poses, past, inputs), inputs)
         x, inputs = self._carried(past.local, start, inputs, past.neighbours)
         return Search(self.potential, self.apply_pins(x, poses), inputs, self.options.solver, numbers)
