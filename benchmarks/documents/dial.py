@@ -106,12 +106,16 @@ def panel(garment: str, device: str = "cpu") -> ChartPanel:
         fail(f"dial_{garment}.json", missing, "both devices are drawn", "measure them by 'dial.py times'")
     points = {
         split: [
-            (took[place, device], _distance(rows[place][split]), NAMED.get(place, place) if split == "flips" else "")
+            (
+                took[place, device],
+                _distance(rows[place][split]),
+                NAMED.get(place, place) if split == [*rows[place]][-1] else "",
+            )
             for place in drawn
             if split in rows[place]
         ]
         for split in SPLITS
-    }  # above each other, so the names of one do for both
+    }  # above each other, so that the names of one split do
     return ChartPanel(
         title=GARMENTS[garment],
         x=f"time of a frame, {DEVICES[device]} [ms]",

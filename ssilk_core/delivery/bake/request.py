@@ -174,6 +174,11 @@ class BakeRequest:
         return {name: getattr(self, name) for name in INPUTS}
 
     @property
+    def meets_beneath(self) -> bool:
+        """Whether it is refined or certified, and so over garments beneath as their files have them."""
+        return self.certify or self.refine != 0
+
+    @property
     def writes_points(self) -> bool:
         """Whether the garment is refined and written as points instead of joints."""
         return self.refine != 0 and self.refined_output == "points"

@@ -118,7 +118,7 @@ def _environment() -> dict[str, Any]:
 
 
 def _steps(tasks: Sequence[BakeTask], options: BundleOptions) -> list[dict[str, Any]]:
-    """Return the steps: outer garments are certified over inner ones, which are baked in a step before."""
+    """Return the steps: outer garments are refined or certified over inner ones, which are baked in a step before."""
     steps, first = list[dict[str, Any]](), 0
     for number, level in enumerate(in_levels(tasks)):
         name = "BakeOver" + (str(number) if number > 1 else "") if number else "Bake"

@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,9 @@ from torch import Tensor
 from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
+from ..captured import Captured
 from ..collision import Contacts, PosedBody, SmoothedDistance
+from ..collision.inner_cloth import PosedBeneath
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
@@ -66,6 +69,7 @@ class StepInputs(Framed):
         friction: of what pressed in the step before; None without.
         pierced: the cloth that limbs are through, wherever it goes; None where that is found at each position.
         world: what cloth meets besides the body; None without.
+        beneath: the garments beneath, for a potential that meets them (`over_cloth`); None without.
     """
 
     body: PosedBody | None
@@ -79,6 +83,7 @@ class StepInputs(Framed):
     friction: Friction | None = None
     pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
+    beneath: PosedBeneath | None = None
 
     @property
     def is_plain(self) -> bool:
@@ -93,6 +98,8 @@ class IncrementalPotential:
     Attributes:
         free: indices of the free vertices: not pinned, with mass, shape (U,).
         size: diagonal of the garment's bounding box at rest [m].
+        cloth: the samples at which it meets things, those that meet the body and the world first.
+        sample_count: of these.
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
@@ -116,6 +123,7 @@ class IncrementalPotential:
         self.tether[energy.tethered, 0] = energy.tether_stiffness
         self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
+        self.sample_count = len(self.cloth.area)
         self.contacts = Contacts(scene, self.cloth.samples, limbs=limbs, device=device)
         self._self_contact = partial(SelfContact, TouchingCloth.of(scene, fabric), device, dtype)
         self.use(Hessian.of(scene, energy))
@@ -140,7 +148,19 @@ class IncrementalPotential:
     @cached_property
     def captured(self) -> CapturedPotential:
         """What a GPU computes of it at once."""
-        return CapturedPotential(self)
+
+        def state(x: Tensor, inputs: StepInputs) -> list[Tensor]:
+            distance = self.body_distance(x, inputs)
+            return [self.energy(x, inputs, distance), *(distance.tensors() if distance else [])]
+
+        def gradient(x: Tensor, inputs: StepInputs, distance: SmoothedDistance | None) -> list[Tensor]:
+            return [self.gradient(x, inputs, distance)]
+
+        def hessian(x: Tensor, inputs: StepInputs, *others: Any) -> list[Tensor]:
+            matrix = self.hessian(x, inputs, *others)
+            return [matrix.blocks, matrix.inverse_diagonal()]
+
+        return CapturedPotential(Captured(state), Captured(gradient), Captured(hessian))
 
     @property
     def block_pattern(self) -> BlockPattern:
@@ -161,7 +181,7 @@ class IncrementalPotential:
             return None
         assert not isinstance(inputs.pierced, PiercedOutfit)
         within = self.law.start + allowance
-        return self.contacts.smoothed(self.cloth.positions(x), inputs.body, within, inputs.pierced)
+        return self.contacts.smoothed(self._own_samples(x), inputs.body, within, inputs.pierced)
 
     def body_distance_nearby(
         self, x: Tensor, inputs: StepInputs, known: SmoothedDistance | None, at: Tensor
@@ -170,8 +190,8 @@ class IncrementalPotential:
         other positions `at` (V, 3, N) are known: on a processor in less time, the nearer the two are."""
         if inputs.body is None or known is None or inputs.pierced is not None:
             return self.body_distance(x, inputs)
-        positions, within = self.cloth.positions, self.law.start
-        return self.contacts.smoothed_nearby(positions(x), inputs.body, known, positions(at), within)
+        samples, within = self._own_samples, self.law.start
+        return self.contacts.smoothed_nearby(samples(x), inputs.body, known, samples(at), within)
 
     def with_contacts(self, x: Tensor, inputs: StepInputs, moved: bool = False) -> StepInputs:
         """Return inputs with the contacts of cloth with cloth at x, where cloth may not pass through cloth.
@@ -358,14 +378,14 @@ class IncrementalPotential:
 
     def _world_energy(self, x: Tensor, world: PosedWorld) -> Tensor:
         """Return the energy of contact with what surrounds the character [J], shape (N,)."""
-        near = world.touched(self.cloth.positions(x), self.law.start)
+        near = world.touched(self._own_samples(x), self.law.start)
         each = self.cloth.area[near.row, 0] * self.law.energy(near.distance)
         return x.new_zeros(x.shape[-1]).index_put_((near.frame,), each, accumulate=True)
 
     def _world_gradient(self, x: Tensor, world: PosedWorld) -> Tensor:
         """Return its gradient [N], shape (V, 3, N)."""
         samples = self.cloth.positions(x)
-        near = world.touched(samples, self.law.start)
+        near = world.touched(samples[: self.sample_count], self.law.start)
         push = -self.cloth.area[near.row, 0] * self.law.pressure(near.distance) * near.normal
         pushes = samples.new_zeros(len(samples), x.shape[-1], 3)
         pushes.index_put_((near.row, near.frame), push.T, accumulate=True)
@@ -377,12 +397,16 @@ class IncrementalPotential:
         How its normal turns is left out: outside of edges and corners that would make a block indefinite.
         """
         samples = self.cloth.positions(x)
-        near = world.touched(samples, self.law.start)
+        near = world.touched(samples[: self.sample_count], self.law.start)
         stiffness = self.cloth.area[near.row, 0] * self.law.curvature(near.distance)
         blocks = samples.new_zeros(len(samples), x.shape[-1], 3, 3)
         each = (stiffness * near.normal[:, None] * near.normal).permute(2, 0, 1)
         blocks = blocks.index_put_((near.row, near.frame), each, accumulate=True).permute(0, 2, 3, 1)
         return blocks if contact is None else contact + blocks
+
+    def _own_samples(self, x: Tensor) -> Tensor:
+        """Return the samples that meet body and world, at positions (V, 3, N), shape (S, 3, N)."""
+        return self.cloth.positions(x)[: self.sample_count]
 
     def _stiffness(self, x: Tensor, slopes: Slopes) -> ContactStiffness:
         """Return the Hessian that slopes add up to."""

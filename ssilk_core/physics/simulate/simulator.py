@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from ...scene.assets import Floats, Motion, Scene, ShotWorld, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
 from ..collision import limb_axes
+from ..collision.inner_cloth import InnerSurface
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
@@ -41,6 +43,7 @@ from .history import StepHistory
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Search, Solution, SolverOptions, minimise_from
 from .outfit import OutfitPotential, WornGarment
+from .over_cloth import OverPotential
 from .scheduler import Asked, Course, Scheduler
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
@@ -150,6 +153,7 @@ class Simulator:
         options: SimulationOptions | None = None,
         *,
         over: Sequence[WornGarment] = (),
+        beneath: Sequence[InnerSurface] = (),
         device: torch.device | str = "cpu",
         report: Reporter = silent,
     ) -> None:
@@ -157,6 +161,8 @@ class Simulator:
 
         Args:
             over: garments that are worn with the scene's, outer ones last.
+            beneath: garments that the scene's lies over, which others move: its potential meets them where the
+                inputs of a step say where they are. The simulator's own steps do not.
         """
         self.report = report
         self.options, device = options or SimulationOptions(), torch.device(device)
@@ -169,7 +175,12 @@ class Simulator:
             outfit = OutfitPotential(worn, own=self.options.self_contact, device=device, dtype=dtype)
             self.potential, limbs, self._offsets = outfit, outfit.limbs, outfit.offsets
         else:
-            self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
+            common: dict[str, Any] = {"device": device, "dtype": dtype}
+            self.potential = (
+                OverPotential(scene, fabric, beneath, **common)
+                if beneath
+                else IncrementalPotential(scene, fabric, **common)
+            )
             limbs = limb_axes(scene)
         self.poser = CharacterPoser(scenes, limbs, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
