@@ -349,7 +349,9 @@ def test_a_level_of_quality_of_a_member_is_fitted_to_it(world, monkeypatch):
     from ssilk_core.delivery.bake import sizing
 
     reduced, original = [], sizing.Reducer
-    monkeypatch.setattr(sizing, "Reducer", lambda file, motions: reduced.append(file) or original(file, motions))
+    monkeypatch.setattr(
+        sizing, "Reducer", lambda file, *given, **kept: reduced.append(file) or original(file, *given, **kept)
+    )
     assert run(f"{BAKE} --stage heavier.usda --budget 1MB -o small.usda") == 0
     (file,) = reduced
     points = file.scene.garment.mesh.points
