@@ -392,7 +392,7 @@ def test_between_two_poses_joints_turn_about_their_parents(toy_grid) -> None:
 
 @pytest.mark.parametrize("cloth, self_contact", [(CLOTH, False), (replace(CLOTH, friction=0.4), True)])
 def test_a_shot_that_needs_shorter_steps_leaves_the_others_as_they_are(toy_grid, cloth, self_contact) -> None:
-    scene, pose = arm_behind_a_sheet(*toy_grid(21, 17, height=0.5, width=0.4))
+    scene, pose = arm_behind_a_sheet(*toy_grid(13, 11, height=0.5, width=0.4))
     angles = [0, 0, 90, 90], [0, 2, 4, 6]
     jumps, moves = (Motion("/arm", 30.0, forward(each), np.repeat(pose.translations, 4, axis=0)) for each in angles)
     options = SimulationOptions(self_contact=self_contact)
