@@ -126,9 +126,11 @@ def simulated(bench: DialBench, group: Sequence[Played]) -> None:
     network = {
         one.split: range(end - len(one.own), end) for one, end in zip(group, ends) if one.place == NETWORK.name
     }
+    simulator = bench.subject.dressed.simulator
+    simulator.options = replace(simulator.options, batch=len(every))  # those that take longest begin with the others
     reached: dict[int, Tensor] = {}
     waiting = dict(zip(ends.tolist(), group))
-    for number, x in continuations(bench.subject.dressed.simulator, every, told):
+    for number, x in continuations(simulator, every, told):
         reached[number] = x
         for end, one in list(waiting.items()):
             # The simulation from the network's own states is what that from a millimetre beside is compared with.

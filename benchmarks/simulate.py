@@ -51,9 +51,9 @@ class Watched(Simulator):
         self.solutions: list[Solution] = []
         self.first: list[Solution] = []
 
-    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int]) -> Search:
+    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int], dt: float | Tensor) -> Search:
         """Begin with steps of shots."""
-        found = super().search(poses, past, numbers)
+        found = super().search(poses, past, numbers, dt)
         if 0 in numbers:
             row = torch.tensor([list(numbers).index(0)], device=found.residual.device)
             self.problems.append((found.state.x[..., row], found.inputs.select(row)))

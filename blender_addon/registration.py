@@ -25,10 +25,11 @@ from .operators import (
     tasks,
     to_bones,
     training,
+    try_on,
 )
 from .panels import plot
 from .playback import playing, saving
-from .quality import heat_updates
+from .quality import heat_updates, tried_on
 from .scene import overlay
 from .settings import garment as garment_settings
 from .settings import preflight as preflight_settings
@@ -54,6 +55,7 @@ CLASSES = (
     *gltf_export.CLASSES,
     *playback.CLASSES,
     *quality.CLASSES,
+    *try_on.CLASSES,
     *outfit.CLASSES,
     *panels.CLASSES,
 )
@@ -81,6 +83,7 @@ def unregister() -> None:
     overlay.hide()
     quality.remove_key()
     heat_updates.stop_listening()
+    tried_on.forget()
     saving.stop_listening()
     playing.stop_listening()
     training.stop_watching(bpy.context)

@@ -148,6 +148,16 @@ def split_location(text: str) -> tuple[str, str | None]:
     return (file, f"/{prim}") if colon and Path(file).suffix else (text, None)
 
 
+def split_body(text: str) -> tuple[str, str]:
+    """Split "file[:SHAPE=WEIGHT,...]", a body of a stage, into the file and its shapes ("" without any).
+
+    A path of a prim after it stays with the file: `split_location` goes first.
+    """
+    file, colon, shapes = text.rpartition(":")
+    named = bool(colon) and "=" in shapes and "/" not in shapes and Path(file).suffix in USD_NAMES
+    return (file, shapes) if named else (text, "")
+
+
 def need_writable(target: str | Path) -> None:
     """Check before a long task that `target` can be written; leave no file behind.
 
@@ -158,6 +168,7 @@ def need_writable(target: str | Path) -> None:
     if target.is_dir():
         fail(str(target), "this is a folder", "the output is a file", "add a file name")
     folder = next(above for above in target.absolute().parents if above.exists())
+    need_folder(target.parent)
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -165,10 +176,20 @@ def need_writable(target: str | Path) -> None:
         fail(str(target), f"cannot be written ({error.strerror or error})", WRITABLE)
 
 
+def need_folder(target: str | Path) -> None:
+    """Raise `SsilkError` where files are to be written into `target`, which is a file itself, or lies in one."""
+    for above in (Path(target), *Path(target).parents):
+        if above.exists():
+            if not above.is_dir():
+                fail(str(above), "this is a file", "the output is a folder, there already or not", "name another one")
+            return
+
+
 def need_not_input(target: str | Path, *inputs: Path | str | None) -> None:
     """Raise `SsilkError` if `target` is one of the `inputs`, which are never overwritten."""
     target = Path(target)
-    same = target.exists() and any(Path(path).exists() and target.samefile(path) for path in inputs if path)
+    files = [Path(split_body(str(path))[0]) for path in inputs if path]
+    same = target.exists() and any(path.exists() and target.samefile(path) for path in files)
     if same:
         fail(str(target), "the output is also an input", "inputs are never overwritten", "name another file")
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import mean, median
 from typing import Any
@@ -46,19 +46,19 @@ def dial() -> str:
     for garment, words in GARMENTS.items():
         took = times(garment)
         for number, (place, splits) in enumerate(places(garment).items()):
-            own = [splits[split] for split in SPLITS if split in splits]
+            own = [splits.get(split) for split in SPLITS]
             spent = (took.get((place, device)) for device in DEVICES)
             rows.append([
                 "" if number else words,
                 SHOWN.get(place, place),
                 *("" if ms is None else digits(ms, 2) for ms in spent),
-                *(_pair([fixed(median(row["distance"][after]), 0, 1e-3) for row in own]) for after in ("10", "30")),
-                _pair([fixed(median(row["velocity"]), 2) for row in own]),
-                _pair([digits(mean(row["total"])) for row in own]),
-                _pair([percent(mean(row["shown"]), 2) for row in own]),
-                _pair([percent(mean(row["limbs"]), 0) for row in own]),
-                _pair([percent(mean(row["intersecting"]), 1) for row in own]),
-                _pair([fixed(median(row["jitter"]), 1, 1e-3) for row in own]),
+                *(_pair(own, _after(frames)) for frames in ("10", "30")),
+                _pair(own, lambda row: fixed(median(row["velocity"]), 2)),
+                _pair(own, lambda row: digits(mean(row["total"]))),
+                _pair(own, lambda row: percent(mean(row["shown"]), 2)),
+                _pair(own, lambda row: percent(mean(row["limbs"]), 0)),
+                _pair(own, lambda row: percent(mean(row["intersecting"]), 1)),
+                _pair(own, lambda row: fixed(median(row["jitter"]), 1, 1e-3)),
                 *_sizes(place, {variant: at for (model, variant), at in sizes.items() if model == garment}),
             ])  # fmt: skip
     header = ("garment", "place", "one core [ms]", "GPU [ms]", "after 10 [mm]", "30 [mm]", "velocity [m/s]",
@@ -78,8 +78,14 @@ def _sizes(place: str, variants: dict[str, Row]) -> tuple[str, str]:
     return "" if place == SIMULATOR else fixed(model, 1, 1e6), fixed(shot, 1, 1e6)
 
 
-def _pair(figures: Sequence[str]) -> str:
-    return ", ".join(figures)
+def _after(frames: str) -> Callable[[Row], str]:
+    """Return what tells the distance after so many frames [mm]."""
+    return lambda row: fixed(median(row["distance"][frames]), 0, 1e-3)
+
+
+def _pair(rows: Sequence[Row | None], figure: Callable[[Row], str]) -> str:
+    """Return a figure of each split, a dash for one that was not measured."""
+    return ", ".join("–" if row is None else figure(row) for row in rows)
 
 
 def draw(path: Path) -> None:
@@ -100,11 +106,16 @@ def panel(garment: str, device: str = "cpu") -> ChartPanel:
         fail(f"dial_{garment}.json", missing, "both devices are drawn", "measure them by 'dial.py times'")
     points = {
         split: [
-            (took[place, device], _distance(rows[place][split]), NAMED.get(place, place) if split == "flips" else "")
+            (
+                took[place, device],
+                _distance(rows[place][split]),
+                NAMED.get(place, place) if split == [*rows[place]][-1] else "",
+            )
             for place in drawn
+            if split in rows[place]
         ]
         for split in SPLITS
-    }  # above each other, so the names of one do for both
+    }  # above each other, so that the names of one split do
     return ChartPanel(
         title=GARMENTS[garment],
         x=f"time of a frame, {DEVICES[device]} [ms]",

@@ -66,9 +66,15 @@ def drape() -> str:
     rows = []
     for name, found in result("drape").items():
         length, share = found["bending length [mm]"], found["drape coefficient [%]"]
-        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), fixed(length, 1), fixed(share),
-                     STATED_DRAPE.get(name, "")])  # fmt: skip
-    header = ("preset", "weight [g/m²]", "bending length [mm]", "drape coefficient [%]", "stated elsewhere [%]")
+        stiffer = [
+            f"{found['stiffer: bending [N m]']:.1e}", fixed(found["stiffer: bending length [mm]"], 1),
+            fixed(found["stiffer: drape coefficient [%]"]),
+        ] if name in STATED_DRAPE else [""] * 3  # fmt: skip
+        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), f"{found['bending [N m]']:.1e}", fixed(length, 1),
+                     fixed(share), STATED_DRAPE.get(name, ""), *stiffer])  # fmt: skip
+    header = ("preset", "weight [g/m²]", "`bending` [N m]", "bending length [mm]", "drape coefficient [%]",
+              "stated elsewhere [%]", "reached with `bending` [N m]", "bending length [mm]",
+              "drape coefficient [%]")  # fmt: skip
     return table(header, rows)
 
 

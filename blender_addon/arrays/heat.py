@@ -43,6 +43,15 @@ def elongations(rest: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> 
     return found
 
 
+def told_inside(deep: np.ndarray) -> str:
+    """Return in words how much cloth lies inside a body, by how deep its vertices do [m], shape (V,)."""
+    count = int((deep > 0).sum())
+    if not count:
+        return "Nothing is inside the body"
+    share = f"{count / len(deep):.1%} of the vertices" if count > 1 else "One vertex"
+    return f"{share} {'are' if count > 1 else 'is'} inside the body, {1000 * deep.max():.1f} mm at most"
+
+
 def depths(
     points: np.ndarray, places: np.ndarray, nearest: np.ndarray, body: np.ndarray, triangles: np.ndarray
 ) -> np.ndarray:

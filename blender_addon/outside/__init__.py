@@ -3,6 +3,6 @@
 
 A command comes in; progress and a result go out. Open `work.py` first for one piece of work, and `jobs.py` for
 trainings that outlive Blender: `runner.py` runs each, in the Python that has ssilk. `python` finds that Python, and
-`probe` and `demo_motions` are scripts that it runs, `gltf_export` one that another Blender runs. `training_report`
-and `wording` put what was said into an artist's words.
+`probe`, `demo_motions` and `try_on` are scripts that it runs, `gltf_export` one that another Blender runs.
+`training_report` and `wording` put what was said into an artist's words.
 """

@@ -7,7 +7,7 @@ Open `base.py` first: what all panels share. `CLASSES` is the order of the sideb
 from __future__ import annotations
 
 from .classes import ClassesPanel
-from .garment import FabricPanel, GarmentPanel
+from .garment import FabricPanel, GarmentPanel, TryOnPanel
 from .playback import BakingPanel, HeldProxyPanel, PlaybackPanel, PlayedFabricPanel
 from .preflight import FindingList, PreflightPanel
 from .quality import QualityPanel
@@ -19,6 +19,7 @@ CLASSES = (
     MotionList,
     GarmentPanel,
     FabricPanel,
+    TryOnPanel,
     PreflightPanel,
     ClassesPanel,
     RigPanel,

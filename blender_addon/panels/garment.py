@@ -10,7 +10,9 @@ from ..operators import make_it_move, outfit, tasks
 from ..outside.training_report import improvement
 from ..playback.models import orphans, progress_of
 from ..preferences import ROOT, unready
+from ..quality import tried_on
 from ..scene.garment import armature_of, garments_of, unplayable, unusable
+from ..settings.try_on import KEYS
 from .base import SidebarPanel, UsableGarmentPanel, draw_text, draw_work, saying_errors
 from .training import draw_bar
 
@@ -124,3 +126,43 @@ class FabricPanel(UsableGarmentPanel, bpy.types.Panel):
         contact = CONTACT[fabric.contact_model]
         for name in ("bending", "drag", "contact_model", *contact, "margin", "thickness", "tether", "stitch"):
             layout.prop(fabric, name)
+
+
+def draw_body_keys(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) -> None:
+    """Draw the shape keys that make a body, each with its value there."""
+    column = layout.column(align=True)
+    for number, item in enumerate(settings.keys):
+        row = column.row(align=True)
+        row.prop(item, "key", text="")
+        row.prop(item, "value", text="")
+        row.operator("ssilk.remove_body_key", text="", icon="X").index = number
+    column.operator("ssilk.add_body_key", icon="ADD")
+
+
+class TryOnPanel(UsableGarmentPanel, bpy.types.Panel):
+    bl_idname = "SSILK_PT_try_on"
+    bl_label = "Try On"
+    section = "try-on"
+    bl_parent_id = "SSILK_PT_garment"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @saying_errors
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, garment, settings = self.layout, context.object, context.object.ssilk.try_on
+        layout.prop(settings, "body")
+        if settings.body == KEYS:
+            draw_body_keys(layout, settings)
+        else:
+            layout.prop(settings, "stage")
+        shown = tried_on.find(garment)
+        row = layout.row(align=True)
+        row.operator("ssilk.try_on", icon="MOD_CLOTH")
+        if shown is None:
+            return
+        row.operator("ssilk.stop_trying_on", text="", icon="X")
+        draw_text(layout, f"Beside the character, at rest; 1 is {tried_on.body_of(shown)}")
+        layout.prop(settings, "share", slider=True)
+        if line := tried_on.inside_line(garment):
+            draw_text(layout, line)
+        if tried_on.changed(garment):
+            draw_text(layout, "The garment or a body has changed since; try it on again", icon="ERROR")

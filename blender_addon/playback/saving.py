@@ -24,7 +24,8 @@ def paths() -> Iterator[tuple[Any, str]]:
             training = thing.ssilk.training
             files = [(item, "name") for item in training.motions if item.kind == FILE and not is_override(thing)]
             linked = {origin(thing).ssilk.model, origin(thing).ssilk.training.folder} if is_override(thing) else set()
-            for holder, name in ((thing.ssilk, "model"), (training, "folder"), *files):
+            own = ((thing.ssilk, "model"), (training, "folder"), (thing.ssilk.try_on, "stage"))
+            for holder, name in (*own, *files):
                 if getattr(holder, name).startswith("//") and getattr(holder, name) not in linked:
                     yield holder, name
 

@@ -123,8 +123,9 @@ def measuring(
     need_unmasked(bodies)
     need_enabled(bodies)
     surfaces = [_surface(body.evaluated_get(depsgraph)) for body in bodies]
-    for surface in surfaces:
-        depths.append((yield from scaled(_depths(points, *surface), len(depths) / len(surfaces), 1 / len(surfaces))))
+    for number, surface in enumerate(surfaces):
+        steps = depths_in(points, *surface)
+        depths.append((yield from scaled(steps, number / len(surfaces), 1 / len(surfaces))))
     return HeatMap(kind, scale * np.max(depths, axis=0))
 
 
@@ -282,7 +283,7 @@ def _at_rest(thing: bpy.types.Object, points: np.ndarray) -> np.ndarray:
     return points @ world[:3, :3].T + world[:3, 3]
 
 
-def _depths(points: np.ndarray, surface: np.ndarray, triangles: np.ndarray) -> Generator[float, None, np.ndarray]:
+def depths_in(points: np.ndarray, surface: np.ndarray, triangles: np.ndarray) -> Generator[float, None, np.ndarray]:
     """Find how deep points lie inside a body, by its nearest triangles, in world units, shape (V,).
 
     In the world: what is nearest to a scaled object is not what is nearest before it is scaled.

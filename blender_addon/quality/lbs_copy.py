@@ -13,6 +13,7 @@ from ssilk_usd.shots.skinned import SkinnedGarment
 from ..arrays.classes import COLOR_ATTRIBUTE
 from ..playback.models import TrainedGarment, model_of
 from ..scene.armature import read_joints
+from ..scene.beside import clear_shapes, find_beside, remove_beside, show_beside
 from ..scene.garment import armature_of
 from ..scene.linked import local_copy, open_collection, own_copy
 from ..scene.meshes import need_relative
@@ -21,12 +22,11 @@ from ..scene.weights import write_groups
 from .heat import ATTRIBUTE
 
 OWNER = "ssilk_plain_of"  # custom property of the empty and the copy: the garment
-GAP = 1.3  # distance in widths of the garment
 
 
 def find_copy(garment: bpy.types.Object) -> bpy.types.Object | None:
     """Return the empty that shows a garment's LBS copy; None where there is none."""
-    return next((thing for thing in bpy.data.objects if thing.type == "EMPTY" and thing.get(OWNER) == garment), None)
+    return find_beside(garment, OWNER)
 
 
 def show_copy(garment: bpy.types.Object) -> None:
@@ -41,25 +41,18 @@ def show_copy(garment: bpy.types.Object) -> None:
     trained = TrainedGarment(model_of(garment), garment, armature, joints)
     laid = trained.lay(garment, armature, joints, SkinnedGarment.of(trained.player.deformer()))
     copy = _lbs_copy(garment, trained, laid.offsets if laid else None)
-    collection = bpy.data.collections.new(f"{garment.name} LBS")
-    collection.objects.link(copy)
-    shown = bpy.data.objects.new(f"{garment.name} LBS, beside", None)
-    shown[OWNER] = garment
-    shown.instance_type, shown.instance_collection = "COLLECTION", collection
-    shown.location.x = GAP * max(garment.dimensions.x, garment.dimensions.y)
-    open_collection(garment).objects.link(shown)
+    show_beside(
+        garment, [copy], OWNER, name=f"{garment.name} LBS", empty=f"{garment.name} LBS, beside",
+        width=max(garment.dimensions.x, garment.dimensions.y), into=open_collection(garment),
+    )  # fmt: skip
 
 
 def remove_copy(shown: bpy.types.Object) -> None:
     """Remove the copy and what shows it."""
-    collection = shown.instance_collection
-    for copy in list(collection.objects):
-        bpy.data.meshes.remove(copy.data)
-    bpy.data.collections.remove(collection)
-    bpy.data.objects.remove(shown)
+    remove_beside(shown)
 
 
-def _clear_colors(mesh: bpy.types.Mesh) -> None:
+def clear_colors(mesh: bpy.types.Mesh) -> None:
     """Remove the colours of heat, and of classes: beside a heat map they would be read as heat."""
     colors = mesh.color_attributes
     for name in (ATTRIBUTE, COLOR_ATTRIBUTE):
@@ -68,15 +61,10 @@ def _clear_colors(mesh: bpy.types.Mesh) -> None:
 
 
 def _clear_shapes(copy: bpy.types.Object) -> None:
-    keys = copy.data.shape_keys
-    if keys is None:
-        return
-    name, worn = keys.name, worn_points(copy)
-    copy.shape_key_clear()
-    copy.data.vertices.foreach_set("co", worn.reshape(-1))
-    left = bpy.data.shape_keys.get(name)  # Blender frees them since 5.2; before, they stay unused in the file
-    if left:
-        bpy.data.batch_remove([left])
+    if copy.data.shape_keys:
+        worn = worn_points(copy)
+        clear_shapes(copy)
+        copy.data.vertices.foreach_set("co", worn.reshape(-1))
 
 
 def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment, laid: np.ndarray | None) -> bpy.types.Object:
@@ -85,7 +73,7 @@ def _lbs_copy(garment: bpy.types.Object, trained: TrainedGarment, laid: np.ndarr
     copy[OWNER] = garment
     copy.ssilk.live = False
     copy.ssilk.heat = ""  # the heat of the garment is not its own
-    _clear_colors(copy.data)
+    clear_colors(copy.data)
     _clear_shapes(copy)
     copy.vertex_groups.clear()
     if laid is not None:

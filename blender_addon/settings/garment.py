@@ -18,10 +18,11 @@ from ssilk_core.scene.assets import SOFTEST, STIFFEST
 from ssilk_core.scene.kinematics import MAX_HOLD
 
 from ..scene.classes import tighten
-from . import fabric, played, training
+from . import fabric, played, training, try_on
 from .fabric import FabricSettings
 from .played import PlayedFabric
 from .training import RELATIVE, SHOTS, TrainingSettings
+from .try_on import TryOnSettings
 
 LIVE_QUALITIES = [
     ("NETWORK", "Network", "The network's own motion, at once"),
@@ -89,6 +90,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     played: PointerProperty(
         type=PlayedFabric, name="Played Fabric", description="What the garment is played and baked as", override=SHOTS
     )
+    try_on: PointerProperty(type=TryOnSettings, name="Try On", description="Which other body it is tried on")
     tightness: FloatProperty(
         name="Tightness",
         description="How much of the garment is tight: nothing but what is pinned, or all; replaces what is painted, "
@@ -196,7 +198,7 @@ class GarmentSettings(bpy.types.PropertyGroup):
     )
 
 
-CLASSES = (*training.CLASSES, *fabric.CLASSES, *played.CLASSES, BoneMatch, GarmentSettings)
+CLASSES = (*training.CLASSES, *fabric.CLASSES, *played.CLASSES, *try_on.CLASSES, BoneMatch, GarmentSettings)
 
 
 def attach() -> None:

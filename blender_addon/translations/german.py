@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 WORDS = {
-    # Garment, fabric
+    # Garment
     "Garment": "Kleidungsstück",
     "Armature": "Skelett",
     "Armature of the character that wears the garment; found by its Armature modifier when empty": (
@@ -47,6 +47,46 @@ WORDS = {
     "Meshes that the garment collides with; all others bound to the armature when empty": (
         "Netze, mit denen das Kleidungsstück kollidiert; leer: alle anderen, die an das Skelett gebunden sind"
     ),
+    # Try on
+    "Try On": "Anprobieren",
+    "Which other body it is tried on": "An welchem anderen Körper es anprobiert wird",
+    "Show a copy of the garment on another body, beside the character; the garment itself stays as it is": (
+        "Eine Kopie des Kleidungsstücks an einem anderen Körper zeigen, neben der Figur; das Kleidungsstück selbst "
+        "bleibt, wie es ist"
+    ),
+    "Stop Trying On": "Anprobe beenden",
+    "Remove what shows the garment on another body": "Entfernen, was es an einem anderen Körper zeigt",
+    "Add Shape Key": "Formschlüssel hinzufügen",
+    "Add a shape key that makes the body to try on": (
+        "Einen Formschlüssel hinzufügen, der den anderen Körper ausmacht"
+    ),
+    "Remove Shape Key": "Formschlüssel entfernen",
+    "Take this shape key from the list; the body keeps it": (
+        "Diesen Formschlüssel aus der Liste nehmen; der Körper behält ihn"
+    ),
+    "Body": "Körper",
+    "Where the body to try on comes from": "Woher der andere Körper kommt",
+    "Shape Keys": "Formschlüssel",
+    "The character's own bodies with other values of their shape keys": (
+        "Die Körper der Figur mit anderen Werten ihrer Formschlüssel"
+    ),
+    "USD Stage": "USD-Stage",
+    "Another character with the same joints, and bodies with the same points and faces": (
+        "Eine andere Figur mit denselben Gelenken, und Körpern mit denselben Punkten und Flächen"
+    ),
+    "Shape Key": "Formschlüssel",
+    "Shape key of a body; all bodies that have it": "Formschlüssel eines Körpers; alle Körper, die ihn haben",
+    "Value": "Wert",
+    "Value of the shape key on the body to try on": "Wert des Formschlüssels am anderen Körper",
+    "Stage": "Stage",
+    "USD file of another character of the family; followed by :/Root where it holds several": (
+        "USD-Datei einer anderen Figur der Familie; gefolgt von :/Wurzel, wenn sie mehrere enthält"
+    ),
+    "Share": "Anteil",
+    "0 is the body that the garment was fitted to, 1 the other one": (
+        "0 ist der Körper, dem das Kleidungsstück angepasst wurde, 1 der andere"
+    ),
+    # Fabric
     "Fabric": "Stoff",
     "Match Bones": "Knochen zuordnen",
     "Bone": "Knochen",

@@ -98,11 +98,18 @@ def _options_of(
         "stage": Path(table["stage"]),
         "garment": table.get("garment"),
         "motion": [*options.motion, *map(Path, _listed(table, "motions"))],
-        "family": [*map(Path, _listed(table, "family"))],
+        "family": _family(table),
         "preset": options.preset or table.get("preset"),
         "over": [*(_location(tables[name]) for name in entry.over), *entry.models(table)],
         "over_names": [*entry.over, *_model_names(entry, entry.models(table))],
     })  # fmt: skip
+
+
+def _family(table: Mapping[str, Any]) -> list[Path] | None:
+    """Return the bodies of --family as its option has them."""
+    if "family" not in table:
+        return None
+    return [] if table["family"] is True else [*map(Path, _listed(table, "family"))]
 
 
 def _model_names(entry: WardrobeEntry, models: Sequence[str]) -> list[str]:

@@ -19,7 +19,8 @@ the simulator. A refined shot gets blendshapes of its own, as many as it takes t
 (any vertex) of the solver's points; the result says how many, and what the points would take. In one file they
 replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes
 time-sampled points instead, bound to no skeleton; in a folder of layers, they are the variant "points" of
-"deformation", beside the network's joints.
+"deformation", beside the network's joints. In a folder of layers or a glb, a garment that was trained over others of
+the shot is refined after these, and kept off them; they stay as they are.
 
 --certify moves the frames in which triangles of the garment intersect, or covered skin shows, as little as it takes
 until none does in the written file, and says which frames have no free position. It adds blendshapes for these frames

@@ -29,6 +29,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..delivery.bake.fabrics import need_fabric
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
 from . import options as shared
@@ -48,8 +49,7 @@ COLUMNS = 118  # of a terminal, which tables fit
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, action="append", required=True,
-                      help="USD file with the character (repeatable: one for each body of a family)")  # fmt: skip
+    verb.add_argument("--stage", type=Path, action="append", required=True, help=shared.BODIES)
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     verb.add_argument("--index", type=Path, metavar="JSON",
@@ -76,6 +76,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, *options.stage, options.index)
+    need_fabric(options.fabric, options.material)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
     results = evaluated(options, asked, partial(open_model, options, report), report)
@@ -304,7 +305,7 @@ def _results(
     options: argparse.Namespace, asked: EvaluationOptions, opened: Sequence[OpenedModel], listed: ListedClips
 ) -> EvaluationResults:
     """Return the results to write, with their provenance; their inputs are told by content, wherever they lie."""
-    from ..files import sha256
+    from ..files import sha256, split_body
     from ..quality.evaluation.results import EvaluationResults
     from ._measured import contents, measured_inputs
     from ._reference import shots
@@ -335,7 +336,7 @@ def _results(
         {
             "units": "SI",
             "models": {str(path): digest for path, (_, digest) in zip(options.models, inputs["models"])},
-            "stage": {str(stage): sha256(stage) for stage in options.stage},
+            "stage": {str(stage): sha256(split_body(str(stage))[0]) for stage in options.stage},
             "reference": options.reference and str(options.reference),
             "options": settings,
             "hardware": inputs["hardware"],

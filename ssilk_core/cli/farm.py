@@ -2,9 +2,9 @@
 """Bake many shots on a farm: write a bundle of Open Job Description, or run its tasks on a Ray cluster.
 
 The bundle runs unchanged with 'openjd run' on one machine and with 'deadline bundle submit' on Deadline Cloud. Each
-task is one garment in one shot, on one body; with --certify outer garments come after those that they were trained
-over, and are certified over these. Running a job again, anywhere, leaves finished tasks alone. With
---device cuda each host needs a GPU. Both commands take the size of chunks as the job's parameters:
+task is one garment in one shot, on one body; with --refine or --certify outer garments come after those that they
+were trained over, and are refined and certified over these. Running a job again, anywhere, leaves finished tasks
+alone. With --device cuda each host needs a GPU. Both commands take the size of chunks as the job's parameters:
 -p ChunkSize=20 -p ChunkSeconds=600.
 """
 
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..delivery.bake import BakeTask, LayerFolder, plan_layers
-from ..delivery.bake.layered import certified_over, in_levels, tell_layers
+from ..delivery.bake.layered import in_levels, put_over, tell_layers
 from ..delivery.farm.job import NAME, FarmJob, is_job, submitted
 from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
@@ -55,8 +55,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if not (options.bundle or options.output):
         fail("--cluster", "no folder for the layers", "-o names one")
     tasks = [_absolute(task) for task in plan_layers(requests_of(options), **layer_options(options))]
-    if options.certify:
-        tasks = certified_over(tasks, report)
+    if any(task.request.meets_beneath for task in tasks):
+        tasks = put_over(tasks, report)
     if options.output:
         LayerFolder(options.output).need_names(tasks, complete=not options.bundle)
     job = submitted(tasks, report)

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import did_you_mean, fail
-from ..files import split_location
+from ..files import split_body, split_location
+from ..scene.shape_weights import is_shapes
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class Kind:
 
 MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
+SHOT = Kind("file", "each motion of a shot is a USD file")
 CHARACTER = Kind("file", "a USD stage with a character is needed")
 KINDS = {
     "model": MODEL,
@@ -39,6 +41,9 @@ KINDS = {
 }
 """By the names under which options are parsed."""
 
+OF_STAGE = ("family", "onto")
+"""Options that also take weights of shapes alone, which are of the command's stage."""
+
 INDEPENDENT = ("bake", "farm")
 """Verbs with tasks: where one of several inputs is missing, the others are baked."""
 
@@ -48,10 +53,13 @@ def need_inputs(options: argparse.Namespace) -> None:
     for name, kind in KINDS.items():
         value = getattr(options, name, None)
         values = value if isinstance(value, list) else [value] if value else []
-        if options.verb in INDEPENDENT and len(values) > 1:
-            continue
+        if options.verb in INDEPENDENT:
+            if len(values) > 1:
+                continue
+            kind = SHOT if kind is MOTIONS else kind
         for each in values:
-            need_input(str(each), kind)
+            if not (name in OF_STAGE and is_shapes(str(each))):
+                need_input(str(each), kind)
 
 
 def need_input(named: str, kind: Kind) -> None:
@@ -59,7 +67,7 @@ def need_input(named: str, kind: Kind) -> None:
 
     Names that USD resolves in its own way, such as a file in a package, are left to it.
     """
-    path = Path(split_location(named)[0])
+    path = Path(split_body(split_location(named)[0])[0])
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
     found, near = f"there is no such {kind.name}", ""

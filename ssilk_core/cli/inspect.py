@@ -58,8 +58,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="training to estimate memory and time for (default: draft on a CPU, else preview)",
     )
     verb.add_argument(
-        "--family", type=Path, nargs="+", default=[], metavar="STAGE",
-        help="other characters to compare: bodies of one skeleton and topology, which one model can dress",
+        "--family", type=Path, nargs="*", metavar="STAGE|SHAPES",
+        help="other characters to compare: bodies of one skeleton and topology, which one model can dress, as 'ssilk "
+             "train' takes them",
     )  # fmt: skip
     verb.add_argument(
         "--onto", type=Path, metavar="STAGE[:/ROOT]",
@@ -114,6 +115,8 @@ def _read(options: argparse.Namespace, report: Reporter) -> PreflightInput:
 
 def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInput:
     """Read everything that is inspected, with the preset "draft" where none is asked for."""
+    from ssilk_usd.opening.shaped import body_parameters
+    from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.writing.repair import repair_lock
 
     from ..authoring.preflight.inspection import PreflightInput
@@ -122,12 +125,13 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     file, prim = shared.wardrobe(options)
     motions, unread = _readable(options.motion, character.skeleton)
     shared.tell_shapes(options, motions, report, trained=character)
+    known = body_parameters(open_stage(options.stage)).items()
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
         garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
         preset=preset_named(options.preset or "draft"), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
-        inner=_inner(options, character),
+        inner=_inner(options, character), body_ranges={name: (of.low, of.high) for name, of in known if of.is_marked},
     )  # fmt: skip
 
 
@@ -160,14 +164,24 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
 
 def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
     """Return what there is to say of the characters of --family beside this one."""
-    if not options.family:
-        return []
-    from ssilk_usd.reading.character import read_character
-
+    if options.family is None:
+        return _parameters(inputs)
     from ..authoring.bodies.differences import family_findings
 
-    others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
+    others = [shared.read_member(options, member, report) for member in shared.members(options)]
     return list(family_findings([inputs.character, *others]))
+
+
+def _parameters(inputs: PreflightInput) -> list[Finding]:
+    """Return which shapes of the character its stage marks as body parameters, where it marks some."""
+    from ..authoring.preflight.finding import Finding
+
+    if not inputs.body_ranges:
+        return []
+    marked = [f"{name} ({low:g} to {high:g})" for name, (low, high) in inputs.body_ranges.items()]
+    found = f"shapes are marked as body parameters: {', '.join(marked)}"
+    fix = "--family alone takes them all; --family tall=1 names a body by weights of shapes"
+    return [Finding(severity="info", code="body-parameters", prim=inputs.character.path, found=found, fix=fix)]
 
 
 def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:

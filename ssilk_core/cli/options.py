@@ -26,7 +26,7 @@ from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..files import need_not_input, need_writable, split_location
+from ..files import need_not_input, need_writable, split_body, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
@@ -34,6 +34,7 @@ from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 from ..scene.posed_alike import shaped_as_in_stage
+from ..scene.shape_weights import body_name, body_of
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 LIST, MODEL = ".toml", ".safetensors"  # suffixes of a list of garments, and of a trained one
 STAGE = "USD file with the character (SkelRoot, Skeleton, body meshes)"
+BODIES = "USD file with the character, or FILE:SHAPE=WEIGHT,... (repeatable: one for each body of a family)"
 
 
 def add_scene(verb: argparse.ArgumentParser) -> None:
@@ -130,7 +132,7 @@ def add_world(verb: argparse.ArgumentParser, of: str) -> None:
 
 def asked_fabric(options: argparse.Namespace) -> Fabric:
     """Return the fabric that the options alone ask for; raise `SsilkError` for an unknown property or a bad value."""
-    return apply_overrides(fabric_named(options.fabric or "default"), options.material)
+    return apply_overrides(fabric_named(options.fabric or "default"), options.material, "--material")
 
 
 def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> Fabric:
@@ -146,7 +148,7 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
     if options.fabric or garment.surface is None:
         found = asked_fabric(options)
     else:
-        found = apply_overrides(stated_fabric(garment.surface, report), options.material)
+        found = apply_overrides(stated_fabric(garment.surface, report), options.material, "--material")
     if garment.classes is not None:
         need_stitch(garment.mesh, garment.classes, found)
     if garment.mesh.stiffness is not None:
@@ -197,7 +199,7 @@ def add_bake(verb: argparse.ArgumentParser) -> None:
         type=Path,
         action="append",
         required=True,
-        help="USD file with the characters (repeatable: one for each body of a family)",
+        help=BODIES,
     )
     motions = verb.add_mutually_exclusive_group(required=True)
     motions.add_argument(
@@ -466,8 +468,13 @@ def read(options: argparse.Namespace, report: Reporter) -> tuple[Character, Garm
     """Read the character, the garment and its authored rig, as the options of `add_scene` say."""
     from ssilk_usd.reading.scene import read_scene
 
-    if not options.stage.exists():
+    file, shapes = split_body(str(options.stage))
+    if not Path(file).exists():
         fail(str(options.stage), "there is no such file", "a USD stage with a character is needed")
+    if shapes and wardrobe(options)[0] == options.stage:
+        found = "the stage's own garment, on a body that weights of its shapes make"
+        fail(str(options.stage), found, "the garment lies as on the body of the stage itself",
+             f"'ssilk rig {file} --onto {shapes}' puts it on that one")  # fmt: skip
     return read_scene(options.stage, root=options.root, bodies=options.body, garment=options.garment, report=report)
 
 
@@ -482,10 +489,50 @@ def read_onto(options: argparse.Namespace, report: Reporter) -> Character:
     """Read the character of --onto, "STAGE[:/ROOT]", which has another skeleton: --root and --body name others."""
     from ssilk_usd.reading.character import read_character
 
-    file, root = split_location(str(options.onto))
-    if not Path(file).exists():
+    file, root = onto(options)
+    if not Path(split_body(file)[0]).exists():
         fail(file, "there is no such file", "a USD stage with a character is needed")
     return read_character(file, root=root, report=report)
+
+
+def onto(options: argparse.Namespace) -> tuple[str, str | None]:
+    """Return where the character of --onto is, which may be weights of the stage's shapes, and its root."""
+    file, root = split_location(str(options.onto))
+    return body_of(file, str(options.stage)), root
+
+
+def read_member(options: argparse.Namespace, location: str, report: Reporter, root: str | None = None) -> Character:
+    """Read another body of the character; a body of its own stage has its garment too, which is none of the body."""
+    from ssilk_usd.reading.character import read_character
+
+    file, prim = wardrobe(options)
+    own = split_body(location)[0] == split_body(str(options.stage))[0] == str(file)
+    root, garment = root or options.root, prim if own else None
+    return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
+
+
+def members(options: argparse.Namespace) -> list[str]:
+    """Return where the bodies of --family are, as `open_stage` takes them.
+
+    Without a word, --family means the ends of the ranges of all shapes that the stage marks as body parameters.
+
+    Raises:
+        SsilkError: it marks none.
+    """
+    if options.family is None:
+        return []
+    if options.family:
+        return [body_of(str(member), str(options.stage)) for member in options.family]
+    from ssilk_usd.opening.shaped import body_parameters
+    from ssilk_usd.opening.stage import open_stage
+
+    file, known = split_body(str(options.stage))[0], body_parameters(open_stage(options.stage))
+    marked = {name: each for name, each in known.items() if each.is_marked}
+    if not marked:
+        there = f"its blendshapes are {', '.join(known)}" if known else "its bodies have no blendshapes"
+        fail(file, "it marks no body parameters with ssilk:weightRange", there,
+             "name the bodies, such as --family tall=1 heavy=1")  # fmt: skip
+    return [f"{file}:{name}={weight:.9g}" for name, of in marked.items() for weight in (of.low, of.high) if weight]
 
 
 def tell_shapes(
@@ -534,7 +581,7 @@ def load_scene(
 
 
 def bodies(stages: Sequence[Path]) -> dict[str, Path]:
-    """Return the stages of bodies by their names, that of one alone by none.
+    """Return the stages of bodies by their names, their stems or shapes; that of one alone by none.
 
     Raises:
         SsilkError: two have one name.
@@ -543,7 +590,8 @@ def bodies(stages: Sequence[Path]) -> dict[str, Path]:
         return {"": stages[0]}
     found: dict[str, Path] = {}
     for stage in stages:
-        if stage.stem in found:
-            fail(str(stage), f"a second body '{stage.stem}'", "names of stages tell bodies apart", "rename one")
-        found[stage.stem] = stage
+        name = body_name(str(stage))
+        if name in found:
+            fail(str(stage), f"a second body '{name}'", "names of stages tell bodies apart", "rename one")
+        found[name] = stage
     return found

@@ -20,7 +20,6 @@ from ..authoring.setup.classes import USUAL
 from ..authoring.setup.rig import RigOptions
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
-from ..files import split_location
 from . import options as shared
 
 if TYPE_CHECKING:
@@ -49,8 +48,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--onto",
         type=Path,
-        metavar="STAGE[:/ROOT]",
-        help="another body of the same skeleton and topology, to put the garment on; with --joints any character",
+        metavar="STAGE[:/ROOT]|SHAPES",
+        help="another body of the same skeleton and topology, to put the garment on, or weights of the stage's own "
+        "blendshapes, such as tall=1,heavy=0.5; with --joints any character",
     )
     verb.add_argument(
         "--joints", type=Path, metavar="MAP",
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES
 
-    onto = split_location(str(options.onto))[0] if options.onto else None
+    onto = shared.onto(options)[0] if options.onto else None
     shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], onto)
     report(Started("rig", options.proxies))
     shared.need_onto(options)
@@ -118,15 +118,14 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
         SsilkError: that body is none of the character's family.
     """
     import numpy as np
-    from ssilk_usd.reading.character import read_character
 
     from ..authoring.bodies.carry import carry
     from ..authoring.bodies.differences import differences, need_family
     from ..authoring.preflight.fit import describe_left, describe_move
 
     path = scene.garment.mesh.path
-    file, root = split_location(str(options.onto))
-    other = read_character(file, root=root or options.root, bodies=options.body, report=report)
+    file, root = shared.onto(options)
+    other = shared.read_member(options, file, report, root)
     if found := differences(scene.character, other):
         _need_map(options, scene, other, found)
     family = need_family([scene.character, other])

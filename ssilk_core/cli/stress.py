@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from .options import bodies, check_output
+from .options import BODIES, bodies, check_output
 
 if TYPE_CHECKING:
     from ..quality.kept_rows import KeptRows
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("model", type=Path, help="model written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, action="append", required=True,
-                      help="USD file with the character (repeatable: one for each body of a family)")  # fmt: skip
+    verb.add_argument("--stage", type=Path, action="append", required=True, help=BODIES)
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument(
         "--motion",

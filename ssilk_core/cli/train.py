@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import TYPE_CHECKING
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
 from ..events import Message, Reporter, Result, TextReporter, silent
+from ..files import split_body
 from ..network.settings import ModelConfig, apply_overrides, setting_names
 from ..scene.fabric_range import FACTORS, FabricRange
 from ..scene.fabrics import FRICTION
@@ -90,9 +92,10 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "while this one learns to lie on it, and to be worn without",
     )
     verb.add_argument(
-        "--family", type=Path, nargs="+", default=[], metavar="STAGE",
-        help="other bodies of the character's skeleton and topology, which the model is to dress as well: steps are "
-             "done on bodies drawn among these",
+        "--family", type=Path, nargs="*", metavar="STAGE|SHAPES",
+        help="other bodies of the character's skeleton and topology, which the model is to dress as well: stages, or "
+             "the stage's own blendshapes with weights, such as tall=1,heavy=0.5 (default: the ends of the ranges of "
+             "those that are marked by ssilk:weightRange). Steps are done on bodies drawn among these",
     )  # fmt: skip
     verb.add_argument(
         "--graded", action="store_true",
@@ -237,10 +240,12 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             was, now = now, was
         report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
     over = InnerModel.load_all(options.over, options.output)
-    family = _family(options, scene, report) if options.family else None
+    others = shared.members(options)
+    family = _family(options, others, scene, report) if others else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
-    files |= {*options.over, *options.family}
+    files |= {*options.over, *(Path(split_body(member)[0]) for member in others)}
+    files = {Path(split_body(str(path))[0]) for path in files}
     return TrainJob(
         scene=scene,
         motions=motions,
@@ -261,24 +266,22 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     )
 
 
-def _family(options: argparse.Namespace, scene: Scene, report: Reporter) -> DressedFamily:
+def _family(options: argparse.Namespace, others: Sequence[str], scene: Scene, report: Reporter) -> DressedFamily:
     """Return the scene's garment on the bodies of --family, and say what of it stays in one.
 
     Raises:
         SsilkError: a body is none of the character's family.
     """
-    from ssilk_usd.reading.character import read_character
-
     from ..authoring.bodies.carry import dressed_family
     from ..authoring.bodies.differences import need_family
     from ..authoring.preflight.fit import describe_left
 
-    others = [read_character(path, root=options.root, bodies=options.body, report=report) for path in options.family]
-    bodies = need_family([scene.character, *others], trained=True)
+    characters = [shared.read_member(options, other, report) for other in others]
+    bodies = need_family([scene.character, *characters], trained=True)
     how = ", and graded to each" if options.graded else ""
-    report(Message(f"the garment is carried onto {len(others)} more bodies, along {bodies.size} directions{how}"))
-    dressed, carried = dressed_family(scene, bodies, others)
-    for one, other in zip(carried, others):
+    report(Message(f"the garment is carried onto {len(characters)} more bodies, along {bodies.size} directions{how}"))
+    dressed, carried = dressed_family(scene, bodies, characters)
+    for one, other in zip(carried, characters):
         if left := describe_left(one.settled, one.unsettled, other):
             report(Message(f"{other.path}: {left}", "warning"))
     return dressed
@@ -318,7 +321,7 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
         SsilkError: a setting or a word of --fabrics that does not exist, or a value that it cannot have; or --graded
             without --family.
     """
-    if options.graded and not options.family:
+    if options.graded and options.family is None:
         fail("--graded", "no --family", "garments are graded to further bodies", "name these, or leave it out")
     preset = preset_named(options.preset or default_preset(options.device))
     fabric = shared.asked_fabric(options)

@@ -37,7 +37,8 @@ from pathlib import Path
 from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
-from ..files import need_writable, sha256
+from ..files import need_writable, sha256, split_body
+from ..scene.shape_weights import is_shapes
 from ..training.wardrobe.listing import WardrobeEntry, read_list, write_list
 from ..training.wardrobe.panel import ProgressTable, table
 from ..training.wardrobe.queue import CommandTask, End, Queue, Slot
@@ -194,5 +195,6 @@ def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
-    others = [folder / file for file in (*options.over, *options.family)]
-    return [folder / options.stage, folder / shared.wardrobe(options)[0], *motions, *others]
+    bodies = [options.stage, shared.wardrobe(options)[0], *(options.family or ())]
+    named = [file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
+    return [folder / file for file in (*named, *options.over)] + list(motions)

@@ -12,7 +12,8 @@ from torch import Tensor
 
 
 class Framed:
-    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, or None.
+    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, None, or
+    numbers that all frames share.
 
     Attributes:
         SHARED: names of fields that all frames share.
@@ -20,7 +21,7 @@ class Framed:
 
     SHARED: ClassVar[frozenset[str]] = frozenset()
 
-    def _own(self) -> dict[str, Any]:
+    def own(self) -> dict[str, Any]:
         """Return the fields that each frame has a value of."""
         return {
             each.name: getattr(self, each.name)
@@ -30,7 +31,7 @@ class Framed:
 
     def select(self, frames: Tensor) -> Self:
         """Return the frames with indices (M,), in ascending order."""
-        chosen = {name: _selected(value, frames) for name, value in self._own().items()}
+        chosen = {name: _selected(value, frames) for name, value in self.own().items()}
         return replace(self, **chosen)  # type: ignore[type-var]
 
     def first(self, count: int) -> Self:
@@ -44,7 +45,7 @@ class Framed:
 
     @property
     def _first_tensor(self) -> Tensor:
-        return next(value for value in self._own().values() if isinstance(value, Tensor))
+        return next(value for value in self.own().values() if isinstance(value, Tensor))
 
     @property
     def _device(self) -> torch.device:
@@ -55,18 +56,27 @@ class Framed:
         """Return the frames of several, one after the other; what is None is so in all."""
         if len(parts) == 1:
             return parts[0]
-        own = [part._own() for part in parts]
+        own = [part.own() for part in parts]
         values = {name: _concatenated([each[name] for each in own]) for name in own[0]}
         return replace(parts[0], **values)  # type: ignore[type-var]
 
 
-def _selected(value: Tensor | Framed | None, frames: Tensor) -> Tensor | Framed | None:
+def consecutive(counts: Sequence[int], device: torch.device) -> tuple[Tensor, ...]:
+    """Return the numbers that the frames of several have where these follow each other, (N,) each."""
+    return torch.arange(sum(counts), device=device).split(list(counts))
+
+
+def _selected(value: Any, frames: Tensor) -> Any:
     if isinstance(value, Tensor):
         return value[..., frames]
-    return None if value is None else value.select(frames)
+    return value if _is_shared(value) else value.select(frames)
 
 
-def _concatenated(values: list[Any]) -> Tensor | Framed | None:
+def _concatenated(values: list[Any]) -> Any:
     if isinstance(values[0], Tensor):
         return torch.cat(values, dim=-1)
-    return None if values[0] is None else type(values[0]).concatenated(values)
+    return values[0] if _is_shared(values[0]) else type(values[0]).concatenated(values)
+
+
+def _is_shared(value: Any) -> bool:
+    return value is None or isinstance(value, (int, float))

@@ -39,8 +39,8 @@ class Fabric:
             millimetre.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
-        friction: Coulomb's coefficient, of cloth on the body and on cloth. The simulator alone knows it: networks
-            are trained without.
+        friction: Coulomb's coefficient, of cloth on the body, on floors and props, and on cloth. The simulator alone
+            knows it: networks are trained without.
     """
 
     name: str

@@ -115,6 +115,18 @@ def shown_heat(garment: Any) -> None:
     garment.data.attributes.new("ssilk:displacement", "FLOAT_VECTOR", "POINT")
 
 
+def other_bodies(garment: Any) -> None:
+    """Give a garment keys of bodies to try it on, which none has, a stage that is gone, and half of what shows it."""
+    import bpy
+
+    for name in ("", "Gone"):
+        garment.ssilk.try_on.keys.add().key = name
+    garment.ssilk.try_on.stage = "//gone.usd"
+    shown = bpy.data.objects.new("on", None)
+    shown["ssilk_tried_on"], shown.instance_type = garment, "COLLECTION"
+    garment.ssilk.try_on.share = 0.3
+
+
 def live(monkeypatch: Any, **fields: Any) -> Callable[[Any], None]:
     def play(garment: Any) -> None:
         from blender_addon.playback import playing
@@ -140,6 +152,7 @@ def states(bpy: Any, monkeypatch: Any, folder: Path) -> Iterator[tuple[str, Call
     yield "mirrored", mirrored
     yield "strange bodies", strange_bodies(bpy)
     yield "motions", motions
+    yield "other bodies", other_bodies
     yield "found", found
     yield "heat", shown_heat
     yield "reads", live(monkeypatch, done=0.5, stale=False, renewed=False, model_only=True, fabric_only=False)

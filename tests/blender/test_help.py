@@ -25,7 +25,7 @@ def test_every_panel_has_help_about_itself(bpy, monkeypatch):
     monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
     chapters = {slug(line.lstrip("# ")) for line in GUIDE.splitlines() if line.startswith("#")}
     panels = [kind for kind in CLASSES if issubclass(kind, bpy.types.Panel)]
-    assert len(panels) == 10
+    assert len(panels) == 13
     for kind in panels:
         layout = Layout()
         kind.draw_header_preset(SimpleNamespace(layout=layout, section=kind.section), bpy.context)

@@ -11,18 +11,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 
 from ssilk_core.cli import main
+from ssilk_core.cli.main import parser as command_line
 from ssilk_core.delivery.bake import worn
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
+from ssilk_core.events import silent
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.layers import ClothLayers
 from ssilk_core.scene.kinematics import bind_pose
+from ssilk_core.training.wardrobe.listing import read_list
 
+from .test_shaped_bodies import add_shape
 from .test_skeletons import JOINTS as OTHER_JOINTS
 from .test_skeletons import put_on, stretch_in, write_clip, write_other
 
@@ -346,7 +350,9 @@ def test_a_level_of_quality_of_a_member_is_fitted_to_it(world, monkeypatch):
     from ssilk_core.delivery.bake import sizing
 
     reduced, original = [], sizing.Reducer
-    monkeypatch.setattr(sizing, "Reducer", lambda file, motions: reduced.append(file) or original(file, motions))
+    monkeypatch.setattr(
+        sizing, "Reducer", lambda file, *given, **kept: reduced.append(file) or original(file, *given, **kept)
+    )
     assert run(f"{BAKE} --stage heavier.usda --budget 1MB -o small.usda") == 0
     (file,) = reduced
     points = file.scene.garment.mesh.points
@@ -690,3 +696,130 @@ def test_a_family_is_measured_on_a_character_with_more_joints(world):
     asked = "family.safetensors --stage other_skirt.usda"
     assert run(f"evaluate {asked} --motions clips --no-probes -o figures.json") == EXIT_OK
     assert run(f"stress {asked} --motion other_clip.usda --quick --only 'rate: 60'") == EXIT_OK
+
+
+@pytest.fixture
+def shapes(world) -> Path:
+    """The rigged toy with the bodies of the family as blendshapes, `slight` of which is marked, and the world."""
+    stage = Usd.Stage.Open("rigged.usda")
+    points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get(), dtype=float)
+    for name, change in (("taller", taller), ("heavier", heavier), ("slight", lambda points: points * [0.9, 1, 0.9])):
+        add_shape(stage, name, change(points) - points)
+    shape = stage.GetPrimAtPath("/Hero/Body/Slight")
+    shape.CreateAttribute("ssilk:weightRange", Sdf.ValueTypeNames.Float2, False).Set((-0.5, 1))
+    stage.GetRootLayer().Export("shapes.usda")
+    return world
+
+
+def test_inspect_tells_bodies_by_shapes_with_their_millimetres(shapes, capsys):
+    code, found = findings(capsys, "inspect shapes.usda --family taller=1 heavier=0.5,taller=0.2")
+    assert code == 0 and found["family"]["count"] == 3
+    assert found["body-shape"]["prim"] == "shapes.usda:heavier=0.5,taller=0.2:/Hero"
+    far = 1000 * np.linalg.norm(0.5 * np.array([0.15 * 0.3, 0.4 * 0.15 * 1.7]))
+    assert f" mm on average and {far:.1f} mm at most, and joints" in found["body-shape"]["found"]
+    assert "45.0 mm at most, which is 'Head'" in found["body-shape"]["found"]
+    code, found = findings(capsys, "inspect shapes.usda")
+    assert code == 0 and "slight (-0.5 to 1)" in found["body-parameters"]["found"]
+    code, found = findings(capsys, "inspect shapes.usda --family")
+    assert code == 0 and found["family"]["count"] == 3
+    assert run("inspect rigged.usda --family") == 2
+    assert "it marks no body parameters with ssilk:weightRange" in capsys.readouterr().err
+
+
+def test_a_training_takes_bodies_by_shapes_as_it_does_their_stages(shapes, toy):
+    from ssilk_core.cli.train import training_job
+
+    parser = command_line()
+    stages, by_shapes, marked = (
+        training_job(parser.parse_args(shlex.split(f"{TRAIN.replace('rigged', 'shapes')} {family} -o x.safetensors")
+                     + [*toy.training]), "cpu", silent)
+        for family in ("--family taller.usda heavier.usda", "--family taller=1 heavier=1", "--family")
+    )  # fmt: skip
+    for name in ("members", "joint_moves", "point_moves"):
+        one, other = (getattr(job.family.bodies, name) for job in (stages, by_shapes))
+        np.testing.assert_allclose(one, other, atol=1e-4)
+    np.testing.assert_allclose(stages.family.cloth_moves, by_shapes.family.cloth_moves, atol=1e-3)
+    assert [name.split(":")[1] for name in marked.family.bodies.names[1:]] == ["slight=-0.5", "slight=1"]
+    assert by_shapes.inputs.keys() == marked.inputs.keys() == {"shapes.usda", "clip.usda"}
+
+
+def test_a_garment_is_put_onto_a_body_by_shapes(shapes, capsys):
+    assert run("rig shapes.usda --onto heavier=1 -o by_shapes.usda") == 0
+    assert run("rig rigged.usda --onto heavier.usda -o by_stage.usda") == 0
+    for mine, theirs in zip(skinned_rest("by_shapes.usda"), skinned_rest("by_stage.usda")):
+        np.testing.assert_allclose(mine, theirs, atol=1e-4)
+    stage = Usd.Stage.Open("by_shapes.usda")
+    assert sum(prim.IsA(UsdGeom.Mesh) for prim in stage.Traverse()) == 2  # it is moved, not doubled
+    capsys.readouterr()
+    assert run("simulate shapes.usda:heavier=1 --motion clip.usda -o out.usda") == 2
+    assert "'ssilk rig shapes.usda --onto heavier=1' puts it on that one" in capsys.readouterr().err
+    assert run("rig shapes.usda --onto heavier=1.2 -o out.usda") == 2
+    assert "shape 'heavier' weighs 1.2; 0 to 1 is allowed" in capsys.readouterr().err
+    assert not Path("out.usda").exists()
+
+
+def test_a_body_by_shapes_is_baked_as_its_stage_is_and_the_motion_is_played_between_its_bones(shapes, capsys):
+    member_clip("tall_clip.usda", 1.15)
+    assert run("bake family.safetensors --motion tall_clip.usda --stage taller.usda -o by_stage.usda") == 0
+    capsys.readouterr()
+    assert run("bake family.safetensors --motion clip.usda --stage shapes.usda:taller=1 -o by_shapes.usda") == 0
+    told = capsys.readouterr()
+    assert "are played between this one's bones" in told.out + told.err
+    assert "a body of the model's family, that of taller.usda:/Hero" in told.out + told.err
+    found, farther = shown("by_shapes.usda", 12), 0.15 * 0.2 * np.sin(12 / 7)  # the hub's way grows with the legs
+    for name, points in shown("by_stage.usda", 12).items():
+        np.testing.assert_allclose(found[name], points + [farther, 0, 0], atol=1e-3)
+    assert run("verify by_shapes.usda") == 0
+    Path("moved").mkdir()
+    shutil.move("shapes.usda", "moved/shapes.usda")
+    assert run("verify by_shapes.usda --stage moved/shapes.usda") == 0
+
+
+def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):
+    bodies = "--stage shapes.usda --stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
+    assert run(f"farm family.safetensors --motion clip.usda {bodies} --bundle job") == 0
+    files = json.loads(Path("job/asset_references.json").read_text())["assetReferences"]["inputs"]["filenames"]
+    assert sorted(Path(file).name for file in files) == ["clip.usda", "family.safetensors", "shapes.usda"]
+    assert run("task job/job.json -o shots") == 0 and run("task job/job.json -o shots --check") == 0
+    names = {f"{body}_clip" for body in ("shapes", "heavier", "heavier0_5_taller0_2")}
+    assert {path.parent.name for path in Path("shots/shots").glob("*/shot.usda")} == names
+    bake = "bake family.safetensors --motion clip.usda -o shots/ --body-name heavier --stage shapes.usda:heavier"
+    capsys.readouterr()
+    assert run(f"{bake}=1.0 --json") == 0
+    results = [json.loads(line)["detail"] for line in capsys.readouterr().out.splitlines() if '"result"' in line]
+    assert results and all(detail.get("current") for detail in results), results
+    assert run(f"{bake}=0.9") == 2 and "was baked on another body" in capsys.readouterr().err
+
+
+def test_an_evaluation_has_bodies_by_shapes_under_their_names(shapes):
+    (shapes / "clips").mkdir()
+    shutil.copy("clip.usda", "clips")
+    bodies = "--stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
+    assert run(f"evaluate family.safetensors {bodies} --motions clips --no-probes -o by_shapes.json") == 0
+    text = Path("by_shapes.json").read_text()
+    assert '"heavier/Skirt' in text and '"heavier0.5_taller0.2/Skirt' in text
+
+
+def test_a_list_keeps_shapes_and_finds_the_files_of_bodies(shapes):
+    Path("lists").mkdir()
+    table = 'stage = "../shapes.usda"\nmotions = "../clip.usda"\n'
+    listed = {"named": '["taller=1", "../heavier.usda", "../shapes.usda:heavier=0.5"]', "marked": "true"}
+    tables = [f"[{name}]\n{table}family = {family}\n" for name, family in listed.items()]
+    Path("lists/list.toml").write_text("\n".join(tables))
+    named, marked = read_list(Path("lists/list.toml"))
+    assert named.words[-4:] == ("--family", "taller=1", "../heavier.usda", "../shapes.usda:heavier=0.5")
+    assert marked.words[-1] == "--family" and marked.located(Path("lists"))["family"] is True
+    family = named.located(Path("lists"))["family"]
+    assert family == ["taller=1", "lists/../heavier.usda", "lists/../shapes.usda:heavier=0.5"]
+    assert run("inspect lists/list.toml") == 0
+
+
+def test_marks_that_nobody_uses_change_no_byte(shapes):
+    bake = "bake family.safetensors --motion clip.usda -o"
+    assert run(f"{bake} marked.usda --stage shapes.usda") == 0
+    written = Path("marked.usda").read_bytes()
+    stage = Usd.Stage.Open("shapes.usda")
+    stage.GetPrimAtPath("/Hero/Body/Slight").RemoveProperty("ssilk:weightRange")
+    stage.Save()
+    assert run(f"{bake} marked.usda --stage shapes.usda") == 0
+    assert Path("marked.usda").read_bytes() == written

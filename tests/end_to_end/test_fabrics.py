@@ -145,6 +145,8 @@ def test_a_job_tells_what_its_tasks_lack_and_replaces_no_files_of_others(copy, c
     farm = "farm ranged.safetensors model.safetensors --stage rigged.usda --motion sway.usda --bundle job"
     assert run(f"{farm} --fabric silk") == 0
     assert "model.safetensors: --fabric silk for a model of one fabric" in capsys.readouterr().err
+    assert run(f"{farm} --material drag=9x") == 0
+    assert "drag 9 (trained from 0.25 to 4) is beyond the fabrics of its training" in capsys.readouterr().err
     before = Path("job/job.json").read_bytes()
     for words, text in (
         ("--fabric silk --range 0-999", "--range 0-999"),
@@ -176,6 +178,29 @@ def test_what_networks_do_not_see_is_refused(copy, capsys, words, text):
     assert run(f"{BAKE} {words} -o shot.usdc") == 2
     assert text in capsys.readouterr().err
     assert not Path("shot.usdc").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("--material density", "--material density: a name without a value; NAME=VALUE is needed."),
+        ("--material density=x1", "--material density=x1: 'x1' is not a value for 'density'"),
+        ("--material desnity=3", "--material desnity=3: networks do not see it"),
+        ("--material density=-3", "density = -3.0; it must be finite and not negative"),
+        ("--material stretch=0x", "those of stretch and density positive"),
+    ],
+)
+def test_a_fabric_that_no_model_has_is_refused_before_a_file_is_opened(tmp_path, monkeypatch, capsys, words, text):
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty.safetensors", "empty.usda"):
+        Path(name).touch()
+    for verb in (
+        "bake empty.safetensors --stage empty.usda --motion empty.usda -o shot.usdc",
+        "evaluate empty.safetensors --stage empty.usda --motions empty.usda",
+        "export empty.safetensors -o model.onnx",
+    ):
+        assert run(f"{verb} {words}") == 2
+        assert text in capsys.readouterr().err
 
 
 def test_a_model_of_one_fabric_refuses_others_in_every_command(copy, capsys):

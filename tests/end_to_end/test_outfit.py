@@ -39,6 +39,9 @@ def world(toy, tmp_path_factory) -> Path:
         assert main([*train, *toy.training]) in (0, 5)
         train = shlex.split("train rigged.usda --motions clip.usda -o tights.safetensors --set seed=5")
         assert main([*train, *toy.training]) in (0, 5)
+        write_dented_coat()
+        train = shlex.split("train coat.usda --motions clip.usda --over skirt.safetensors -o dented.safetensors")
+        assert main([*train, *toy.training]) in (0, 5)
     return folder
 
 
@@ -232,11 +235,9 @@ def crossing_frames(folder: str) -> list[int]:
     return [frame for frame, each in enumerate(pairs) if len(each)]
 
 
-def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file(toy, copy, capsys):
+def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file(copy, capsys):
     """Whatever the order of the models; the file is proven against that of the inner garment, which must be there."""
-    write_dented_coat()
-    train = shlex.split("train coat.usda --motions clip.usda --over skirt.safetensors -o coat.safetensors")
-    assert main([*train, *toy.training]) in (0, 5)
+    Path("dented.safetensors").replace("coat.safetensors")
     both = "coat.safetensors skirt.safetensors"
     baked(capsys, both, "plain")
     assert crossing_frames("plain")
@@ -270,6 +271,37 @@ def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file
             points[name] = [np.float64(reader.skinned(mesh["name"], frame)) for frame in range(9)]
     faces = load_model("coat.safetensors").scene.garment.mesh.faces
     assert not any(len(intersections_between(x, faces, y, faces)) for x, y in zip(points["coat"], points["skirt"]))
+
+
+def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(copy, capsys):
+    """Whatever the order of the models; the inner garment is as it is without the outer, which comes out of it."""
+    Path("dented.safetensors").replace("coat.safetensors")
+    refine, both = "--refine 6", "coat.safetensors skirt.safetensors"
+    for model in both.split():
+        baked(capsys, f"{model} {refine}", "alone")
+    assert len(crossing_frames("alone")) == 9
+    baked(capsys, f"{both} {refine}", "over")
+    assert crossing_frames("over") == []
+    layers = {folder: Path(folder, "shots/walk") for folder in ("alone", "over")}
+    assert len({sha256(layer / "skirt/anim.usdc") for layer in layers.values()}) == 1
+    said = {name: read_provenance(layers["over"] / name / "anim.usdc")["refined"] for name in ("coat", "skirt")}
+    assert said["coat"]["over"] == {"skirt": "../skirt/anim.usdc"} and "over" not in said["skirt"]
+    assert "over" not in read_provenance(layers["alone"] / "coat/anim.usdc")["refined"]
+    again = baked(capsys, f"{both} {refine}", "over")
+    results = [event["detail"] for event in again if event["event"] == "result" and "layer" in event["detail"]]
+    assert [each.get("current") for each in results] == [True, True]
+    coat, inner = layers["over"] / "coat/anim.usdc", layers["over"] / "skirt/anim.usdc"
+    assert main(["verify", str(coat)]) == 0  # it is refined again, over the same cloth
+    inner.rename("kept.usdc")
+    assert main(["verify", str(coat)]) == 3
+    assert "it was refined over 'skirt', which is not at" in capsys.readouterr().err
+    glb = shlex.split(f"bake {both} --stage rigged.usda --motion walk.usda --target glb --quality hero -o both.glb")
+    assert main([*glb, "--range", "4-8"]) == 0 and main(["verify", "both.glb"]) == 0
+    reader, faces = Reader("both.glb"), load_model("coat.safetensors").scene.garment.mesh.faces
+    names = {mesh["extras"].get("garment"): mesh["name"] for mesh in reader.json["meshes"]}
+    for frame in range(5):  # at hems, where this cloth has hardly any samples
+        coat, skirt = (np.float64(reader.skinned(names[name], frame)) for name in ("coat", "skirt"))
+        assert len(np.unique(intersections_between(coat, faces, skirt, faces)[:, 0])) < 0.05 * len(faces), frame
 
 
 def test_a_damaged_record_of_inner_cloth_is_told_by_an_outer_certificate(toy, copy, capsys):
@@ -328,6 +360,9 @@ def test_a_farm_certifies_an_outer_garment_over_the_inner_one_of_its_job(toy, co
     capsys.readouterr()
     assert main(shlex.split(f"{farm.replace('skirt.safetensors', '')} --bundle alone")) == 0
     assert "walk/coat: it was trained over skirt; the job has none of these" in capsys.readouterr().err
+    assert main(shlex.split(f"{farm.replace('--certify', '--refine 2')} --bundle refined")) == 0
+    tasks = json.loads(Path("refined/job.json").read_text())["tasks"]
+    assert [(task["garment"], task.get("over")) for task in tasks] == [("skirt", None), ("coat", ["skirt"])]
 
 
 def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):

@@ -26,6 +26,9 @@ RIDER_JOINTS = "ssilk:riderJoints"
 # Of a garment that was put onto another skeleton: the joints of the character that it was made on, and for each the
 # one that stands for it, or "".
 FROM_JOINTS, ONTO_JOINTS = "ssilk:fromJoints", "ssilk:ontoJoints"
+# Of a blendshape of a body: which weights a body may have of it; joints, and how far each moves at a weight of one.
+WEIGHT_RANGE, OFFSET_JOINTS, JOINT_OFFSETS = "ssilk:weightRange", "ssilk:offsetJoints", "ssilk:jointOffsets"
+SHAPES_SET = "ssilk:shapesSet"  # of a mesh whose points have the shape of these blendshapes, which it had
 LAYER_SUFFIXES = (".usdc", ".usd", ".usda")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...errors import SsilkError, fail
 from ...events import format_count
+from ...files import split_body, split_location
 from ...scene.assets import Body, Character
 from ...scene.family import BodyFamily, turned_joint
 from ..preflight.finding import Finding, Findings
@@ -91,6 +92,8 @@ def family_findings(characters: Sequence[Character]) -> Findings:
             continue
         members.append(other)
         yield from _on_member(base, other)
+        if split_body(split_location(other.path)[0])[1]:
+            yield _by_shapes(base, other)
     if len(members) > 1:
         yield _about(members)
 
@@ -117,6 +120,20 @@ def _on_member(base: Character, other: Character) -> Findings:
                 why="training poses all members with the weights of the first",
                 fix="copy the weights of the first member",
             )  # fmt: skip
+
+
+def _by_shapes(base: Character, other: Character) -> Finding:
+    """Return by how much a body that weights of the stage's shapes make differs from the base."""
+    own, its = base.merged_body().mesh.points, other.merged_body().mesh.points
+    skin = 1000 * np.linalg.norm(its - own, axis=1)
+    joints = 1000 * np.linalg.norm((other.skeleton.bind_transforms - base.skeleton.bind_transforms)[:, :3, 3], axis=1)
+    farthest = base.skeleton.joint_names[int(joints.argmax())].rpartition("/")[2]
+    return Finding(
+        severity="info", code="body-shape", prim=other.path,
+        found=f"its shapes move {format_count(int((skin > 0).sum()), 'points')} by {skin.mean():.1f} mm on average "
+              f"and {skin.max():.1f} mm at most, and joints with them by {joints.mean():.1f} mm on average and "
+              f"{joints.max():.1f} mm at most, which is '{farthest}'",
+    )  # fmt: skip
 
 
 def _about(members: Sequence[Character]) -> Finding:

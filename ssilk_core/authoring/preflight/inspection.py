@@ -42,6 +42,7 @@ class PreflightInput:
         inner: garments that it is worn over in the bind pose, by name.
         unread: what keeps the other motions from being read, in a sentence, by their files.
         preset: settings for which memory and time are estimated.
+        body_ranges: least and greatest weights of shapes that are marked as parameters of the body, by their names.
     """
 
     character: Character
@@ -55,6 +56,7 @@ class PreflightInput:
     preset: Preset
     unread: Mapping[str, str] = field(default_factory=dict)
     inner: Mapping[str, Mesh] = field(default_factory=dict)
+    body_ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def inspect(inputs: PreflightInput) -> list[Finding]:

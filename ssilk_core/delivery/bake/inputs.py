@@ -6,13 +6,14 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TypeVar
 
 from ...errors import SsilkError, fail
-from ...files import FileHashes, relative_path, sha256, split_location
+from ...files import FileHashes, relative_path, sha256, split_body, split_location
+from ...scene.shape_weights import parse_shapes, shapes_text
 from .request import INPUTS, BakeRequest
 
 T = TypeVar("T")
@@ -34,9 +35,11 @@ class InputContents:
 
     Attributes:
         files: path and SHA-256 of each file that it consists of, the one that a request names first.
+        shapes: weights of the stage's shapes that make the body, as `shapes_text` writes them; "" for its own.
     """
 
     files: tuple[tuple[str, str], ...]
+    shapes: str = ""
 
     @property
     def first(self) -> str:
@@ -45,7 +48,10 @@ class InputContents:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of all files and of where they lie beside each other; of the file where it is one."""
+        """SHA-256 of all files, of where they lie beside each other, and of shapes; of the file where it is one."""
+        if self.shapes:
+            whole = replace(self, shapes="").digest
+            return hashlib.sha256(json.dumps([whole, self.shapes]).encode()).hexdigest()
         if len(self.files) == 1:
             return self.first
         home = Path(self.files[0][0]).parent
@@ -72,14 +78,20 @@ def stage_contents(location: str, hashed: Callable[[str], str] = sha256) -> Inpu
     """Return what a stage with all its layers and value clips holds.
 
     Args:
-        location: its file, with or without the path of a prim.
+        location: its file, with or without shapes and the path of a prim.
 
     Raises:
         SsilkError: it cannot be read.
     """
     from ssilk_usd.opening.stage import used_files
 
-    return _hashed(used_files(split_location(location)[0]), hashed)
+    return replace(_hashed(used_files(split_location(location)[0]), hashed), shapes=shapes_of(location))
+
+
+def shapes_of(location: str) -> str:
+    """Return the weights of shapes in a location as they are compared; "" where it has none."""
+    shapes = split_body(split_location(location)[0])[1]
+    return shapes_text(parse_shapes(location, shapes)) if shapes else ""
 
 
 def _hashed(paths: Iterable[str], hashed: Callable[[str], str]) -> InputContents:

@@ -103,10 +103,11 @@ def inner_first(tasks: Sequence[BakeTask]) -> list[BakeTask]:
     return sorted(tasks, key=lambda task: depth(task.request.model, over))
 
 
-def certified_over(tasks: Sequence[BakeTask], report: Reporter) -> list[BakeTask]:
-    """Return tasks as `inner_first` does, each with those of its shot and character that it is certified over.
+def put_over(tasks: Sequence[BakeTask], report: Reporter) -> list[BakeTask]:
+    """Return tasks as `inner_first` does, each with those of its shot and character that it is refined or certified
+    over.
 
-    One whose model was trained over another one that is not among them is certified without that, with a warning.
+    One whose model was trained over another one that is not among them does without that, with a warning.
 
     Raises:
         SsilkError: a model cannot be read.
@@ -119,12 +120,12 @@ def certified_over(tasks: Sequence[BakeTask], report: Reporter) -> list[BakeTask
     found = []
     for task in inner_first(tasks):
         model, names = str(task.request.model), tuple[str, ...]()
-        if task.request.certify:
+        if task.request.meets_beneath:
             together = [other for other in worn[_worn_in(task)] if not other.level_of]
             names = tuple(other.garment for other in together if str(other.request.model) in over[model])
             if len(names) < len(digests[model]):
                 text = f"it was trained over {', '.join(digests[model])}; the job has {', '.join(names) or 'none'}"
-                told = f"{task.name}: {text} of these in its shot, and certifies it over no others"
+                told = f"{task.name}: {text} of these in its shot, and puts it over no others"
                 report(Message(told, "warning"))
         found.append(replace(task, over=names))
     return found
@@ -136,7 +137,7 @@ def _worn_in(task: BakeTask) -> tuple[str | None, ...]:
 
 
 def in_levels(tasks: Sequence[BakeTask]) -> list[list[BakeTask]]:
-    """Return tasks in groups, each of which is certified over garments of groups before it alone."""
+    """Return tasks in groups, each of which is put over garments of groups before it alone."""
     left, levels = list(tasks), list[list[BakeTask]]()
     while left:
         waiting = {(task.shot, task.garment) for task in left}

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import SsilkError, fail
 from ...events import Message, Reporter, Result, Started, silent
-from ...files import FileHashes, remove_unfinished_in, replacing, sha256
+from ...files import FileHashes, need_folder, remove_unfinished_in, replacing, sha256
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
@@ -88,6 +88,7 @@ def bake_layers(
     layers, results = LayerFolder(folder), []
     if any(task.request.certify for task in tasks):
         need_certifier()
+    if any(task.request.meets_beneath for task in tasks):
         tasks = inner_first(tasks)
     layers.need_names(tasks)
     report(Started("bake", len(tasks), {"output": str(folder)}))
@@ -112,10 +113,14 @@ class LayerFolder:
 
     The garment of the last task is kept: tasks of one garment that follow each other load it and write its asset
     once.
+
+    Raises:
+        SsilkError: `path` is a file.
     """
 
     def __init__(self, path: str | os.PathLike[str], inputs: InputFiles | None = None) -> None:
         self.path = Path(path)
+        need_folder(self.path)
         self.inputs = inputs or InputFiles()
         self._files = FileHashes()
         self._checked: set[BakeTask] = set()  # tasks of which the names are known to be free
@@ -192,21 +197,21 @@ class LayerFolder:
         is of what the inputs held while they were read.
 
         Args:
-            together: certify it over what it was trained over and lies finished in the shot; otherwise over what the
-                task names alone, so that it does not depend on which tasks are done.
+            together: refine and certify it over what it was trained over and lies finished in the shot; otherwise
+                over what the task names alone, so that it does not depend on which tasks are done.
 
         Raises:
             SsilkError: an input is missing or bad, or not what the task's job was submitted with, a garment that it
-                is certified over is not finished, or a file cannot be written.
+                is refined or certified over is not finished, or a file cannot be written.
             VerificationError: the written layer is not what was computed; it is not kept.
         """
         need_possible_names(task)
         layout, home = self.layout(task), self._home(task)
         wanted = task.pinned or self.inputs.hashes(task.request)
-        beneath = self._beneath(task, report) if task.request.certify and (together or task.over) else {}
+        beneath = self._beneath(task, report) if task.request.meets_beneath and (together or task.over) else {}
         if missing := [name for name in task.over if name not in beneath]:
             found = f"{', '.join(missing)} beneath it is not finished in this shot"
-            allowed = "an outer garment is certified over inner ones as their files have them"
+            allowed = f"an outer garment is {_made(task)} over inner ones as their files have them"
             fail(f"{self.path}: {task.name}", found, allowed, "bake what lies beneath first, and this again")
         if not together:
             beneath = {name: path for name, path in beneath.items() if name in task.over}
@@ -255,8 +260,12 @@ class LayerFolder:
         if damaged and len(found) < len(set(over)):
             records = ", ".join(str(self._home(replace(task, garment=name)) / RECORD) for name in damaged)
             text = f"{records} is damaged, and nothing tells whether '{task.garment}' was trained over that garment"
-            todo = "it is certified without; bake what is damaged again with --replace, then this"
+            todo = f"it is {_made(task)} without; bake what is damaged again with --replace, then this"
             report(Message(f"{task.name}: {text}; {todo}", "warning"))
+        for name in found:
+            if self.layout(replace(task, garment=name)).points.is_file() and _is_refined_points(there[name]):
+                text = f"the refined '{name}' is in its points, and this is {_made(task)} over its joints"
+                report(Message(f"{task.name}: {text}; leave --refined-output out of both", "warning"))
         return found
 
     def _home(self, task: BakeTask) -> Path:
@@ -316,6 +325,16 @@ class LayerFolder:
             remove_unfinished_in(folder)
 
 
+def _made(task: BakeTask) -> str:
+    """Return what a task does with a garment over others."""
+    return "certified" if task.request.certify else "refined"
+
+
+def _is_refined_points(record: TaskRecord | None) -> bool:
+    """Return whether a garment was refined, and its joints are the network's."""
+    return record is not None and record.result.refinement is not None and record.result.refinement.shapes is None
+
+
 def _as_one(errors: Sequence[SsilkError], shots: int) -> SsilkError:
     """Return the error of shots whose stages could not be written."""
     if len(errors) == 1:
@@ -354,11 +373,12 @@ def _write_layer(
     """Write and verify what moves; return the result, and SHA-256 of what was written, by its path.
 
     Args:
-        beneath: layers of garments that it is certified over, by name.
+        beneath: layers of garments that it is refined and certified over, by name.
     """
     from ssilk_usd.shots import layers_animation
 
-    rollout = certified(refined(solved(rollout, report), report, add_shapes=True), report, beneath)
+    rollout = refined(solved(rollout, report), report, add_shapes=True, beneath=beneath)
+    rollout = certified(rollout, report, beneath)
     hidden = hidden_polygons_of(rollout, report)
     riders = rollout.rider_joints()
     if riders and rollout.request.writes_points:

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import fail
-from ...files import split_location
+from ...files import split_body, split_location
 from ...scene.plain import from_plain
+from ...scene.shape_weights import body_name
 
 FIELDS = "{stem}, {prim}, {parent}, {parent2}, {parent3}, ... are names of its file, prim and folders"
 LONGEST = 100  # characters of a name; file systems take 255 bytes
@@ -32,8 +33,8 @@ def pattern_name(pattern: str, location: str, option: str) -> str:
         SsilkError: a field that does not exist, or that this path lacks.
     """
     file, prim = split_location(location)
-    path = Path(os.path.abspath(file))
-    fields = {"stem": path.stem, "prim": (prim or "").rpartition("/")[2]}
+    path = Path(os.path.abspath(split_body(file)[0]))
+    fields = {"stem": body_name(file), "prim": (prim or "").rpartition("/")[2]}
     fields |= {f"parent{'' if up == 1 else up}": folder.name for up, folder in enumerate(path.parents, start=1)}
 
     def value(match: re.Match[str]) -> str:

@@ -9,19 +9,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...errors import fail
-from ...files import relative_path, sha256, split_location
+from ...files import relative_path, sha256, split_body, split_location
 from ...scene.assets import ShotWorld
+from .beneath import OVER
 from .opened import provenance_of
 from .record import RECORD
 from .request import AT, BakeRequest, split_start
-from .rollout import BakeRollout
+from .rollout import BakeRollout, Refinement
 
+REFINED = "refined"  # what a shot says of its refinement, under this name
 COLLIDERS = "colliders"  # what a shot says of those that its cloth met, under this name
 
 
-def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
-    """Return what a shot says of its origin and quality; `recovered` fills while poses are written."""
-    refined = {"refined": rollout.refinement.summary.to_metadata()} if rollout.refinement else {}
+def shot_metadata(rollout: BakeRollout, output: Path, part: Path | None = None) -> dict[str, object]:
+    """Return what a shot says of its origin and quality; `recovered` fills while poses are written.
+
+    Args:
+        part: where it lies before it becomes a part of the output, beside parts that it was refined over.
+    """
+    refined = _refined(rollout.refinement, (part or output).parent) if rollout.refinement else {}
     solved = {"solved in latents": rollout.latents.summary.to_metadata()} if rollout.latents else {}
     loop = {"loop": rollout.loop_summary.to_metadata()} if rollout.loop_summary else {}
     request = rollout.request.relocated(lambda path: _from_folder(path, output.absolute().parent)).to_metadata()
@@ -34,6 +40,11 @@ def shot_metadata(rollout: BakeRollout, output: Path) -> dict[str, object]:
         **refined,
         **met_metadata(rollout.around.seen, output),
     }
+
+
+def _refined(refinement: Refinement, folder: Path) -> dict[str, object]:
+    over = {OVER: refinement.beneath.named(folder)} if refinement.beneath else {}
+    return {REFINED: {**refinement.summary.to_metadata(), **over}}
 
 
 def met_metadata(world: ShotWorld | None, output: Path) -> dict[str, object]:
@@ -129,6 +140,8 @@ def read_origin(
             what = f"the {name} that it was baked from is not at {path}"
             fail(str(shot), what, f"--{name} gives its present path")
         found[name] = str(place)
+        if name == "stage" and (shapes := split_body(path)[1]) and not split_body(found[name])[1]:
+            found[name] += f":{shapes}"  # another path of the stage, which is baked as the same body
     start = stored.start_cloth
     if start is not None:
         place, code = split_start(start)
@@ -169,8 +182,8 @@ def _existing(shot: Path, near: str, held: object, *, baked: bool = False) -> Pa
 
 
 def _file(place: Path) -> Path:
-    """Return the file of a place, which may name a prim in it."""
-    return Path(split_location(str(place))[0])
+    """Return the file of a place, which may name a prim in it, or a body by weights of shapes."""
+    return Path(split_body(split_location(str(place))[0])[0])
 
 
 def _is_baked(file: Path, shot: Path) -> bool:

@@ -18,10 +18,12 @@ from ...files import replacing, sha256
 from ...network.checkpoint import ModelFile, load_model
 from ...physics.intersections.figures import EVERY, LAYERS, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
+from ...quality.levels import quality_named
 from ...scene.mesh.joined import joined
 from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
+from .beneath import THICKNESS
 from .bodies import WornModel, worn
 from .layered import depth, over_others, tell_layers, trained_over
 from .opened import add_provenance, provenance_of
@@ -68,13 +70,16 @@ def bake_outfit(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         parts = {name: folder / f"{name}{GLB}" for name in names}
         asked = dict(zip(names, requests))
-        for name, beneath in _beneath(requests, names).items():
+        over = _beneath(requests, names, quality)
+        for name, beneath in over.items():
             result = bake(
                 asked[name], parts[name], quality=quality, budget=budget,
                 include_body=include_body and name == names[0], verify=verify,
                 report=_without_results(report), place=output,
                 beneath={inner: parts[inner] for inner in beneath},
             )  # fmt: skip
+            if any(name in others for others in over.values()):  # and may be refined over it
+                add_provenance(parts[name], {THICKNESS: load_model(asked[name].model).fabric.thickness})
             results[name] = replace(result, path=output)
             report(Result("bake", {"garment": name, **results[name].figures()}))
         with replacing(output) as unverified:
@@ -117,7 +122,7 @@ def verify_garments(
         parts = {name: Path(folder_name) / f"{name}{GLB}" for name in said}
         for name, alone in parts.items():
             write_alone(shot, name, alone)
-        for name, alone in parts.items():  # beside those that it is certified over
+        for name, alone in parts.items():  # beside those that it is refined or certified over
             origin = read_origin(shot, {}, provenance=said[name])
             proven[name] = verify(alone, device=device, report=_without_results(report), **origin.request.inputs)
             report(Result("verify", {"shot": str(shot), "garment": name, **proven[name].figures()}))
@@ -142,9 +147,10 @@ def holds_several(shot: Path) -> bool:
     return is_stage(shot)
 
 
-def _beneath(requests: Sequence[BakeRequest], names: Sequence[str]) -> dict[str, list[str]]:
-    """Return the garments that each is certified over, by name, inner ones first; none where that is not asked."""
-    if not requests[0].certify:
+def _beneath(requests: Sequence[BakeRequest], names: Sequence[str], quality: str | None) -> dict[str, list[str]]:
+    """Return the garments that each is refined or certified over, by name, inner ones first; none where neither is
+    asked."""
+    if not (requests[0].meets_beneath or (quality and quality_named(quality).refine)):
         return {name: [] for name in names}
     called = {str(request.model): name for name, request in zip(names, requests)}
     over = trained_over(called)

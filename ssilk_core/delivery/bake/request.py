@@ -14,6 +14,7 @@ from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MAX_HOLD, MIN_FPS
 from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
+from .fabrics import need_fabric
 from .world import parse_world
 
 AT = "@"  # before the time code of a frame
@@ -77,7 +78,7 @@ class BakeRequest:
         asset_identifier: likewise; None for the asset's own layer, and for none in a file.
 
     Raises:
-        SsilkError: an unknown target or refined output, or a number out of range.
+        SsilkError: an unknown target, refined output or fabric, or a number out of range.
     """
 
     model: str
@@ -141,6 +142,7 @@ class BakeRequest:
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")
+        need_fabric(self.fabric, self.material)
         if self.lbs and (self.fabric or self.material):
             found = "linear blend skinning has no fabric"
             fail("--lbs", found, "only the network and the solver have one", "leave --fabric and --material out")
@@ -170,6 +172,11 @@ class BakeRequest:
     def inputs(self) -> dict[str, str]:
         """The files that it is baked from, by their fields."""
         return {name: getattr(self, name) for name in INPUTS}
+
+    @property
+    def meets_beneath(self) -> bool:
+        """Whether it is refined or certified, and so over garments beneath as their files have them."""
+        return self.certify or self.refine != 0
 
     @property
     def writes_points(self) -> bool:

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from ...network.latent_solver import LatentRoller
     from ...network.model.network import GarmentModel
     from ...network.start import GivenStart
+    from .beneath import GarmentsBeneath
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +59,14 @@ class Refinement:
         poses: poses fitted to them with the rollout's deformer, where joints are written.
         summary: what the solver changed.
         before: the garment that the network's poses are of.
+        beneath: the garments that it was refined over; None without.
     """
 
     points: tuple[Floats, ...]
     poses: tuple[GarmentPose, ...]
     summary: RefinementSummary
     before: Deformer
+    beneath: GarmentsBeneath | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ class BakeTask:
         level_of: name of the garment of its shot that it is a level of quality of; None for one of its own.
         asset_version, asset_identifier: as the request asks for them. They are of the asset, which shots share, and
             none of them is baked again for another version.
-        over: names of garments of its shot that it is certified over, which have to be finished before.
+        over: names of garments of its shot that it is refined or certified over, which have to be finished before.
     """
 
     garment: str

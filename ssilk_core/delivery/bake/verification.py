@@ -19,11 +19,12 @@ from ...scene.assets import Floats
 from ...scene.cycles import LEAST_FRAMES
 from ..gltf.play import GlbShot
 from ..targets import GLB
+from .beneath import OVER, GarmentsBeneath, beneath_said
 from .certificate.verified import verify_certificate
 from .load import load_rollout
 from .looped import seam
 from .opened import open_shot, provenance_of
-from .origin import read_origin
+from .origin import REFINED, read_origin
 from .refinement import refined_points, verify_energies
 from .result import SKINNED, Verification
 from .riders import verify_riders
@@ -160,9 +161,10 @@ def _verify_points(
         if rollout.direction is not None and not shot.is_skinned:  # held points have any energy
             return _verify_extent(shot, times, path, rollout, report, "refined, and held for a while")
         if not shot.is_skinned:
-            return verify_energies(rollout, map(shot.garment_points, times), report)
+            return verify_energies(rollout, map(shot.garment_points, times), _refined_over(path, samples), report)
         if not rollout.request.writes_points:
-            fitted = _with_moved(shot, times, refined_points(rollout, report), moved)
+            again = refined_points(rollout, report, _refined_over(path, samples))
+            fitted = _with_moved(shot, times, again, moved)
             return compare_trajectories(shot, fitted, samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
     expected = _with_moved(shot, times, expected, moved)
@@ -176,6 +178,12 @@ def _verify_points(
             f"decoder has it; at most {found.bound:.3g} m is allowed, wherever it is; {todo}."
         )
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
+
+
+def _refined_over(path: Path, samples: int) -> GarmentsBeneath | None:
+    """Return the garments that a file says it was refined over; raise `VerificationError` where one is not there."""
+    said = provenance_of(path).get(REFINED)
+    return beneath_said(said.get(OVER), path, samples, "refined") if isinstance(said, Mapping) else None
 
 
 def _with_moved(

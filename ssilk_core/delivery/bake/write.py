@@ -57,7 +57,7 @@ def bake(
         verify: re-skin the file by UsdSkel and compare it with the decoder's own vertices.
         report: takes events.
         place: the file that this one becomes a part of, from which inputs are named; `output` by default.
-        beneath: files of garments that it is certified over, by name, where the request asks for that.
+        beneath: files of garments that it is refined and certified over, by name, where the request asks for that.
 
     Raises:
         SsilkError: an input is missing or does not fit, or the file cannot be written.
@@ -75,7 +75,7 @@ def bake(
         need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
-    rollout = certified(refined(solved(rollout, report), report), report, beneath)
+    rollout = certified(refined(solved(rollout, report), report, beneath=beneath), report, beneath)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, Path(place or path), report)
     rollout, hidden, summary, counts, verification = _write_verified(
@@ -177,7 +177,7 @@ def _write(
         "include_body": include_body,
         "hidden": rollout.hidden,
         "hidden_polygons": hidden,
-        "provenance": shot_metadata(rollout, place),
+        "provenance": shot_metadata(rollout, place, output),
     }
     riders = rollout.rider_joints()
     poses = riders.poses(rollout.motion, rollout.poses())

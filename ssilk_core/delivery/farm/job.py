@@ -17,7 +17,7 @@ from ...files import replacing
 from ...scene.plain import from_plain
 from ..bake import BakeRequest, BakeTask
 from ..bake.asked import tell_impossible
-from ..bake.inputs import InputContents, InputFiles, InputHashes
+from ..bake.inputs import InputContents, InputFiles, InputHashes, shapes_of
 from ..bake.layered import in_levels
 
 NAME = "job.json"
@@ -39,16 +39,22 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     submitted again.
 
     Raises:
-        SsilkError: no task is left that can be baked, because a model has not the fabric that is asked for, or a
-            motion not the range.
+        SsilkError: no task is left that can be baked, because an input cannot be read, a model has not the fabric
+            that is asked for, or a motion not the range.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
+    unread: list[SsilkError] = []
     for name, path in dict.fromkeys(item for task in tasks for item in task.request.inputs.items()):
         try:
             found[path] = files.contents(name, path)
         except SsilkError as error:
-            report(Message(str(error), "warning"))
+            unread.append(error)
+    able = any(found.keys() >= set(task.request.inputs.values()) for task in tasks)
+    for fault in unread if able else unread[:-1]:
+        report(Message(str(fault), "warning"))
+    if not able:
+        raise unread[-1]
     tell_impossible(tasks, found, report)
     return FarmJob(tuple(_pinned(task, found) for level in in_levels(tasks) for task in level), found)
 
@@ -101,7 +107,7 @@ def read_job(path: str | Path, mapping: str | Path | None = None, chosen: str | 
     try:
         tasks = [_mapped(_checked(from_plain(BakeTask, entries[number])), rules) for number in wanted]
         held = document.get("inputs", {})
-        inputs = {_found(path, rules): _contents(files, rules) for path, files in held.items()}
+        inputs = {_found(path, rules): _contents(path, files, rules) for path, files in held.items()}
         return FarmJob(tuple(_pinned(task, inputs) for task in tasks), inputs)
     except (KeyError, TypeError, AttributeError, SsilkError) as error:
         return _no_job(path, f"it is no job ({type(error).__name__}: {error})")
@@ -111,10 +117,11 @@ def _no_job(path: str | Path, found: str) -> NoReturn:
     fail(str(path), found, "a file written by 'ssilk farm' is needed")
 
 
-def _contents(files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> InputContents:
+def _contents(location: str, files: Mapping[str, str], rules: Sequence[dict[str, str]]) -> InputContents:
     if not files or not all(isinstance(digest, str) for digest in files.values()):
         raise TypeError(f"{str(files)[:40]!r} are no files with their hashes")
-    return InputContents(tuple((_found(path, rules), digest) for path, digest in files.items()))
+    held = tuple((_found(path, rules), digest) for path, digest in files.items())
+    return InputContents(held, shapes_of(location))
 
 
 def _pinned(task: BakeTask, inputs: Mapping[str, InputContents]) -> BakeTask:

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from ...errors import fail
 from ...events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
-from ...files import replacing, split_location
+from ...files import need_folder, replacing, split_body, split_location
 from ..bake import BakeTask
 from ..bake.layered import in_levels
 from .job import NAME, FarmJob, is_job, write_job
@@ -50,9 +50,10 @@ def write_bundle(folder: Path, job: FarmJob, output: Path | None, options: Bundl
     """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
-        SsilkError: it cannot be written, or would replace files of another program.
+        SsilkError: it cannot be written, is a file, or would replace files of another program.
     """
     tasks = job.tasks
+    need_folder(folder)
     held = [name for name in (NAME, TEMPLATE, VALUES, ASSETS) if (folder / name).is_file()]
     if held and not is_job(folder / NAME):
         fail(
@@ -74,7 +75,8 @@ def _write(path: Path, document: dict[str, Any]) -> None:
 
 
 def _asset_references(tasks: Sequence[BakeTask], output: Path | None) -> dict[str, Any]:
-    files = sorted({split_location(path)[0] for task in tasks for path in task.request.inputs.values()})
+    places = {split_location(path)[0] for task in tasks for path in task.request.inputs.values()}
+    files = sorted({split_body(place)[0] for place in places})
     folders = [] if output is None else [str(output.absolute())]
     return {
         "assetReferences": {"inputs": {"filenames": files, "directories": []}, "outputs": {"directories": folders}}
@@ -117,7 +119,7 @@ def _environment() -> dict[str, Any]:
 
 
 def _steps(tasks: Sequence[BakeTask], options: BundleOptions) -> list[dict[str, Any]]:
-    """Return the steps: outer garments are certified over inner ones, which are baked in a step before."""
+    """Return the steps: outer garments are refined or certified over inner ones, which are baked in a step before."""
     steps, first = list[dict[str, Any]](), 0
     for number, level in enumerate(in_levels(tasks)):
         name = "BakeOver" + (str(number) if number > 1 else "") if number else "Bake"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import fail
-from ...scene.assets import Floats, Ints
+from ...scene.assets import Floats, Ints, Mesh
 from .channel import NodeChannel
 from .container import GENERATOR
 from .file import GlbFile, listed, understood
@@ -113,6 +113,13 @@ class GlbShot:
         if len(found) != 1:
             fail(self.name, f"{len(found)} meshes are marked as garments", "one is needed")
         return self._posed(found, time)[0]
+
+    @property
+    def garment_at_rest(self) -> Mesh:
+        """The one garment in the bind pose [m]; raises `SsilkError` as `garment_points` does."""
+        self.garment_points(self._start)
+        found = next(surface for surface in self._surfaces if surface.mesh.is_garment)
+        return Mesh(found.mesh.name, found.rest, found.mesh.faces)
 
     def rider_points(self, time: float) -> list[Floats]:
         """Return the points of each mesh that rides on the garment [m], shape (V, 3), in the file's order."""

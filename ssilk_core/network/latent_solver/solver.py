@@ -172,7 +172,7 @@ class LatentSolver:
         failed = torch.zeros_like(none, dtype=torch.bool)
         return LatentSolution(z, state.x, energy, energy, left, torch.zeros_like(left), failed, none)
 
-    def allowed(self, energy: Tensor, dt: float) -> Tensor:
+    def allowed(self, energy: Tensor, dt: float | Tensor) -> Tensor:
         """Return what may be left of frames that have converged [J], (N,); their `energy` resolves nothing finer."""
         resolved = ROUNDING * torch.finfo(energy.dtype).eps * energy.abs().double()
         tolerance = 0.5 * self.free_mass.sum().double() * (self.options.tolerance * GRAVITY * dt) ** 2

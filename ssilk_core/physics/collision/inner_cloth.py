@@ -17,8 +17,9 @@ one obstacle.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,9 +33,10 @@ from .. import kernels
 from ..operators import SparseOperator
 from .closest_point import triangle_patches
 from .contacts import NO_CONTACT_DISTANCE, no_planes
-from .distance import PosedBody, nearest_planes, signed_distance_to_planes
+from .distance import PosedBody, nearest_planes, signed_distance_to_planes, smoothed_planes
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK
 from .samples import ContactSamples
+from .smoothed_distance import SmoothedDistance
 
 DEEPEST = 0.05  # [m] beneath inner cloth, up to which a sample is pushed out
 FACING = (
@@ -42,6 +44,30 @@ FACING = (
 )  # cosine between a triangle's normal and the direction away from the skin, below which it faces the skin
 BORDER_NORMAL = 0.25  # share of the surface's normal in those at a border; the rest leans outwards along the cloth
 Planes = tuple[Tensor, Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class InnerSurface:
+    """A garment beneath another: its mesh in the bind pose, and the thickness of its fabric [m]."""
+
+    mesh: Mesh
+    thickness: float
+
+
+@dataclass(frozen=True, eq=False)
+class PosedBeneath:
+    """The surfaces of several garments beneath one, in N frames."""
+
+    parts: tuple[PosedBody, ...]
+
+    def select(self, frames: Tensor) -> PosedBeneath:
+        """Return those in the frames with indices (M,)."""
+        return PosedBeneath(tuple(part.select(frames) for part in self.parts))
+
+    @classmethod
+    def concatenated(cls, several: Sequence[PosedBeneath]) -> PosedBeneath:
+        """Return those in the frames of several, one after the other."""
+        return cls(tuple(PosedBody.concatenated(own) for own in zip(*(each.parts for each in several))))
 
 
 class InnerCloth:
@@ -127,6 +153,22 @@ class InnerCloth:
         normal, offset = nearest_planes(x, self.posed(y), self._blocks)
         deep = signed_distance_to_planes(x, normal, offset) < -DEEPEST
         return normal, torch.where(deep, offset - NO_CONTACT_DISTANCE, offset + self.half)
+
+    @torch.no_grad()
+    def smoothed(self, x: Tensor, inner: PosedBody, within: float = math.inf) -> SmoothedDistance:
+        """Return smoothed distances of x from the outer face of the cloth, in the precision of x.
+
+        Where a sample touches nothing they are very large.
+
+        Args:
+            x: positions of the samples in `rows`, shape (R, 3, N).
+            inner: the surface, as `posed` returns it.
+            within: distances that matter outside of it [m] (`smoothed_planes`).
+        """
+        found = smoothed_planes(x, inner, self._blocks, within=within + self.half)
+        deep = found.distance(x) < -DEEPEST
+        offset = torch.where(deep, found.offset - NO_CONTACT_DISTANCE, found.offset + self.half)
+        return SmoothedDistance(found.normal, offset, found.curvature.masked_fill(deep[:, None, None], 0))
 
     @torch.no_grad()
     def deeper(self, planes: Planes, x: Tensor, y: Tensor, worn: Tensor | None = None) -> Planes:

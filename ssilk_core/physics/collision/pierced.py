@@ -160,11 +160,11 @@ class Piercing:
             held: what is pierced, wherever x is; found by default.
         """
         pierced = self.find(x[: self.count].float(), limbs) if held is None else held
-        if curvature is None and kernels.supports(normal):
+        if kernels.available(normal.device):
             from ..kernels.crossings import replace_planes_kernel
 
             where = pierced.point, pierced.direction, pierced.tip, pierced.radius
-            replace_planes_kernel(self._rest, self._loose, where, SLOPE, normal, offset)
+            replace_planes_kernel(self._rest, self._loose, where, SLOPE, normal, offset, curvature)
             return
         for point, direction, tip, radius in zip(pierced.point, pierced.direction, pierced.tip, pierced.radius):
             (frames,) = radius.nonzero(as_tuple=True)

@@ -9,12 +9,14 @@ the programs of the next kernel sum these in a fixed order. The host is not invo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
+
+from ..captured import captured, replays, rounded_up
 
 ROWS, FRAMES, WARPS = 16, 32, 4  # rows, maximum number of frames, and warps of one program
 CHUNK = tl.constexpr(32)  # parts of an inner product summed together
@@ -29,11 +31,13 @@ class BlockTable:
         columns: their columns, shape (U, W), int32; shorter rows are padded.
         places: 2 i for the stored block i, 2 i + 1 for its transpose, shape (U, W), int32.
         counts: blocks of each row, shape (U,), int32.
+        captured: solves that are captured as CUDA graphs.
     """
 
     columns: Tensor
     places: Tensor
     counts: Tensor
+    captured: dict[tuple[int, int, float], _CapturedSolve] = field(default_factory=dict, init=False)
 
 
 def solve_kernel(
@@ -54,31 +58,101 @@ def solve_kernel(
         check_every: iterations between convergence checks, which synchronise with the GPU.
         add_product: adds the product of another matrix with vectors (U, 3, N) to such vectors, or None.
     """
-    rows, _, frames = right.shape
-    tile = min(FRAMES, triton.next_power_of_2(frames))
-    grid = triton.cdiv(rows, ROWS), triton.cdiv(frames, tile)
-    blocks, inverse = blocks.contiguous(), inverse.contiguous()
-    residual = right.clone(memory_format=torch.contiguous_format)
-    y = (inverse * residual[:, None]).sum(2)
-    step, image, z = y.clone(), torch.empty_like(y), torch.zeros_like(y)
-    product = (residual * y).sum((0, 1))
-    enough, fresh = product * reduction**2, torch.empty_like(product)
-    along, left = product.new_empty(2, grid[0], frames).unbind()
-    size = (rows, frames, ROWS, tile)
+    if add_product is None and iterations % check_every == 0 and replays(right):
+        capacity = rounded_up(right.shape[-1])
+        key = capacity, check_every, reduction
+        if key not in table.captured:
+            table.captured[key] = _CapturedSolve(blocks, table, right, *key)
+        return table.captured[key](blocks, inverse, right, iterations)
+    own = _Search(
+        blocks.contiguous(), table, inverse.contiguous(), right.clone(memory_format=torch.contiguous_format)
+    )
+    own.begin(reduction)
     for done in range(1, iterations + 1):
-        _multiply[grid](blocks, table.columns, table.places, table.counts, step, image, along, table.columns.shape[1],
-                        *size, num_warps=WARPS)  # fmt: skip
-        parts = grid[0]
-        if add_product is not None:
-            add_product(step, image)
-            along[0], parts = (step * image).sum((0, 1)), 1
-        _descend[grid](z, residual, y, step, image, inverse, product, enough, along, left, parts, *size,
-                       num_warps=WARPS)  # fmt: skip
-        _turn[grid](step, y, product, fresh, left, grid[0], *size, num_warps=WARPS)
-        product, fresh = fresh, product
-        if done % check_every == 0 and not bool((product > enough).any()):
+        own.iterate(add_product)
+        if done % check_every == 0 and own.has_converged():
             break
-    return z, done
+    return own.z, done
+
+
+class _Search:
+    """The vectors of conjugate gradients, which change in place.
+
+    Args:
+        residual: the right side.
+    """
+
+    def __init__(self, blocks: Tensor, table: BlockTable, inverse: Tensor, residual: Tensor) -> None:
+        rows, _, frames = residual.shape
+        tile = min(FRAMES, triton.next_power_of_2(frames))
+        self.grid = triton.cdiv(rows, ROWS), triton.cdiv(frames, tile)
+        self.size = rows, frames, ROWS, tile
+        self.blocks, self.table, self.inverse, self.residual = blocks, table, inverse, residual
+        self.y, self.step, self.image, self.z = (torch.empty_like(residual) for _ in range(4))
+        self.product, self.fresh, self.enough = residual.new_empty(3, frames).unbind()
+        self.along, self.left = residual.new_empty(2, self.grid[0], frames).unbind()
+
+    def begin(self, reduction: float) -> None:
+        """Start from zero."""
+        self.y.copy_((self.inverse * self.residual[:, None]).sum(2))
+        self.step.copy_(self.y)
+        self.z.zero_()
+        self.product.copy_((self.residual * self.y).sum((0, 1)))
+        self.enough.copy_(self.product * reduction**2)
+
+    def iterate(self, add_product: Callable[[Tensor, Tensor], None] | None = None) -> None:
+        """Make an iteration."""
+        columns, places, counts = self.table.columns, self.table.places, self.table.counts
+        _multiply[self.grid](self.blocks, columns, places, counts, self.step, self.image, self.along,
+                             columns.shape[1], *self.size, num_warps=WARPS)  # fmt: skip
+        parts = self.grid[0]
+        if add_product is not None:
+            add_product(self.step, self.image)
+            self.along[0], parts = (self.step * self.image).sum((0, 1)), 1
+        _descend[self.grid](self.z, self.residual, self.y, self.step, self.image, self.inverse, self.product,
+                            self.enough, self.along, self.left, parts, *self.size, num_warps=WARPS)  # fmt: skip
+        _turn[self.grid](self.step, self.y, self.product, self.fresh, self.left, self.grid[0], *self.size,
+                         num_warps=WARPS)  # fmt: skip
+        self.product, self.fresh = self.fresh, self.product
+
+    def has_converged(self) -> bool:
+        """Return whether no frame goes on; this waits for the GPU."""
+        return not bool((self.product > self.enough).any())
+
+
+class _CapturedSolve:
+    """A solve in memory of its own, with graphs of its beginning and of some iterations (`physics.captured`)."""
+
+    def __init__(
+        self, blocks: Tensor, table: BlockTable, right: Tensor, capacity: int, several: int, reduction: float
+    ) -> None:
+        own = _Search(
+            blocks.new_zeros(*blocks.shape[:-1], capacity),
+            table,
+            blocks.new_zeros(len(right), 3, 3, capacity),
+            right.new_zeros(*right.shape[:-1], capacity),
+        )
+        self._own, self._several = own, several + several % 2  # `product` and `fresh` change places in each
+
+        def iterate() -> None:
+            for _ in range(self._several):
+                own.iterate()
+
+        self._begin, self._iterate = captured(lambda: own.begin(reduction)), captured(iterate)
+
+    def __call__(self, blocks: Tensor, inverse: Tensor, right: Tensor, iterations: int) -> tuple[Tensor, int]:
+        own, frames = self._own, right.shape[-1]
+        for kept, given in ((own.blocks, blocks), (own.inverse, inverse), (own.residual, right)):
+            kept[..., :frames].copy_(given)
+        own.residual[..., frames:].zero_()  # what is solved for nothing has converged
+        self._begin.replay()
+        done = 0
+        while done < iterations:
+            self._iterate.replay()
+            done += self._several
+            if own.has_converged():
+                break
+        return own.z[..., :frames].clone(memory_format=torch.contiguous_format), done
 
 
 @triton.jit

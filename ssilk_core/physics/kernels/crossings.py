@@ -79,25 +79,28 @@ def replace_planes_kernel(
     slope: float,
     normal: Tensor,
     offset: Tensor,
+    curvature: Tensor | None = None,
 ) -> None:
-    """Replace, in place, the planes of loose samples around crossings.
+    """Replace, in place, the planes of loose samples around crossings; their curvature becomes zero.
 
     Args:
         rest: samples at rest (S, 3); loose: which of them are, bool (S,).
         pierced: `collision.pierced.PiercedCloth`.
         slope: length of the new normals.
-        normal: (S, 3, N); offset: (S, N).
+        normal: (S, 3, N), and offset: (S, N), in any precision; curvature: (S, 3, 3, N), or None.
     """
     point, direction, tip, radius = (values.contiguous() for values in pierced)
-    assert rest.is_contiguous() and normal.is_contiguous() and offset.is_contiguous()
+    bent = normal if curvature is None else curvature
+    assert all(values.is_contiguous() for values in (rest, normal, offset, bent))
     samples, _, frames = normal.shape
     grid = (samples, triton.cdiv(frames, FRAMES))
-    _replace[grid](rest, loose, point, direction, tip, radius, normal, offset, slope, len(point), frames, FRAMES,
-                   num_warps=1)  # fmt: skip
+    _replace[grid](rest, loose, point, direction, tip, radius, normal, offset, bent, slope, len(point), frames,
+                   curvature is not None, FRAMES, num_warps=1)  # fmt: skip
 
 
 @triton.jit
-def _replace(rest, loose, point, direction, tip, radius, normal, offset, slope, limbs, frames, block: tl.constexpr):
+def _replace(rest, loose, point, direction, tip, radius, normal, offset, curvature, slope, limbs, frames,
+             bent: tl.constexpr, block: tl.constexpr):  # fmt: skip
     s = tl.program_id(0).to(tl.int64)
     if tl.load(loose + s) == 0:
         return
@@ -114,3 +117,6 @@ def _replace(rest, loose, point, direction, tip, radius, normal, offset, slope, 
             store3(normal + s * 3 * frames, frames, n, near, slope * dx, slope * dy, slope * dz)
             far = tl.load(tip + limb * frames + n, mask=near, other=0.0)
             tl.store(offset + s * frames + n, slope * far, mask=near)
+            if bent:
+                for entry in range(9):
+                    tl.store(curvature + (s * 9 + entry) * frames + n, far * 0, mask=near)

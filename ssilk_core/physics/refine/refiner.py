@@ -14,6 +14,8 @@ below the network's. Inertia m/(2 dt^2) |x - target|^2 holds each frame x
   last correction, or as a step of the simulator does, whichever has least energy: the network's course may differ
   from that of the refined cloth. With enough iterations this is the simulator.
 
+Garments beneath it are met where they are in each frame, and stay there (`simulate.over_cloth`).
+
 The first frame of a shot, and after a cut, is quasi-static with feedback, and solved as the simulator does: the shot
 goes on from it.
 """
@@ -32,11 +34,13 @@ from ...errors import fail
 from ...scene.assets import Floats, Motion, Scene, ShotWorld
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import split_at_cuts
+from ..collision.inner_cloth import InnerSurface, PosedBeneath
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.characters import PosedCharacters
 from ..simulate.history import StepHistory
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from, need_finite
+from ..simulate.over_cloth import OverPotential
 from ..world.surroundings import Surroundings
 from .clearing import SkinClearing
 
@@ -137,19 +141,32 @@ class Refiner:
     Args:
         scene: with the character's body.
         fps: of the shots.
+        beneath: garments that it is worn over, which others move.
         device: where everything runs.
     """
 
     def __init__(
-        self, scene: Scene, fabric: Fabric, options: RefineOptions, *, fps: float, device: torch.device | str = "cpu"
+        self,
+        scene: Scene,
+        fabric: Fabric,
+        options: RefineOptions,
+        *,
+        fps: float,
+        beneath: Sequence[InnerSurface] = (),
+        device: torch.device | str = "cpu",
     ) -> None:
         self.options = options
-        self.simulator = Simulator(scene, fabric, SimulationOptions(fps=fps, solver=options.solver), device=device)
+        settings = SimulationOptions(fps=fps, solver=options.solver)
+        self.simulator = Simulator(scene, fabric, settings, beneath=beneath, device=device)
         self.potential = self.simulator.potential
         self.clearing = SkinClearing(scene, self.potential)
 
     def frames(
-        self, motion: Motion, network: Iterable[Floats], world: ShotWorld | None = None
+        self,
+        motion: Motion,
+        network: Iterable[Floats],
+        world: ShotWorld | None = None,
+        beneath: Iterable[Sequence[Floats]] = (),
     ) -> Iterator[RefinedFrame]:
         """Yield the refined frames of a shot.
 
@@ -157,17 +174,23 @@ class Refiner:
             motion: the character's, at the shot's frames.
             network: garment vertices of each frame in world space [m], shape (V, 3).
             world: what surrounds the character, from the motion's first frame on.
+            beneath: vertices of the garments beneath in each frame in world space [m], shape (W, 3) each.
 
         Raises:
             SsilkError: the motion is at another rate, or a frame is not finite.
         """
-        yield from self._spans(motion, iter(network), None, world)
+        yield from self._spans(motion, iter(network), None, world, iter(beneath))
 
     def changes(
-        self, motion: Motion, network: Iterable[Floats], refined: Iterable[Floats], world: ShotWorld | None = None
+        self,
+        motion: Motion,
+        network: Iterable[Floats],
+        refined: Iterable[Floats],
+        world: ShotWorld | None = None,
+        beneath: Iterable[Sequence[Floats]] = (),
     ) -> Iterator[FrameChange]:
         """Yield the changes of a shot that has been refined; arguments as for `frames`."""
-        for frame in self._spans(motion, iter(network), iter(refined), world):
+        for frame in self._spans(motion, iter(network), iter(refined), world, iter(beneath)):
             yield frame.change
 
     @torch.no_grad()
@@ -177,13 +200,14 @@ class Refiner:
         network: Iterator[Floats],
         refined_points: Iterator[Floats] | None,
         world: ShotWorld | None,
+        beneath: Iterator[Sequence[Floats]],
     ) -> Iterator[RefinedFrame]:
         fps = self.simulator.options.fps
         if not abs(motion.fps - fps) < 1e-6:
             fail(motion.path, f"{motion.fps:g} frames per second", f"{fps:g} is needed")
         surroundings, first = self.simulator.surroundings([world]), 0
         for span in split_at_cuts(motion, self.simulator.poser.skeleton):
-            yield from self._span(span, network, refined_points, surroundings, first)
+            yield from self._span(span, network, refined_points, surroundings, first, beneath)
             first += span.frame_count
 
     def _span(
@@ -193,6 +217,7 @@ class Refiner:
         refined_points: Iterator[Floats] | None,
         surroundings: Surroundings | None,
         first: int,
+        beneath: Iterator[Sequence[Floats]],
     ) -> Iterator[RefinedFrame]:
         """Yield the frames of a motion without cuts, whose first is one of the shot's."""
         tail: _Tail | None = None
@@ -204,7 +229,8 @@ class Refiner:
                 places = [(0, (first + frame) / span.fps) for frame in range(start, stop)]
                 poses = replace(poses, world=surroundings.around(places, poses.root, poses.lbs))
             given = None if refined_points is None else self._next_frames(refined_points, stop - start)
-            frames, tail = self._refined(tail, world, poses, given)
+            below = self._beneath(beneath, stop - start, poses.root)
+            frames, tail = self._refined(tail, world, poses, given, below)
             yield from frames
 
     @torch.no_grad()
@@ -234,19 +260,25 @@ class Refiner:
             )
             moves = self.simulator.poser.moves((motion, slice(number, number + 1)) for motion in running)
             poses = self.simulator.poser.pose(rotations, translations, moves)
-            frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None)
+            frames, tail = self._refined(tail and tail.first(len(running)), world, poses, None, None)
             yield list(frames)
 
     def _refined(
-        self, tail: _Tail | None, world: Tensor, poses: PosedCharacters, given: Tensor | None
+        self,
+        tail: _Tail | None,
+        world: Tensor,
+        poses: PosedCharacters,
+        given: Tensor | None,
+        beneath: PosedBeneath | None,
     ) -> tuple[Iterator[RefinedFrame], _Tail]:
         """Refine frames of a shot, or with feedback one of each of several; return them and what the next ones need.
 
         Args:
             world: the network's positions (V, 3, N); given: those after refinement, where they are known.
+            beneath: the garments beneath, where there are any.
         """
         past = self._history(tail, world, poses)
-        inputs = self.simulator.inputs(poses, past)
+        inputs = replace(self.simulator.inputs(poses, past), beneath=beneath)
         if not self.options.feedback:
             inputs = replace(inputs, predicted=(world - poses.root).to(self.potential.dtype))
         before = State.at(self.potential, self.simulator.apply_pins(world - poses.root, poses), inputs)
@@ -262,6 +294,13 @@ class Refiner:
         """Return the next frames' positions (V, 3, N)."""
         points = np.stack(list(islice(vertices, count)), axis=-1)
         return torch.as_tensor(points, dtype=torch.float64, device=self.potential.free.device)
+
+    def _beneath(self, frames: Iterator[Sequence[Floats]], count: int, root: Tensor) -> PosedBeneath | None:
+        """Return the garments beneath in the next frames, relative to the roots (3, N); None where there are none."""
+        if not isinstance(self.potential, OverPotential):
+            return None
+        each = [np.stack(points, axis=-1) for points in zip(*islice(frames, count), strict=True)]
+        return self.potential.posed(each, root)
 
     def _refine(
         self,

@@ -34,11 +34,13 @@ class BlockMatrix:
     Attributes:
         blocks: stored blocks, first those on the diagonal, shape (stored, 3, 3, N).
         contacts: what is added for contacts of cloth with cloth, or None.
+        inverse: what `inverse_diagonal` returns, where it is known.
     """
 
     pattern: BlockPattern
     blocks: Tensor
     contacts: ContactStiffness | None = None
+    inverse: Tensor | None = None
 
     @cached_property
     def rows(self) -> Tensor:
@@ -54,6 +56,13 @@ class BlockMatrix:
             image += added.permute(2, 0, 1)
         return image
 
+    def inverse_diagonal(self) -> Tensor:
+        """Return the inverses of the blocks on the diagonal, shape (U, 3, 3, N)."""
+        diagonal = self.blocks[: self.pattern.count]
+        if self.contacts is not None:
+            diagonal = diagonal + self.contacts.diagonal
+        return inverse_blocks(diagonal.permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
+
     def solve(
         self, right: Tensor, reduction: float, iterations: int, check_every: int = CHECK_EVERY
     ) -> tuple[Tensor, int]:
@@ -64,17 +73,14 @@ class BlockMatrix:
         Args:
             check_every: iterations between checks of a GPU for convergence, which wait for it.
         """
-        diagonal = self.blocks[: self.pattern.count]
-        if self.contacts is not None:
-            diagonal = diagonal + self.contacts.diagonal
-        diagonal = diagonal.permute(3, 0, 1, 2)
-        inverse = inverse_blocks(diagonal.contiguous())
+        inverse = self.inverse_diagonal() if self.inverse is None else self.inverse
         if kernels.available(right.device):
             from ..kernels.conjugate_gradient import solve_kernel
 
-            inverse, table = inverse.permute(1, 2, 3, 0), self.pattern.table
+            table = self.pattern.table
             added = None if self.contacts is None else self.contacts.add_product
             return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every, added)
+        inverse = inverse.permute(3, 0, 1, 2)
         z, count = solve(
             lambda v: self @ v,
             lambda r: (inverse * r[..., None, :]).sum(-1),
@@ -142,10 +148,8 @@ class BlockPattern:
         at = np.arange(len(row)) - np.repeat(counts.cumsum() - counts, counts)
         columns, places = np.zeros((2, self.count, counts.max()), dtype=np.int32)
         columns[row, at], places[row, at] = column, 2 * stored + below
-        tables = (
-            torch.as_tensor(values, device=self.device) for values in (columns, places, counts.astype(np.int32))
-        )
-        return BlockTable(*tables)
+        tables = columns, places, counts.astype(np.int32)
+        return BlockTable(*[torch.as_tensor(values, device=self.device) for values in tables])
 
     @cached_property
     def block_rows(self) -> BlockRows:

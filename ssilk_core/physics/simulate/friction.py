@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Coulomb friction of cloth on the body and on cloth, as a potential of the slip in one step.
+"""Coulomb friction of cloth on the body, on colliders and on cloth, as a potential of the slip in one step.
 
 What pressed at the end of the last step rubs in this one: its forces and directions stay as they were then. So the
 friction of a step is a convex potential, as in IPC (Li et al. 2020, Section 5). With the coefficient mu, a force p,
@@ -12,13 +12,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
+from ..collision.samples import SampledCloth
+from ..energy.collision import ContactLaw
+from ..framed import consecutive
 from ..self_contact import ClothContacts
 from ..self_contact.contacts import Slopes, at_vertices
 from ..self_contact.neighbours import places_among
+from ..world.surroundings import PosedWorld
 
 CREEP = 2e-3  # [m/s]
 TINY = 1e-12  # [m]
@@ -34,12 +37,12 @@ class Friction:
         frame: of each place, shape (P,).
         vertices: of the cloth, shape (4, P).
         coefficients: of these in a position c . x, or in the difference of two, shape (4, P).
-        corners: vertices of the body, shape (3, P).
+        corners: vertices of the body, and after these of all colliders of the shot, shape (3, P).
         weights: of these, likewise; zero where cloth rubs on cloth, shape (3, P).
         direction: across which it slips, unit vectors, shape (3, P).
         limit: mu p [N], shape (P,).
-        held: c . x - w . b at the end of the last step [m], for vertices b of the body; then, for a step, c . x where
-            nothing would slip, shape (3, P).
+        held: c . x - w . b at the end of the last step [m], for vertices b of what cloth rubs on; then, for a step,
+            c . x where nothing would slip, shape (3, P).
     """
 
     frames: int
@@ -75,15 +78,41 @@ class Friction:
         return cls(own.frames, CREEP * dt, own.frame, *rows)
 
     @classmethod
+    def on_world(
+        cls, cloth: SampledCloth, law: ContactLaw, x: Tensor, world: PosedWorld, body: int, mu: float, dt: float
+    ) -> Friction:
+        """Return that of cloth at positions x (V, 3, N) on colliders, beside a body of so many vertices."""
+        samples = cloth.positions(x)
+        near = world.touched(samples, law.start)
+        row, frame = near.row, near.frame
+        held = samples[row, :, frame].T - world.on_surfaces(near.corners, near.weights, frame)
+        limit = mu * cloth.area[row, 0] * law.pressure(near.distance)
+        met = near.corners + body, near.weights
+        return cls(x.shape[-1], CREEP * dt, frame, *corners_of(cloth, row, x), *met, near.normal, limit, held)
+
+    @classmethod
     def concatenated(cls, parts: Sequence[Friction]) -> Friction:
         """Return that of the frames of several, one after the other."""
-        before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
-        moved = [replace(part, frame=part.frame + first) for part, first in zip(parts, before)]
-        return replace(cls.joined(*moved), frames=before[-1])
+        places = consecutive([part.frames for part in parts], parts[0].frame.device)
+        moved = [replace(part, frame=place[part.frame]) for part, place in zip(parts, places)]
+        return replace(cls.joined(*moved), frames=sum(map(len, places)))
 
-    def after(self, body: Tensor) -> Friction:
-        """Return that of a step in which the body has moved to points (B, 3, N)."""
-        return replace(self, held=self.held + _combined(self.weights, body, self.corners, self.frame))
+    def after(self, body: Tensor, world: PosedWorld | None = None) -> Friction:
+        """Return that of a step in which the body has moved to points (B, 3, N), and colliders as `world` has them.
+
+        A collider that is gone rubs no more.
+        """
+        on_world = self.corners[0] >= len(body)
+        if not bool(on_world.any()):
+            return replace(self, held=self.held + _combined(self.weights, body, self.corners, self.frame))
+        moved = _combined(self.weights, body, self.corners.where(~on_world, 0), self.frame)
+        if world is None:
+            moved[:, on_world] = torch.nan
+        else:
+            own = (self.corners - len(body))[:, on_world], self.weights[:, on_world], self.frame[on_world]
+            moved[:, on_world] = world.on_surfaces(*own)
+        there = ~moved.isnan().any(0)
+        return replace(self, held=self.held + moved.where(there, 0), limit=self.limit.where(there, 0))
 
     def select(self, frames: Tensor) -> Friction:
         """Return that of the frames with indices (M,), in ascending order."""
@@ -141,6 +170,13 @@ class Friction:
             self.limit,
             self.held,
         )
+
+
+def corners_of(cloth: SampledCloth, row: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the vertices of samples (P,) at positions x, with their coefficients, of four of which one has none."""
+    vertices = torch.as_tensor(cloth.samples.corners, device=x.device)[row].T
+    coefficients = torch.as_tensor(cloth.samples.weights, dtype=x.dtype, device=x.device)[row].T
+    return torch.cat([vertices, vertices[:1]]), torch.cat([coefficients, torch.zeros_like(coefficients[:1])])
 
 
 def _combined(coefficients: Tensor, points: Tensor, index: Tensor, frame: Tensor) -> Tensor:

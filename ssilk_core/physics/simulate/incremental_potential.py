@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,9 @@ from torch import Tensor
 from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
+from ..captured import Captured
 from ..collision import Contacts, PosedBody, SmoothedDistance
+from ..collision.inner_cloth import PosedBeneath
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..energy import GarmentEnergy
@@ -37,8 +40,9 @@ from ..self_contact import ClothContacts, ClothNeighbours, SelfContact, Touching
 from ..self_contact.contacts import Slopes
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
+from .captured_potential import CapturedPotential
 from .contact_stiffness import ContactStiffness
-from .friction import CREEP, Friction
+from .friction import CREEP, Friction, corners_of
 from .hessian import NO_CORNERS, Hessian
 from .membrane import outer
 from .stitches import stitch_gradient
@@ -57,28 +61,35 @@ class StepInputs(Framed):
             garments differently.
         predicted: 2 x' - x'' [m], shape (V, 3, N), or None for a quasi-static state.
         advected: x' moved with the air [m], shape (V, 3, N), or None likewise.
-        dt: time step [s]. For a quasi-static state it only damps the solver's steps.
+        dt: time step [s], or that of each frame, shape (N,). For a quasi-static state it only damps the solver's
+            steps.
         skinned: the garment under linear blend skinning [m], where tethers hold it, shape (V, 3, N); None without.
         neighbours: which cloth may touch which, or None where cloth may pass through cloth.
         contacts: of cloth with cloth, about the positions that a step starts from; None where no step began.
         friction: of what pressed in the step before; None without.
         pierced: the cloth that limbs are through, wherever it goes; None where that is found at each position.
         world: what cloth meets besides the body; None without.
+        beneath: the garments beneath, for a potential that meets them (`over_cloth`); None without.
     """
-
-    SHARED = frozenset({"dt"})
 
     body: PosedBody | None
     gravity: Tensor
     predicted: Tensor | None = None
     advected: Tensor | None = None
-    dt: float = 0.1
+    dt: float | Tensor = 0.1
     skinned: Tensor | None = None
     neighbours: ClothNeighbours | None = None
     contacts: ClothContacts | None = None
     friction: Friction | None = None
     pierced: PiercedCloth | PiercedOutfit | None = None
     world: PosedWorld | None = None
+    beneath: PosedBeneath | None = None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether all of it is tensors of fixed sizes: the cloth of one garment meets its body, and nothing rubs."""
+        changing = self.neighbours, self.contacts, self.friction, self.world
+        return all(each is None for each in changing) and not isinstance(self.pierced, PiercedOutfit)
 
 
 class IncrementalPotential:
@@ -87,6 +98,8 @@ class IncrementalPotential:
     Attributes:
         free: indices of the free vertices: not pinned, with mass, shape (U,).
         size: diagonal of the garment's bounding box at rest [m].
+        cloth: the samples at which it meets things, those that meet the body and the world first.
+        sample_count: of these.
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
@@ -110,6 +123,7 @@ class IncrementalPotential:
         self.tether[energy.tethered, 0] = energy.tether_stiffness
         self.size = mesh.diagonal
         self.cloth, self.law, self.stitching = energy.cloth, energy.law, energy.stitching
+        self.sample_count = len(self.cloth.area)
         self.contacts = Contacts(scene, self.cloth.samples, limbs=limbs, device=device)
         self._self_contact = partial(SelfContact, TouchingCloth.of(scene, fabric), device, dtype)
         self.use(Hessian.of(scene, energy))
@@ -118,7 +132,8 @@ class IncrementalPotential:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
-        self.__dict__.pop("_elastic_tables", None)
+        for name in ("_elastic_tables", "captured"):
+            self.__dict__.pop(name, None)
 
     @property
     def garments(self) -> list[tuple[slice, Fabric]]:
@@ -129,6 +144,23 @@ class IncrementalPotential:
     def self_contact(self) -> SelfContact:
         """What knows where the garment touches itself; nothing is spent on it where nobody asks."""
         return self._self_contact()
+
+    @cached_property
+    def captured(self) -> CapturedPotential:
+        """What a GPU computes of it at once."""
+
+        def state(x: Tensor, inputs: StepInputs) -> list[Tensor]:
+            distance = self.body_distance(x, inputs)
+            return [self.energy(x, inputs, distance), *(distance.tensors() if distance else [])]
+
+        def gradient(x: Tensor, inputs: StepInputs, distance: SmoothedDistance | None) -> list[Tensor]:
+            return [self.gradient(x, inputs, distance)]
+
+        def hessian(x: Tensor, inputs: StepInputs, *others: Any) -> list[Tensor]:
+            matrix = self.hessian(x, inputs, *others)
+            return [matrix.blocks, matrix.inverse_diagonal()]
+
+        return CapturedPotential(Captured(state), Captured(gradient), Captured(hessian))
 
     @property
     def block_pattern(self) -> BlockPattern:
@@ -149,7 +181,7 @@ class IncrementalPotential:
             return None
         assert not isinstance(inputs.pierced, PiercedOutfit)
         within = self.law.start + allowance
-        return self.contacts.smoothed(self.cloth.positions(x), inputs.body, within, inputs.pierced)
+        return self.contacts.smoothed(self._own_samples(x), inputs.body, within, inputs.pierced)
 
     def body_distance_nearby(
         self, x: Tensor, inputs: StepInputs, known: SmoothedDistance | None, at: Tensor
@@ -158,8 +190,8 @@ class IncrementalPotential:
         other positions `at` (V, 3, N) are known: on a processor in less time, the nearer the two are."""
         if inputs.body is None or known is None or inputs.pierced is not None:
             return self.body_distance(x, inputs)
-        positions, within = self.cloth.positions, self.law.start
-        return self.contacts.smoothed_nearby(positions(x), inputs.body, known, positions(at), within)
+        samples, within = self._own_samples, self.law.start
+        return self.contacts.smoothed_nearby(samples(x), inputs.body, known, samples(at), within)
 
     def with_contacts(self, x: Tensor, inputs: StepInputs, moved: bool = False) -> StepInputs:
         """Return inputs with the contacts of cloth with cloth at x, where cloth may not pass through cloth.
@@ -203,8 +235,16 @@ class IncrementalPotential:
             inputs = self.with_contacts(x, inputs, moved=True)
         return x, inputs
 
-    def friction(self, x: Tensor, body: PosedBody, neighbours: ClothNeighbours | None, dt: float) -> Friction | None:
-        """Return the friction in the step of dt [s] after positions x on a body; None for cloth without friction."""
+    def friction(
+        self,
+        x: Tensor,
+        body: PosedBody,
+        neighbours: ClothNeighbours | None,
+        dt: float,
+        world: PosedWorld | None = None,
+    ) -> Friction | None:
+        """Return the friction in the step of dt [s] after positions x on a body, and on the colliders of a world;
+        None for cloth without friction."""
         mu = self.fabric.friction
         if not mu:
             return None
@@ -214,8 +254,6 @@ class IncrementalPotential:
         force = self.cloth.area * self.law.pressure(distance)
         reach = torch.where(force > 0, 2 * distance.abs() + self.law.start, -1.0).float()
         row, frame, corners, weights = self.contacts.touched(samples.float(), reach, body)
-        vertices = torch.as_tensor(self.cloth.samples.corners, device=x.device)[row].T
-        coefficients = torch.as_tensor(self.cloth.samples.weights, dtype=x.dtype, device=x.device)[row].T
         normal = torch.nn.functional.normalize(found.normal[row, :, frame].T, dim=0)
         weights = weights.to(x.dtype)
         on_body = (weights[:, None] * body.points[corners, :, frame].movedim(-1, 1)).sum(0)
@@ -223,17 +261,19 @@ class IncrementalPotential:
             x.shape[-1],
             CREEP * dt,
             frame,
-            torch.cat([vertices, vertices[:1]]),
-            torch.cat([coefficients, torch.zeros_like(coefficients[:1])]),
+            *corners_of(self.cloth, row, x),
             corners,
             weights,
             normal,
             mu * force[row, frame],
             samples[row, :, frame].T - on_body,
         )
-        if neighbours is None:
-            return rubbing
-        return Friction.joined(rubbing, Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+        parts = [rubbing]
+        if world is not None and world.has_colliders:
+            parts.append(Friction.on_world(self.cloth, self.law, x, world, len(body.points), mu, dt))
+        if neighbours is not None:
+            parts.append(Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
+        return Friction.joined(*parts)
 
     def best_start(self, starts: Sequence[Tensor], inputs: StepInputs) -> Tensor:
         """Return for each frame the start (V, 3, N) with the least energy."""
@@ -260,12 +300,16 @@ class IncrementalPotential:
                 total = total + part.energy(x)
         if inputs.world is not None:
             total = total + self._world_energy(x, inputs.world)
-        if loops.supports(x) and not x.requires_grad:
+        if self._by_loop(x, inputs) and not x.requires_grad:
             return total + self._points(x, inputs, body_distance, False)[0]
         total = total - (self.mass * (x * inputs.gravity).sum(1)).sum(0)
         for weight, target in self._anchors(inputs):
             total = total + (0.5 * weight * ((x - target) ** 2).sum(1)).sum(0)
         return total + self.collision(x, body_distance).sum(0)
+
+    @staticmethod
+    def _by_loop(x: Tensor, inputs: StepInputs) -> bool:
+        return loops.supports(x) and not isinstance(inputs.dt, Tensor)
 
     def _points(
         self, x: Tensor, inputs: StepInputs, body_distance: SmoothedDistance | None, wanted: bool
@@ -298,7 +342,7 @@ class IncrementalPotential:
                 total += part.gradient(x)
         if inputs.world is not None:
             total += self._world_gradient(x, inputs.world)
-        if loops.supports(x):
+        if self._by_loop(x, inputs):
             _, slopes, pushes = self._points(x, inputs, body_distance, True)
             total += slopes
             return total + self.cloth.to_vertices(pushes) if body_distance else total
@@ -342,14 +386,14 @@ class IncrementalPotential:
 
     def _world_energy(self, x: Tensor, world: PosedWorld) -> Tensor:
         """Return the energy of contact with what surrounds the character [J], shape (N,)."""
-        near = world.touched(self.cloth.positions(x), self.law.start)
+        near = world.touched(self._own_samples(x), self.law.start)
         each = self.cloth.area[near.row, 0] * self.law.energy(near.distance)
         return x.new_zeros(x.shape[-1]).index_put_((near.frame,), each, accumulate=True)
 
     def _world_gradient(self, x: Tensor, world: PosedWorld) -> Tensor:
         """Return its gradient [N], shape (V, 3, N)."""
         samples = self.cloth.positions(x)
-        near = world.touched(samples, self.law.start)
+        near = world.touched(samples[: self.sample_count], self.law.start)
         push = -self.cloth.area[near.row, 0] * self.law.pressure(near.distance) * near.normal
         pushes = samples.new_zeros(len(samples), x.shape[-1], 3)
         pushes.index_put_((near.row, near.frame), push.T, accumulate=True)
@@ -361,12 +405,16 @@ class IncrementalPotential:
         How its normal turns is left out: outside of edges and corners that would make a block indefinite.
         """
         samples = self.cloth.positions(x)
-        near = world.touched(samples, self.law.start)
+        near = world.touched(samples[: self.sample_count], self.law.start)
         stiffness = self.cloth.area[near.row, 0] * self.law.curvature(near.distance)
         blocks = samples.new_zeros(len(samples), x.shape[-1], 3, 3)
         each = (stiffness * near.normal[:, None] * near.normal).permute(2, 0, 1)
         blocks = blocks.index_put_((near.row, near.frame), each, accumulate=True).permute(0, 2, 3, 1)
         return blocks if contact is None else contact + blocks
+
+    def _own_samples(self, x: Tensor) -> Tensor:
+        """Return the samples that meet body and world, at positions (V, 3, N), shape (S, 3, N)."""
+        return self.cloth.positions(x)[: self.sample_count]
 
     def _stiffness(self, x: Tensor, slopes: Slopes) -> ContactStiffness:
         """Return the Hessian that slopes add up to."""
@@ -407,7 +455,10 @@ class IncrementalPotential:
         return elastic_tables(len(self.mass), membrane.corners, weights, areas, corners, numbers)
 
     def _anchors(self, inputs: StepInputs) -> list[tuple[Tensor, Tensor]]:
-        """Return stiffness [N/m] (V, 1) and target (V, 3, N) of the tether, inertia and drag, where present."""
+        """Return stiffness [N/m] and target (V, 3, N) of the tether, inertia and drag, where present.
+
+        Stiffness is (V, 1), or (V, N) where frames have time steps of their own.
+        """
         found = []
         if inputs.skinned is not None and self.fabric.tether:
             found.append((self.tether, inputs.skinned))

@@ -26,13 +26,17 @@ import torch
 from torch import Tensor
 
 from ...errors import fail
+from .. import kernels
+from ..captured import replays
 from ..collision import SmoothedDistance
 from ..framed import Framed
 from ..self_contact import ClothContacts, ClothNeighbours
+from .blocks import BlockMatrix
 from .incremental_potential import IncrementalPotential, StepInputs
 
 ARMIJO = 1e-4  # required decrease relative to the slope
-MAX_BACKTRACKS = 12
+LENGTHS = tuple(0.5**halved for halved in range(12))  # of steps that are tried
+AT_ONCE = 128  # frames and lengths after the first that a GPU tries at once, which takes no longer than one
 REDUCTION = 0.1  # of the residual by each linear solve
 MAX_DISPLACEMENT = 0.1  # of a vertex in one step, relative to the garment's size: a bound on inexact solutions
 SHORT_STEP = 0.25  # step length from which on obstructing vertices are fixed
@@ -111,6 +115,9 @@ class State(Framed):
     @classmethod
     def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
+        if inputs.is_plain and replays(x):
+            energy, *planes = potential.captured.state(x, inputs)
+            return cls(x, SmoothedDistance(*planes) if planes else None, energy)
         body_distance = potential.body_distance(x, inputs)
         return cls(x, body_distance, potential.energy(x, inputs, body_distance), inputs.neighbours)
 
@@ -308,7 +315,11 @@ class Search:
         if self.inputs.neighbours is not None:
             around = replace(self.inputs, neighbours=self.state.neighbours)
             self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
-        gradient = self.potential.gradient(self.state.x, self.inputs, self.state.body_distance)
+        given = self.state.x, self.inputs, self.state.body_distance
+        if self.inputs.is_plain and replays(self.state.x):
+            (gradient,) = self.potential.captured.gradient(*given)
+        else:
+            gradient = self.potential.gradient(*given)
         self.gradient = gradient.masked_fill(self.course.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)
 
@@ -329,9 +340,13 @@ def newton_step(
     solved until its residual has fallen to `reduction`.
     """
     right = -gradient[potential.free].float()
-    z, count = potential.hessian(state.x, inputs, state.body_distance, fixed, exact_hessian).solve(
-        right, reduction, cg_iterations
-    )
+    given = state.x, inputs, state.body_distance, fixed, exact_hessian
+    if inputs.is_plain and replays(state.x):
+        blocks, inverse = potential.captured.hessian(*given)
+        matrix = BlockMatrix(potential.block_pattern, blocks, inverse=inverse)
+    else:
+        matrix = potential.hessian(*given)
+    z, count = matrix.solve(right, reduction, cg_iterations)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)
     if fixed is not None:
@@ -350,22 +365,32 @@ def line_search(
         steps where the length is small (V, N).
     """
     slope = (gradient * step).sum((0, 1))
-    found, left, length = state, (slope < 0).nonzero()[:, 0], 1.0
+    found, left = state, (slope < 0).nonzero()[:, 0]
     lengths, obstructing = torch.zeros_like(slope), torch.zeros_like(step[:, 0], dtype=torch.bool)
-    for _ in range(MAX_BACKTRACKS):
-        if not len(left):
-            break
-        x = (state.x + length * step)[..., left]
-        trial = State.at(potential, x, potential.with_contacts(x, inputs.select(left)))
-        fallen = trial.energy <= (state.energy + ARMIJO * length * slope)[left]
-        rows = fallen.nonzero()[:, 0]
-        if len(rows):
-            found = found.replace_frames(left[rows], trial.select(rows))
-            lengths[left[rows]] = length
-        if length <= SHORT_STEP:
-            cost = excess_collision(potential, state.select(left), trial, length * step[..., left])
-            obstructing[:, left] |= (cost > OBSTRUCTING * length * slope[left].abs()) & ~fallen
-        left, length = left[~fallen], length / 2
+    at_once, tried = kernels.available(slope.device) and inputs.neighbours is None, 0
+    while len(left) and tried < len(LENGTHS):
+        count = max(1, AT_ONCE // len(left)) if tried and at_once else 1
+        several = LENGTHS[tried : tried + count]
+        tried += count
+        length, rows = slope.new_tensor(several).repeat_interleave(len(left)), left.repeat(len(several))
+        moved = length * step[..., rows]
+        x = state.x[..., rows] + moved
+        around = StepInputs.concatenated([inputs.select(left)] * len(several))
+        trial = State.at(potential, x, potential.with_contacts(x, around))
+        fallen = trial.energy <= state.energy[rows] + ARMIJO * length * slope[rows]
+        fallen = fallen.view(len(several), -1)
+        done = fallen.any(0)
+        columns = done.nonzero()[:, 0]
+        if len(columns):
+            longest = fallen.int().argmax(0)[columns] * len(left) + columns
+            found = found.replace_frames(left[columns], trial.select(longest))
+            lengths[left[columns]] = length[longest]
+        if several[-1] <= SHORT_STEP:
+            cost = excess_collision(potential, state.select(rows), trial, moved)
+            longer = (fallen.cumsum(0) == 0).flatten() & (length <= SHORT_STEP)
+            obstructs = (cost > OBSTRUCTING * length * slope[rows].abs()) & longer
+            obstructing[:, left] |= obstructs.view(len(cost), len(several), -1).any(1)
+        left = left[~done]
     return found, lengths, obstructing
 
 

@@ -27,6 +27,7 @@ from ..collision.pierced import PiercedOutfit
 from ..collision.samples import ContactSamples, SampledCloth
 from ..self_contact import ClothNeighbours, SelfContact, TouchingCloth
 from ..self_contact.contacts import Slopes
+from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
 from .friction import Friction
 from .incremental_potential import IncrementalPotential, StepInputs
@@ -174,12 +175,19 @@ class OutfitPotential(IncrementalPotential):
             ]
         )
 
-    def friction(self, x: Tensor, body: PosedBody, neighbours: ClothNeighbours | None, dt: float) -> Friction | None:
-        """Return the friction in the step of dt [s] after positions x on a body; None for cloth without friction."""
+    def friction(
+        self,
+        x: Tensor,
+        body: PosedBody,
+        neighbours: ClothNeighbours | None,
+        dt: float,
+        world: PosedWorld | None = None,
+    ) -> Friction | None:
+        """Return the friction in the step of dt [s] after positions x, as that of one garment does."""
         found = [
             replace(rubbing, vertices=rubbing.vertices + rows.start)
             for part, rows in self._each()
-            if (rubbing := part.friction(x[rows], body, None, dt)) is not None
+            if (rubbing := part.friction(x[rows], body, None, dt, world)) is not None
         ]
         if not found:
             return None

@@ -11,6 +11,8 @@ from collections.abc import Callable, Generator, Hashable, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from torch import Tensor
+
 from .characters import PosedCharacters
 from .history import StepHistory
 from .newton import Search, Solution
@@ -26,24 +28,33 @@ class Asked:
 
     Attributes:
         dt: its length [s].
-        search: returns the search for the ends of such steps, by numbers of N shots.
+        search: returns the search for the ends of such steps, by numbers of N shots, and the length of all or of
+            each, (N,).
         past: before the step.
         poses: at its end.
     """
 
     dt: float
-    search: Callable[[PosedCharacters, StepHistory, Sequence[int]], Search]
+    search: Callable[[PosedCharacters, StepHistory, Sequence[int], float | Tensor], Search]
     past: StepHistory
     poses: PosedCharacters
 
     @property
     def kind(self) -> Hashable:
-        """What all steps that are solved together have in common: their length, and what is known of them."""
+        """What all steps that are solved together have in common: what is known of them, and mostly their length.
+
+        A GPU solves those of all lengths together, since each kind of steps takes as long as one step at least.
+        """
         past, poses = (
             tuple(name for name, value in vars(each).items() if value is None) for each in (self.past, self.poses)
         )
         world = self.poses.world
-        return self.dt, past, poses, world is not None and world.has_colliders
+        dt = None if self.on_gpu and self.past.friction is None else self.dt
+        return dt, past, poses, world is not None and world.has_colliders
+
+    @property
+    def on_gpu(self) -> bool:
+        return self.past.last.device.type == "cuda"
 
 
 Course = Generator[Asked, Solution, T]
@@ -98,7 +109,9 @@ def _iterate(steps: _Steps) -> list[tuple[int, Solution]]:
         numbers, asked = zip(*steps.waiting)
         steps.waiting = []
         poses = PosedCharacters.concatenated([each.poses for each in asked])
-        search = asked[0].search(poses, StepHistory.concatenated([each.past for each in asked]), numbers)
+        past, dt = StepHistory.concatenated([each.past for each in asked]), asked[0].dt
+        lengths = past.last.new_tensor([each.dt for each in asked]) if asked[0].on_gpu else dt
+        search = asked[0].search(poses, past, numbers, lengths)
         if steps.search:
             steps.search.join(search)
         else:

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ from ...scene.assets import Floats, Motion, Scene, ShotWorld, Skeleton
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import bind_pose, slerp
 from ..collision import limb_axes
+from ..collision.inner_cloth import InnerSurface
 from ..collision.pierced import PiercedCloth, PiercedOutfit
 from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
@@ -41,6 +43,7 @@ from .history import StepHistory
 from .incremental_potential import IncrementalPotential, StepInputs
 from .newton import Search, Solution, SolverOptions, minimise_from
 from .outfit import OutfitPotential, WornGarment
+from .over_cloth import OverPotential
 from .scheduler import Asked, Course, Scheduler
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
@@ -150,6 +153,7 @@ class Simulator:
         options: SimulationOptions | None = None,
         *,
         over: Sequence[WornGarment] = (),
+        beneath: Sequence[InnerSurface] = (),
         device: torch.device | str = "cpu",
         report: Reporter = silent,
     ) -> None:
@@ -157,6 +161,8 @@ class Simulator:
 
         Args:
             over: garments that are worn with the scene's, outer ones last.
+            beneath: garments that the scene's lies over, which others move: its potential meets them where the
+                inputs of a step say where they are. The simulator's own steps do not.
         """
         self.report = report
         self.options, device = options or SimulationOptions(), torch.device(device)
@@ -169,7 +175,12 @@ class Simulator:
             outfit = OutfitPotential(worn, own=self.options.self_contact, device=device, dtype=dtype)
             self.potential, limbs, self._offsets = outfit, outfit.limbs, outfit.offsets
         else:
-            self.potential = IncrementalPotential(scene, fabric, device=device, dtype=dtype)
+            common: dict[str, Any] = {"device": device, "dtype": dtype}
+            self.potential = (
+                OverPotential(scene, fabric, beneath, **common)
+                if beneath
+                else IncrementalPotential(scene, fabric, **common)
+            )
             limbs = limb_axes(scene)
         self.poser = CharacterPoser(scenes, limbs, device, dtype)
         self.gravity = torch.tensor(self.options.gravity, dtype=dtype, device=device)[:, None]
@@ -212,9 +223,6 @@ class Simulator:
                         "air moves cloth by its drag",
                     )
                     fail("wind", found, allowed, "give --material drag=0.3, or leave the wind out")
-        rubs = any(fabric.friction for _, fabric in self.potential.garments)
-        if rubs and any(world and world.colliders for world in worlds):
-            self.report(Message("friction is that of body and cloth; on floors and props cloth slides", "warning"))
         return Surroundings(worlds, np.array(self.options.gravity))
 
     def _simulate_spans(
@@ -306,7 +314,7 @@ class Simulator:
 
     def _history(self, solution: Solution, poses: PosedCharacters, before: Tensor | None) -> StepHistory:
         """Return what the next step needs of a solution, with the world positions (V, 3, N) before it."""
-        friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt)
+        friction = self.potential.friction(solution.x, poses.body, solution.neighbours, self.dt, poses.world)
         world = solution.x.double() + poses.root
         known = solution.neighbours, friction, poses.matrices
         return StepHistory(world, before, poses.root, poses.lbs, *known, moves=poses.moves)
@@ -374,8 +382,14 @@ class Simulator:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
         return minimise_from(self.potential, start, self.inputs(poses, None), self.options.quasi_static_solver)
 
-    def inputs(self, poses: PosedCharacters, past: StepHistory | None) -> StepInputs:
-        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots."""
+    def inputs(
+        self, poses: PosedCharacters, past: StepHistory | None, dt: float | Tensor | None = None
+    ) -> StepInputs:
+        """Return the inputs of a step after `past`, or of a quasi-static state without it, relative to the roots.
+
+        Args:
+            dt: length of the step [s], or that of each, shape (N,); the simulator's own by default.
+        """
         world = poses.world
         gravity = self.gravity.expand(3, poses.root.shape[-1]) if world is None else world.gravity
         met = world if world and world.has_colliders else None
@@ -385,11 +399,12 @@ class Simulator:
             return StepInputs(poses.body, gravity, skinned=poses.lbs, world=met)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
-        friction = past.friction and past.friction.after(poses.body.points)
+        friction = past.friction and past.friction.after(poses.body.points, world)
         limbs = poses.body.limbs
         pierced = past.pierced.on(limbs) if past.pierced and limbs else None
         advected = past.local if world is None else self._advected(world, past, poses)
-        own = predicted.to(past.lbs.dtype), advected, self.dt, poses.lbs
+        dt = self.dt if dt is None else dt.to(past.lbs.dtype) if isinstance(dt, Tensor) else dt
+        own = predicted.to(past.lbs.dtype), advected, dt, poses.lbs
         return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced, world=met)
 
     def _advected(self, world: PosedWorld, past: StepHistory, poses: PosedCharacters) -> Tensor:
@@ -423,9 +438,13 @@ class Simulator:
                 pushed[:, frame] = torch.as_tensor(blown).to(pushed)
         return fabric.drag / fabric.density * pushed
 
-    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int]) -> Search:
-        """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots."""
-        inputs = self.inputs(poses, past)
+    def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int], dt: float | Tensor) -> Search:
+        """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots.
+
+        Args:
+            dt: as in `inputs`.
+        """
+        inputs = self.inputs(poses, past, dt)
         start = self.potential.best_start(self.starts(poses, past, inputs), inputs)
         x, inputs = self._carried(past.local, start, inputs, past.neighbours)
         return Search(self.potential, self.apply_pins(x, poses), inputs, self.options.solver, numbers)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import accumulate
 
 import numpy as np
 
@@ -29,11 +30,15 @@ class PosedCollider:
 
     Attributes:
         name: as `Collider` has it.
+        first: the place of its first vertex among those of all colliders of its shot, whichever are there.
+        count: of its vertices, P.
         points: of its mesh, shape (P, 3).
     """
 
-    def __init__(self, name: str, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats) -> None:
-        self.name = name
+    def __init__(
+        self, name: str, first: int, surface: PosedSurface, turn: Floats, place: Floats, carried: Floats
+    ) -> None:
+        self.name, self.first, self.count = name, first, len(surface.points)
         self._surface, self._turn, self._place = surface, turn, place
         self._sides = surface.outside(self._inward(carried))
         self._known: tuple[Floats, Floats] | None = None
@@ -42,6 +47,11 @@ class PosedCollider:
     @property
     def points(self) -> Floats:
         return self._surface.points @ self._turn.T + self._place
+
+    def on_surface(self, corners: Ints, weights: Floats) -> Floats:
+        """Return points (M, 3) of the mesh, each between three of its vertices (M, 3) with weights (M, 3)."""
+        own = (weights[:, :, None] * self._surface.points[corners]).sum(axis=1)
+        return own @ self._turn.T + weights.sum(axis=1)[:, None] * self._place
 
     def near(self, queries: Floats, within: float) -> tuple[Ints, SurfaceDistance]:
         """Return the queries (S, 3) that are nearer than `within` [m] or inside, and their distances.
@@ -107,12 +117,17 @@ class ColliderPoser:
             carried: vertices of the garment as the body carries it, relative to the root (V, 3).
             near: leaves out what is further away; by default nothing is.
         """
-        own = [self._posed(each, world, seconds, root, carried, near) for each in world.colliders]
+        firsts = accumulate((each.points.shape[1] for each in world.colliders), initial=0)
+        own = [
+            self._posed(each, first, world, seconds, root, carried, near)
+            for each, first in zip(world.colliders, firsts)
+        ]
         return tuple(each for each in own if each)
 
     def _posed(
         self,
         collider: Collider,
+        first: int,
         world: ShotWorld,
         seconds: float,
         root: Floats,
@@ -139,7 +154,7 @@ class ColliderPoser:
             if key not in self._still:
                 self._still[key] = self._surfaces[key].at(collider.points[0], self._search)
             surface = self._still[key]
-        return PosedCollider(collider.name, surface, place[:3, :3], place[:3, 3] - root, carried)
+        return PosedCollider(collider.name, first, surface, place[:3, :3], place[:3, 3] - root, carried)
 
 
 def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:

@@ -8,7 +8,7 @@ would have a crease. Distances are searched for on a processor, in float64, what
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ class Touched:
         row, frame: of each, shape (P,).
         normal: away from what it meets, unit vectors, shape (3, P).
         distance: [m], shape (P,).
-        corners: of the nearest point, among `PosedWorld.points`, shape (3, P); weights: likewise.
+        corners: of the nearest point, vertices of all colliders of the shot, shape (3, P); weights: likewise.
     """
 
     row: Tensor
@@ -55,7 +55,6 @@ class PosedWorld:
     air: tuple[MovingAir | None, ...]
     seconds: tuple[float, ...]
     roots: Floats
-    _points: list[Tensor] = field(default_factory=list, repr=False)
 
     def select(self, frames: Tensor) -> PosedWorld:
         """Return that of the frames with indices (M,)."""
@@ -78,33 +77,34 @@ class PosedWorld:
     def has_colliders(self) -> bool:
         return any(self.colliders)
 
-    def points(self, like: Tensor) -> Tensor:
-        """Return the points of all colliders, shape (B, 3, N), padded with zeros; `like` gives type and device."""
-        if not self._points:
-            frames = [
-                np.concatenate([each.points for each in own]) if own else np.zeros((0, 3)) for own in self.colliders
-            ]
-            padded = np.zeros((max(map(len, frames), default=0), 3, len(frames)))
-            for frame, own in enumerate(frames):
-                padded[: len(own), :, frame] = own
-            self._points.append(torch.as_tensor(padded, dtype=like.dtype, device=like.device))
-        return self._points[0]
+    def on_surfaces(self, corners: Tensor, weights: Tensor, frame: Tensor) -> Tensor:
+        """Return points of colliders [m], shape (3, P), NaN where their collider is not there.
+
+        Args:
+            corners, weights, frame: of each, as `Touched` has them, shapes (3, P), (3, P) and (P,).
+        """
+        vertices, shares, frames = (each.cpu().numpy().T for each in (corners, weights.double(), frame))
+        found = np.full(vertices.shape, np.nan)
+        for number in np.unique(frames):
+            for collider in self.colliders[number]:
+                inside = (vertices[:, 0] >= collider.first) & (vertices[:, 0] < collider.first + collider.count)
+                rows = np.flatnonzero((frames == number) & inside)
+                found[rows] = collider.on_surface(vertices[rows] - collider.first, shares[rows])
+        return torch.as_tensor(found.T.copy(), dtype=weights.dtype, device=weights.device)
 
     def touched(self, samples: Tensor, within: float) -> Touched:
         """Return which samples (S, 3, N) are nearer to a collider than `within` [m], or inside one."""
         queries = samples.detach().double().cpu().numpy()
         rows, frames, distances, normals, corners, weights = ([] for _ in range(6))
         for frame, own in enumerate(self.colliders):
-            first = 0
             for collider in own:
                 row, found = collider.near(np.ascontiguousarray(queries[:, :, frame]), within)
                 rows.append(row)
                 frames.append(np.full(len(row), frame))
                 distances.append(found.distance)
                 normals.append(found.normal)
-                corners.append(found.corners + first)
+                corners.append(found.corners + collider.first)
                 weights.append(found.weights)
-                first += len(collider.points)
 
         def joined(parts: Sequence[np.ndarray], empty: np.ndarray) -> np.ndarray:
             return np.concatenate(parts) if parts else empty

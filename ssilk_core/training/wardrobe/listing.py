@@ -15,6 +15,7 @@ from typing import Any
 from ...errors import fail, fail_unknown
 from ...files import relative_path, replacing, split_location
 from ...scene.fabrics import FABRICS
+from ...scene.shape_weights import is_shapes
 from ..settings import PRESETS
 
 DEFAULTS = "defaults"  # the table whose keys every garment inherits
@@ -80,7 +81,7 @@ KEYS = {
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "fabrics": Key("--fabrics", _is_range, "a list of presets and factors, like ['silk', 4],"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
-    "family": Key("--family", _is_texts, "a path or a list of paths"),
+    "family": Key("--family", lambda value: value is True or _is_texts(value), "true, or a list of bodies,"),
     "graded": Key("--graded", lambda value: isinstance(value, bool), "true or false"),
     "over": Key("--over", lambda value: isinstance(value, list) and all(map(_is_text, value)), 'a list, like ["a"],'),
 }
@@ -149,8 +150,11 @@ def _relocated(key: str, value: Any, move: Callable[[str], str]) -> Any:
         file, prim = split_location(value)
         own = file.endswith(USD_SUFFIXES)
         return (f"{move(file)}:{prim}" if prim else move(file)) if own else value
+    if key == "family" and value is True:
+        return value
     if key in ("motions", "valid", "family"):
-        return [move(each) for each in ([value] if isinstance(value, str) else value)]
+        listed = [value] if isinstance(value, str) else value
+        return [each if key == "family" and is_shapes(each) else move(each) for each in listed]
     return [move(each) if each.endswith(MODEL) else each for each in value] if key == "over" else value
 
 

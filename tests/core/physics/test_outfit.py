@@ -220,6 +220,9 @@ def test_a_sheet_on_a_sheet_on_a_floor_keeps_its_thickness_and_weighs_on_both(sc
         for part, (rows, _) in zip(potential.parts, potential.garments)
     ]
     assert from_floor == [pytest.approx(sum(weights), rel=0.01), 0]  # the lower sheet carries the upper one
+    rough = Simulator(low, HEAVY, options, over=[WornGarment(high, LIGHT)]).potential
+    rubbing = rough.friction(x, poses.body, None, 1 / 30, around.world)
+    assert float(rubbing.limit.sum()) == pytest.approx(HEAVY.friction * sum(weights), rel=0.01)
     # p = K d^2 / (2 m) carries the weight of an area; corners of triangles and edges share it unevenly.
     stiffness = 0.5 * (LIGHT.loose_contact + HEAVY.loose_contact)
     sunk = np.sqrt(LIGHT.margin * LIGHT.density * G / stiffness)

@@ -355,13 +355,14 @@ def test_kernels_find_and_push_as_the_reference_does(scene):
     found = pierced.radius > 0
     assert found[hand].tolist() == [False, True, False, True]
     assert found[1 - hand].tolist() == [True, True, False, False]
-    planes = torch.zeros_like(x), torch.zeros(len(x), 4)
+    planes = torch.zeros_like(x), torch.zeros(len(x), 4), torch.ones(len(x), 3, 3, 4)
+    own = [each.clone().to(DEVICE) for each in planes]
     piercing.replace_planes(x, limbs, *planes)
-    own = [torch.zeros_like(each, device=DEVICE) for each in planes]
     where = tuple(each.to(DEVICE) for each in (pierced.point, pierced.direction, pierced.tip, pierced.radius))
     replace_planes_kernel(piercing._rest.to(DEVICE), piercing._loose.to(DEVICE), where, SLOPE, *own)
     for mine, theirs in zip(own, planes):
         assert torch.equal(mine.cpu(), theirs) and theirs[..., 1].any() and theirs[..., 0].any()
+    assert not planes[2].all()  # what is pushed along a limb is not bent
 
 
 def test_the_loop_crosses_what_the_reference_does():

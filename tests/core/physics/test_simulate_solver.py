@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import torch
 from scipy.optimize import minimize
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.physics import loops
+from ssilk_core.physics import captured, loops
 from ssilk_core.physics.collision import CollisionBody, PosedBody, SmoothedDistance
 from ssilk_core.physics.energy import TERMS, GarmentEnergy
 from ssilk_core.physics.energy.bending import dihedral_angles
@@ -95,6 +96,58 @@ def test_the_gradient_is_that_of_autograd(potential: IncrementalPotential, scene
     at = x.clone().requires_grad_(True)
     (expected,) = torch.autograd.grad(potential.energy(at, inputs, body_distance).sum(), at)
     torch.testing.assert_close(potential.gradient(x, inputs, body_distance), expected, rtol=1e-9, atol=1e-11)
+
+
+def test_frames_may_have_time_steps_of_their_own(potential: IncrementalPotential, scene: Scene) -> None:
+    x, inputs = moving(scene)
+    steps = torch.tensor([1 / 30, 1 / 120], dtype=torch.float64)
+    together = replace(inputs, dt=steps)
+    distance = potential.body_distance(x, together)
+    energy, gradient = (getattr(potential, name)(x, together, distance) for name in ("energy", "gradient"))
+    blocks = potential.hessian(x, together, distance).blocks
+    for number, dt in enumerate(steps.tolist()):
+        row = torch.tensor([number])
+        alone = together.select(row)
+        assert torch.equal(alone.dt, steps[row])
+        alone, own = replace(alone, dt=dt), distance.select(row)
+        torch.testing.assert_close(energy[row], potential.energy(x[..., row], alone, own))
+        torch.testing.assert_close(gradient[..., row], potential.gradient(x[..., row], alone, own))
+        torch.testing.assert_close(blocks[..., row], potential.hessian(x[..., row], alone, own).blocks)
+
+
+def test_lengths_that_are_tried_at_once_give_what_one_after_the_other_gives(
+    potential: IncrementalPotential, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x, inputs = moving(scene, frames=4)
+    state = newton.State.at(potential, x, inputs)
+    gradient = potential.gradient(x, inputs, state.body_distance)
+    # Steepest descents of several lengths: some are taken whole, some in small parts, and one not at all.
+    step = -gradient * torch.tensor([1e-3, 0.05, 1.0, 1e4], dtype=torch.float64)
+    monkeypatch.setattr(newton, "OBSTRUCTING", 1e-9)  # so that any contact obstructs
+    expected = newton.line_search(potential, state, inputs, gradient, step)
+    assert len(set(expected[1].tolist())) == 4 and expected[2].any()
+    monkeypatch.setattr(newton, "kernels", SimpleNamespace(available=lambda device: True))
+    found = newton.line_search(potential, state, inputs, gradient, step)
+    for own, other in zip((*found[0].tensors(), *found[1:]), (*expected[0].tensors(), *expected[1:])):
+        torch.testing.assert_close(own, other)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="graphs are CUDA's")
+def test_graphs_give_what_is_computed_task_by_task(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    x, inputs = moving(scene, frames=3)
+    inputs = replace(inputs, body=replace(inputs.body, rings=None, groups=None, patches=None))
+    inputs = captured._like(inputs, (leaf.cuda() for leaf in captured._leaves(inputs)))
+    from ssilk_core.physics.kernels import conjugate_gradient
+
+    potential = IncrementalPotential(scene, FABRICS["stvk"], device=torch.device("cuda"))
+    found = minimise_from(potential, x.cuda(), inputs, SolverOptions(tolerance=1e-6))
+    assert all(vars(potential.captured)[name]._graphs for name in ("state", "gradient", "hessian"))
+    assert potential.block_pattern.table.captured
+    for module in (newton, conjugate_gradient):
+        monkeypatch.setattr(module, "replays", lambda x: False)
+    expected = minimise_from(potential, x.cuda(), inputs, SolverOptions(tolerance=1e-6))
+    torch.testing.assert_close(found.x, expected.x, rtol=0, atol=1e-6)
+    torch.testing.assert_close(found.energy, expected.energy)
 
 
 def in_the_fold(scene: Scene) -> tuple[IncrementalPotential, torch.Tensor, StepInputs]:

@@ -13,18 +13,21 @@ import numpy as np
 from pxr import Ar, Pcp, Tf, Usd, UsdGeom, UsdUtils
 
 from ssilk_core.errors import fail
+from ssilk_core.files import split_body
 from ssilk_core.scene.assets import Floats
 
 from ..names import LAYER_SUFFIXES
 from . import memory, trial
 from .garment_api import register_schema
 from .memory import allowed_gib, bounded_memory
+from .shaped import shape_body, shaped_as
 from .specs import free_when_closed
 from .times import EARLIEST, earliest
 from .trial import allowed_seconds, tried
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
+LONGEST_QUOTE = 200  # characters of a damaged file that are told
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 # Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -81,25 +84,34 @@ def _allowed() -> str:
 
 
 def usd_reason(error: Tf.ErrorException) -> str:
-    """Return the first message of a USD error on one line."""
-    return " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
+    """Return the first message of a USD error on one line; of a line of a file that it quotes, the beginning."""
+    if not error.args:
+        return "unknown reason"
+    says, quote, quoted = " ".join(error.args[0].commentary.split()).partition("'")
+    return f"{says}{quote}{quoted[:LONGEST_QUOTE]}..." if len(quoted) > LONGEST_QUOTE else says + quote + quoted
 
 
 @needs_whole_files
 def open_stage(source: StageLike) -> Usd.Stage:
     """Open a stage with all payloads from the current content of its file; return an open stage unchanged.
 
+    "FILE:SHAPE=WEIGHT,..." opens the stage as the body that has these weights of its blendshapes (`shaped`).
+
     Raises:
-        SsilkError: the file is missing, damaged or not USD, or a layer that it needs cannot be found.
+        SsilkError: the file is missing, damaged or not USD, a layer that it needs cannot be found, or it has not the
+            shapes.
     """
     if isinstance(source, Usd.Stage):
         return source
-    if not Path(source).is_file():
+    file, shapes = split_body(str(source))
+    if Path(file).is_dir():
+        fail(str(source), "this is a folder", "a USD file is needed", "name one of its files")
+    if not Path(file).is_file():
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
-    if Path(source).suffix == ".safetensors":
+    if Path(file).suffix == ".safetensors":
         fail(str(source), "this is a trained model", "a USD file is needed", "model and stage may have been swapped")
     quiet = UsdUtils.CoalescingDiagnosticDelegate()  # the errors below replace what USD would print
-    stage = Usd.Stage.Open(str(source), Usd.Stage.LoadAll)
+    stage = Usd.Stage.Open(file, Usd.Stage.LoadAll)
     stage.Reload()
     del quiet
     missing = [
@@ -110,6 +122,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
     free_when_closed(stage.GetUsedLayers())
     if missing:
         fail(str(source), " and ".join(missing[:2]), "every layer must be found", "restore it or its path")
+    if shapes:
+        shape_body(stage, shapes, str(source))
     return stage
 
 
@@ -151,8 +165,9 @@ def location(prim: Usd.Prim) -> str:
 
 
 def stage_name(stage: Usd.Stage) -> str:
-    """Return the path of a stage's root layer as the user gave it."""
-    return stage.GetRootLayer().identifier
+    """Return the path of a stage's root layer as the user gave it, with the shapes that it was opened with."""
+    shapes = shaped_as(stage)
+    return str(stage.GetRootLayer().identifier) + (f":{shapes}" if shapes else "")
 
 
 def named(prims: list[Usd.Prim], name: str) -> list[Usd.Prim]:

@@ -18,7 +18,9 @@ from ssilk_core.files import split_location
 from ssilk_core.scene.assets import BodyShape, Character, Floats, Ints, Mesh, Motion
 from ssilk_core.scene.assets.body_shape import OFF
 
+from ..names import SHAPES_SET
 from ..opening.stage import StageLike, explains_damage, location, open_stage, value
+from ..opening.times import samples_about
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import is_drawn
@@ -146,7 +148,9 @@ class _Shot:
     def _finite(self, rows: Floats, prim: Usd.Prim) -> Floats:
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(bad):
-            found = f"blendShapeWeights hold NaN or infinity, first at time code {self.codes[bad[0]]:g}"
+            code, attribute = float(self.codes[bad[0]]), UsdSkel.Animation(self.animation).GetBlendShapeWeightsAttr()
+            keys = (key for key in samples_about(attribute, code) if not np.isfinite(attribute.Get(key)).all())
+            found = f"blendShapeWeights hold NaN or infinity, first at time code {next(keys, code):g}"
             fail(location(prim), found, "all must be finite", "repair the animation")
         return rows if len(rows) == len(self.codes) else np.repeat(rows, len(self.codes), axis=0)
 
@@ -158,6 +162,7 @@ class _SubShape:
     name: str
     rows: Ints
     offsets: Floats
+    blendshape: str = ""  # that it is of, in an animation
 
     @property
     def reach(self) -> float:
@@ -193,7 +198,7 @@ class _SubShapes:
             summed = np.zeros((len(moved_rows), 3))
             np.add.at(summed, place.reshape(-1), vectors)
             kept = summed.any(axis=1) & (moved_rows >= 0) & (moved_rows < count)
-            self.parts.append(_SubShape(name, moved_rows[kept], summed[kept] @ linear.T))
+            self.parts.append(_SubShape(name, moved_rows[kept], summed[kept] @ linear.T, self.names[index]))
 
     def weights(self, rows: Floats) -> Floats:
         """Return the weights of `parts` (F, S) where blendshapes have weights (F, K)."""
@@ -240,8 +245,10 @@ def _shapes(own: Usd.Prim, mesh: Mesh, number: int, skel: SkelSource, shot: _Sho
             by_name = {part.name: part for part in home.parts}
             there.parts, courses = [by_name[there.parts[at].name] for at in kept], courses[:, kept]
     found: list[tuple[BodyShape, Floats]] = []
-    left = list(range(len(home.parts)))
+    left, taken = list(range(len(home.parts))), set(map(str, value(own, SHAPES_SET) or ()))
     for part, course in zip(there.parts, courses.T):
+        if part.blendshape in taken:  # a parameter of the body, which has it whatever the shot weighs
+            continue
         same = next((at for at in left if home.parts[at].is_same(part)), None)
         if same is not None:
             left.remove(same)

@@ -12,13 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel, Vt
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats
 
-from ..opening.stage import EARLIEST, PRIMS, StageLike, named, needs_whole_files, open_stage, value
+from ..opening.shaped import weighed_offsets
+from ..opening.stage import EARLIEST, PRIMS, StageLike, named, needs_whole_files, open_stage
 from .mesh import is_garment
 from .motion import find_animation
 from .skeleton import bound_skeleton, find_skeleton
@@ -32,13 +33,7 @@ def shape_offsets(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIES
     weights = shape_weights(prim, skel, code)
     if weights is None or not np.any(weights):
         return None
-    shapes = UsdSkel.BlendShapeQuery(UsdSkel.BindingAPI(prim))
-    points = Vt.Vec3fArray(len(value(prim, "points") or []))
-    given = shapes.ComputeSubShapeWeights(Vt.FloatArray(weights))
-    indices, offsets = shapes.ComputeBlendShapePointIndices(), shapes.ComputeSubShapePointOffsets()
-    if not given or not shapes.ComputeDeformedPoints(*given, indices, offsets, points):
-        return None
-    return np.array(points, dtype=np.float64).reshape(-1, 3)
+    return weighed_offsets(prim, weights)
 
 
 def shape_weights(prim: Usd.Prim, skel: SkelSource, code: Usd.TimeCode = EARLIEST) -> list[float] | None:

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import Message, Reporter
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Garment, ProxyRig, Skeleton
 
+from ..names import SHAPES_SET
 from ..opening.garment_api import read_garment_record
 from ..opening.stage import PRIMS, USD_SUFFIXES, StageLike, named, needs_whole_files, open_stage, value
 from ..opening.times import change_times, visibility_attributes
@@ -30,7 +31,7 @@ from .mesh import is_body, is_drawn, is_garment, is_stand_in, kept_faces
 from .motion import find_animation, read_motion
 from .rig import read_proxy_rig
 from .same_meshes import same_meshes, skinned_meshes
-from .shapes import animated_shapes, tell_animated_shapes
+from .shapes import SAME, animated_shapes, tell_animated_shapes
 from .skeleton import bound_skeleton, find_skeleton
 from .spaces import SkelSource
 
@@ -87,7 +88,9 @@ def shown_otherwise(
     skel = find_skeleton(stage, root=root, garment=garment)
     own = [mesh for mesh in skinned_meshes(skel) if is_drawn(mesh)]
     found = [_hidden(mesh, skel, " of its own stage") for mesh in own]
-    _, placed = find_animation(of_motion := open_stage(file), prim, root)
+    animation, placed = find_animation(of_motion := open_stage(file), prim, root)
+    set_shapes = {str(name) for mesh in own for name in value(mesh, SHAPES_SET) or ()}
+    found.append(_animates(animation, set_shapes))
     if placed is None:
         return [*filter(None, found)]
     try:
@@ -113,6 +116,8 @@ def shown_otherwise(
     for mesh, original in same.items():
         if cloth is not None and original == cloth.prim:
             found += _garment_otherwise(mesh, original, compared, known)
+        elif set_shapes and not value(mesh, SHAPES_SET):
+            pass  # it shows the body without these
         elif not is_garment(original) and compared.meets(original):
             found += _body_otherwise(mesh, original, compared, is_baked)
         found.append(_hidden(mesh, there))
@@ -121,6 +126,18 @@ def shown_otherwise(
     met = [mesh for mesh in own if compared.meets(mesh) and not is_stand_in(mesh)]
     found += _other_bodies([mesh for mesh in met if cloth is None or mesh != cloth.prim], same, skel, there)
     return [*filter(None, found)]
+
+
+def _animates(animation: Usd.Prim, set_shapes: set[str]) -> str:
+    """Return in words which shapes that the body sets a motion animates; "" for none."""
+    source = UsdSkel.Animation(animation)
+    names, weights = source.GetBlendShapesAttr().Get() or (), source.GetBlendShapeWeightsAttr()
+    rows = [row for code in weights.GetTimeSamples() if len(row := weights.Get(code) or ()) == len(names)]
+    most = np.ptp(rows, axis=0) if rows else np.zeros(len(names))
+    moving = [str(name) for name, each in zip(names, most) if str(name) in set_shapes and each > SAME]
+    if not moving:
+        return ""
+    return f"it animates {', '.join(moving)}, by which the character's stage sets the body: it stays as it is there"
 
 
 @dataclass(frozen=True, eq=False)

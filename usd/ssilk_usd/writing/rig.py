@@ -14,7 +14,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 
 from ssilk_core.errors import fail
-from ssilk_core.files import split_location
+from ssilk_core.files import split_body, split_location
 from ssilk_core.scene.assets import Floats, Garment, Scene
 
 from ..names import CLASS, FROM_JOINTS, LBS_SKIN, LEVEL, ONTO_JOINTS, PIN, SKEL, STIFFNESS
@@ -83,7 +83,8 @@ def write_rigged_stage(
     old, left_out, wanted = _in_stage(stage, source, scene.garment), "", None
     look = LookFromAbove.of(old) if old else None
     if old:
-        mesh, to_bind, wanted = _place_garment(stage, skel, old, scene, moved)
+        is_shaped = bool(split_body(str(source))[1])
+        mesh, to_bind, wanted = _place_garment(stage, skel, old, scene, moved, is_shaped)
     else:
         mesh, left_out = _copy_garment(stage, skel, scene.garment, out)
         to_bind = np.eye(4)
@@ -138,14 +139,18 @@ def _in_stage(stage: Usd.Stage, source: str | Path, garment: Garment) -> Usd.Pri
     """Return the mesh of a garment that was read from the character's stage; None for one from its own file."""
     file, path = split_location(garment.mesh.path)
     old = stage.GetPrimAtPath(path or "/")
-    same = Path(file).exists() and Path(file).samefile(source)
+    here, there = Path(split_body(file)[0]), split_body(str(source))[0]
+    same = here.exists() and here.samefile(there)
     return old if same and old and old.IsA(UsdGeom.Mesh) else None
 
 
 def _place_garment(
-    stage: Usd.Stage, skel: SkelSource, old: Usd.Prim, scene: Scene, moved: Floats | None
+    stage: Usd.Stage, skel: SkelSource, old: Usd.Prim, scene: Scene, moved: Floats | None, is_shaped: bool
 ) -> tuple[UsdGeom.Mesh, Floats, Floats | None]:
     """Bring a garment's mesh beneath the SkelRoot, where it stands elsewhere.
+
+    Args:
+        is_shaped: whether the stage was opened as another body of it, onto which the garment was carried.
 
     Returns:
         The mesh; its own space to bind space, shape (4, 4); and where its points are to be once it is bound, with
@@ -156,7 +161,7 @@ def _place_garment(
     place = garment_place(old, own, replace(skeleton, path=location(skel.prim)))
     to_bind = np.linalg.inv(skel.bind_to_core) @ place.to_core
     shaped, wanted = shape_offsets(old, own), None
-    if place.moves is not None:  # to its bind pose, which another skeleton has otherwise
+    if is_shaped or place.moves is not None:  # to its bind pose, which another skeleton has otherwise
         wanted = apply(np.linalg.inv(place.to_core), garment.mesh.points)
     elif moved is not None or shaped is not None:
         wanted = np.array(value(old, "points"), dtype=np.float64) + (0 if shaped is None else shaped)

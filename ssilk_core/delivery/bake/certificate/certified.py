@@ -11,14 +11,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ....errors import fail
 from ....events import Countdown, Message, Reporter, silent
+from ..beneath import OVER, GarmentsBeneath
 from ..opened import add_provenance, open_shot
 from ..rollout import BakeRollout
-from .beneath import GarmentsBeneath
 from .blendshapes import with_shapes
 from .requirements import need_certifier
-from .summary import CERTIFICATE, OVER, summary_of
+from .summary import CERTIFICATE, summary_of
 from .work import CertificateWork, frames_of
 from .written import faults_in
 
@@ -48,9 +47,8 @@ def certified(
     poses = tuple(rollout.poses())
     points = [vertices for pose in poses for vertices in rollout.decode(pose)]
     below = GarmentsBeneath(beneath, rollout.request.samples_per_frame) if beneath else None
-    if below and len(below.times) != rollout.motion.frame_count:
-        found, here = f"{len(below.times)} frames", f"the garment over it has {rollout.motion.frame_count}"
-        fail(str(next(iter(below.files.values()))), found, here, "bake both over one range")
+    if below:
+        below.need_frames(rollout.motion.frame_count)
     certifier = Certifier(rollout.deformer.scene, below.faces if below else None)
     work = CertificateWork(rollout, certifier, frames_of(rollout, poses, points, below), below)
     if excused := len(work.certifier.finder.cloth.allowed):

@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ....physics.certify.faults import FrameFaults
 
 CERTIFICATE = "certificate"  # what a shot says of it, under this name
-OVER = "over"  # and in it the files of garments beneath
 
 
 def summary_of(work: CertificateWork, found: Mapping[int, FrameFaults], times: Sequence[float]) -> CertificateSummary:

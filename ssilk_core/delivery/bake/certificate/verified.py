@@ -9,12 +9,12 @@ from pathlib import Path
 
 from ....errors import VerificationError
 from ....events import Reporter, silent
+from ..beneath import OVER, beneath_said
 from ..opened import open_shot, provenance_of
 from ..result import certified_frames
 from ..rollout import BakeRollout
-from .beneath import GarmentsBeneath
 from .requirements import need_certifier
-from .summary import CERTIFICATE, OVER
+from .summary import CERTIFICATE
 from .written import faults_in
 
 
@@ -46,7 +46,7 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
         raise VerificationError(f"{path}: it was baked with --certify, but has no certificate; bake it again.")
     moved, left = (frames_said(said.get(name, ())) for name in ("moved frames", "frames left"))
     shot, samples = open_shot(path), rollout.request.samples_per_frame
-    beneath = _beneath(said.get(OVER), path, samples)
+    beneath = beneath_said(said.get(OVER), path, samples, "certified")
     certifier = Certifier(rollout.deformer.scene, beneath.faces if beneath else None)
     times, intersecting, showing = shot.sample_times(samples), 0, 0
     for frame, faults in faults_in(shot, certifier, rollout, beneath, report):
@@ -58,23 +58,6 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
             )
     counted = certified_frames(len(times), intersecting, showing, tuple(beneath.files) if beneath else ())
     return CheckedCertificate(frozenset(moved), str(said.get("found", "nothing")), counted)
-
-
-def _beneath(said: object, path: Path, samples: int) -> GarmentsBeneath | None:
-    """Return the garments that a file says it was certified over, in their own files; None where it names none.
-
-    Raises:
-        VerificationError: one is not there.
-    """
-    if not (isinstance(said, Mapping) and said):
-        return None
-    files = {str(name): path.parent / str(place) for name, place in said.items()}
-    for name, file in files.items():
-        if not file.is_file():
-            raise VerificationError(
-                f"{path}: it was certified over '{name}', which is not at {file}; bake both again."
-            )
-    return GarmentsBeneath(files, samples)
 
 
 def frames_said(said: object) -> set[int]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from ....scene.assets import Floats, GarmentPose
 from ....scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices, split_at_cuts
+from ..beneath import GarmentsBeneath
 from ..rollout import BakeRollout
-from .beneath import GarmentsBeneath
 
 if TYPE_CHECKING:
     from ....physics.certify.certifier import Certifier, Frames

@@ -12,9 +12,9 @@ from ....errors import fail
 from ....events import Countdown, Reporter
 from ....scene.assets import Floats
 from ....scene.kinematics import body_at_rest, motion_transforms, skin_points, skinning_matrices
+from ..beneath import GarmentsBeneath
 from ..posed import body_in
 from ..rollout import BakeRollout
-from .beneath import GarmentsBeneath
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Garments beneath the one that is certified or refined, as the files of their own pose them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...errors import VerificationError, fail
+from ...scene.assets import Floats, Ints, Mesh, Motion, Scene, SkinWeights
+from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
+from ..gltf.play import GlbShot
+from .opened import open_shot, provenance_of
+
+if TYPE_CHECKING:
+    from ssilk_usd.shots.play import Shot
+
+    from ...physics.collision.inner_cloth import InnerSurface
+
+OVER = "over"  # what a shot says of the files of garments beneath, under this name
+THICKNESS = "thickness"  # [m] of the cloth of a glb that others lie over; stages of USD say it of each garment
+
+
+class GarmentsBeneath:
+    """Garments in files of their own, which stay where they are.
+
+    Attributes:
+        files: their paths, by their names.
+        times: time codes of the frames.
+        faces: triangles of all, of W vertices together, shape (G, 3).
+
+    Args:
+        samples: of each frame.
+
+    Raises:
+        SsilkError: a file cannot be read, or has other frames than the first.
+    """
+
+    def __init__(self, files: Mapping[str, Path], samples: int) -> None:
+        self.files = dict(files)
+        self._shots: list[Shot | GlbShot] = [open_shot(path) for path in self.files.values()]
+        self.times = self._shots[0].sample_times(samples)
+        faces, count = list[Ints](), 0
+        for path, shot in zip(self.files.values(), self._shots):
+            if shot.sample_times(samples) != self.times:
+                fail(str(path), "other frames than the garments beside it", "all are of one range", "bake it again")
+            faces.append(next(mesh.faces for mesh in shot.meshes if mesh.is_garment) + count)
+            count += len(shot.garment_points(self.times[0]))
+        self.faces: Ints = np.concatenate(faces)
+
+    def need_frames(self, count: int) -> None:
+        """Raise `SsilkError` unless they have as many frames as the garment over them."""
+        if len(self.times) != count:
+            found, here = f"{len(self.times)} frames", f"the garment over it has {count}"
+            fail(str(next(iter(self.files.values()))), found, here, "bake both over one range")
+
+    @cached_property
+    def surfaces(self) -> list[InnerSurface]:
+        """Each as cloth that another one touches, in the bind pose.
+
+        Raises:
+            SsilkError: a file does not say how thick its cloth is.
+        """
+        return [_surface(path, shot) for path, shot in zip(self.files.values(), self._shots)]
+
+    def each(self, frame: int) -> list[Floats]:
+        """Return the vertices of each in a frame, in the world [m], shape (W, 3)."""
+        return [shot.garment_points(self.times[frame]) for shot in self._shots]
+
+    def points(self, frame: int) -> Floats:
+        """Return the vertices of all in a frame, in the world [m], shape (W, 3)."""
+        return np.concatenate(self.each(frame))
+
+    def led_up_to(self, scene: Scene, motion: Motion) -> Iterator[list[Floats]]:
+        """Yield each in the frames of a motion but for the last, which is the first frame: as if skin carried it.
+
+        No file tells how it came there. It moves with the skin that is nearest to it in the bind pose.
+        """
+        skeleton, first = scene.character.skeleton, self.each(0)
+        posed = motion_transforms(motion, skeleton.parents)
+        matrices = skinning_matrices(posed[:-1], posed[-1])
+        skins = [_skin_beneath(scene, surface.mesh) for surface in self.surfaces]
+        for frame in matrices:
+            yield [skin_points(points, skin, frame[None])[0] for points, skin in zip(first, skins)]
+
+    def named(self, folder: Path) -> dict[str, str]:
+        """Return the files relative to a folder, with forward slashes, by their names."""
+        return {name: Path(os.path.relpath(path, folder)).as_posix() for name, path in self.files.items()}
+
+
+def beneath_said(said: object, path: Path, samples: int, made: str) -> GarmentsBeneath | None:
+    """Return the garments that a file says it was made over, in their own files; None where it names none.
+
+    Args:
+        said: what it says under `OVER`.
+        path: of the file.
+        made: how it was made, such as "certified".
+
+    Raises:
+        VerificationError: one is not there.
+    """
+    if not (isinstance(said, Mapping) and said):
+        return None
+    files = {str(name): path.parent / str(place) for name, place in said.items()}
+    for name, file in files.items():
+        if not file.is_file():
+            raise VerificationError(f"{path}: it was {made} over '{name}', which is not at {file}; bake both again.")
+    return GarmentsBeneath(files, samples)
+
+
+def _surface(path: Path, shot: Shot | GlbShot) -> InnerSurface:
+    from ...physics.collision.inner_cloth import InnerSurface
+
+    if isinstance(shot, GlbShot):
+        rest, thickness = shot.garment_at_rest, provenance_of(path).get(THICKNESS)
+    else:
+        from ssilk_usd.shots.read import read_parts
+
+        part = next(part for part, own in zip(read_parts(shot), shot.meshes) if own.is_garment)
+        rest, thickness = part.mesh, part.record and part.record.parameters.get(THICKNESS)
+    if not isinstance(thickness, int | float):
+        found, allowed = "it does not say how thick its cloth is", "a garment is refined over what 'ssilk bake' wrote"
+        fail(str(path), found, allowed, "bake it again")
+    return InnerSurface(rest, float(thickness))
+
+
+def _skin_beneath(scene: Scene, mesh: Mesh) -> SkinWeights:
+    """Return the weights of the skin that is nearest to each vertex of a garment in the bind pose."""
+    from scipy.spatial import cKDTree
+
+    body = scene.character.merged_body()
+    _, nearest = cKDTree(body.mesh.points).query(mesh.points)
+    return SkinWeights(mesh.path, body.skin.indices[nearest], body.skin.weights[nearest])

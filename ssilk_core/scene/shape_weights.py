@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bodies of one stage by weights of its shapes: "hero.usd:tall=1,heavy=0.5", or "tall=1" beside a stage."""
+
+from __future__ import annotations
+
+from math import isfinite
+from pathlib import Path
+
+from ..errors import fail
+from ..files import USD_NAMES, split_body, split_location
+
+ALLOWED = "a body of a stage is named as STAGE:SHAPE=WEIGHT,..., such as hero.usd:tall=1,heavy=0.5"
+
+
+def is_shapes(text: str) -> bool:
+    """Return whether a text is weights of shapes alone, "tall=1", which mean a stage that is named elsewhere."""
+    return "=" in text and "/" not in text and Path(split_body(text)[0]).suffix not in USD_NAMES
+
+
+def body_of(text: str, stage: str) -> str:
+    """Return where a body is, "file[:SHAPE=WEIGHT,...]": weights alone are of the file of `stage`."""
+    return f"{split_body(stage)[0]}:{text}" if is_shapes(text) else text
+
+
+def parse_shapes(where: str, shapes: str) -> dict[str, float]:
+    """Return weights by the names of shapes, as "tall=1,heavy=0.5" gives them.
+
+    Raises:
+        SsilkError: a name without a weight, a weight that is no number, or a name twice; `where` is its place.
+    """
+    found: dict[str, float] = {}
+    for part in shapes.split(","):
+        name, equals, text = (each.strip() for each in part.rpartition("="))
+        try:
+            weight = float(text)
+        except ValueError:
+            weight = float("nan")
+        if not (name and equals and isfinite(weight)):
+            fail(where, f"'{part}' is no shape with a weight", ALLOWED)
+        if name in found:
+            fail(where, f"two weights of the shape '{name}'", "each shape has one", "leave one out")
+        found[name] = weight
+    return found
+
+
+def shapes_text(weights: dict[str, float]) -> str:
+    """Return weights as text, whichever way they were written: names in order, numbers as short as they are."""
+    return ",".join(f"{name}={weights[name]:.9g}" for name in sorted(weights))
+
+
+def body_name(location: str) -> str:
+    """Return what a body is called: its shapes, without a weight of one, "tall_heavy0.5"; else its file's stem."""
+    file, shapes = split_body(split_location(location)[0])
+    if not shapes:
+        return Path(file).stem
+    weights = parse_shapes(location, shapes)
+    return "_".join(name if weight == 1 else f"{name}{weight:g}" for name, weight in weights.items())
