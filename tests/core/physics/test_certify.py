@@ -162,9 +162,9 @@ def test_a_fold_through_itself_opens(scene):
 
 
 def test_cloth_that_a_limb_came_through_is_lifted_off_it(scene):
-    limb = trimesh.creation.capsule(height=0.3, radius=0.05, count=[16, 16])
-    tube = trimesh.creation.cylinder(radius=0.06, height=0.2, sections=24)
-    tube = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(tube.vertices, tube.faces, 0.025))
+    limb = trimesh.creation.capsule(height=0.3, radius=0.05, count=[24, 24])
+    tube = trimesh.creation.cylinder(radius=0.06, height=0.2, sections=32)
+    tube = trimesh.Trimesh(*trimesh.remesh.subdivide_to_size(tube.vertices, tube.faces, 0.02))
     tube.update_faces(np.abs(tube.face_normals[:, 2]) < 0.5)
     tube.remove_unreferenced_vertices()
     tube.merge_vertices()

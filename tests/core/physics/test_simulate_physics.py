@@ -406,7 +406,8 @@ def test_a_shot_that_needs_shorter_steps_leaves_the_others_as_they_are(
     }
     np.testing.assert_allclose([together[1, number] for number in range(4)], alone, atol=2e-5)
     order = list(together)
-    assert divided and order.index((1, 2)) < order.index((0, 2))  # which took an arm through the cloth
+    assert divided or self_contact  # with which this jump takes no shorter ones
+    assert order.index((1, 2)) < order.index((0, 2))  # which took an arm through the cloth
 
 
 def test_shots_of_which_less_is_known_go_on_beside_others(scene, toy_motion) -> None:
