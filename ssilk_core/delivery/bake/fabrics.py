@@ -12,9 +12,11 @@ from ...errors import fail, fail_unknown
 from ...events import Event, Message
 from ...network.checkpoint import ONE_FABRIC, ModelFile
 from ...network.settings import apply_overrides
-from ...scene.fabric_range import FACTORS, fabric_with, factors_of, properties
+from ...scene.assets import Floats
+from ...scene.fabric_range import FACTORS, PROPERTIES, fabric_with, factors_of, properties
 from ...scene.fabrics import Fabric, fabric_named
 
+OPTION = "--material"
 TIMES = "x"  # at the end of a value that is a factor
 RUBS = "friction="  # how a property begins that networks never see, and refinement may know
 FEEDBACK_RUBS = (  # what is allowed, and what to do
@@ -38,13 +40,10 @@ def in_fabric(
         SsilkError: the model knows one fabric alone, its networks do not see a property that is asked for, or
             nothing knows the friction that is.
     """
-    rough = [each for each in material if each.startswith(RUBS)]
+    rough, others = _friction_apart(material, rubs)
     if rough:
-        if not rubs:
-            fail(f"--material {rough[0]}", "networks know no friction", *FEEDBACK_RUBS)
-        smooth = [each for each in material if not each.startswith(RUBS)]
-        found, in_words = in_fabric(file, where, fabric, smooth)
-        found = replace(found, fabric=apply_overrides(found.fabric, rough))
+        found, in_words = in_fabric(file, where, fabric, others)
+        found = replace(found, fabric=apply_overrides(found.fabric, rough, OPTION))
         text = f"{where}: friction {found.fabric.friction:g} in refinement; the network plays without it"
         return found, (*in_words, Message(text))
     if not fabric and not material:
@@ -63,29 +62,56 @@ def in_fabric(
     return file.on_fabric(wanted), tuple(told)
 
 
+def need_fabric(fabric: str | None, material: Sequence[str], rubs: bool = False) -> None:
+    """Raise `SsilkError` where options, which are those of `in_fabric`, ask for what no model could play."""
+    preset, (rough, others) = fabric_named(fabric or "default"), _friction_apart(material, rubs)
+    _need_factors(_factors(np.ones(len(FACTORS)), others))
+    apply_overrides(preset, [*_absolute(PROPERTIES, others), *rough], OPTION)
+
+
+def _friction_apart(material: Sequence[str], rubs: bool) -> tuple[list[str], list[str]]:
+    """Return the words of --material that are friction, and the others; raise `SsilkError` where nothing knows it."""
+    rough = [each for each in material if each.startswith(RUBS)]
+    if rough and not rubs:
+        fail(f"{OPTION} {rough[0]}", "networks know no friction", *FEEDBACK_RUBS)
+    return rough, [each for each in material if each not in rough]
+
+
 def _asked(own: Fabric, fabric: str | None, material: Sequence[str]) -> Fabric:
     """Return the fabric that options ask for, with all that networks do not see as the model's own has it."""
-    factors = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
-    absolute = []
+    preset = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
+    factors = _factors(preset, material)
+    _need_factors(factors)
+    return apply_overrides(fabric_with(own, factors, fabric), _absolute(properties(own), material), OPTION)
+
+
+def _factors(preset: Floats, material: Sequence[str]) -> Floats:
+    """Return the factors (5,) of a preset, or those that the words of --material have in their place."""
+    factors = preset.copy()
     for each in material:
-        name, _, text = each.partition("=")
-        where = f"--material {each}"
-        if text.endswith(TIMES):
-            if name not in FACTORS:
-                fail_unknown(where, "networks see no factor of it", name, FACTORS)
-            try:
-                factors[FACTORS.index(name)] = float(text.removesuffix(TIMES))
-            except ValueError:
-                fail(where, f"'{text}'", "a factor is a number before the x, such as bending=2x")
-        elif name not in properties(own):
-            fail_unknown(where, "networks do not see it", name, properties(own))
-        else:
-            absolute.append(each)
+        (name, _, text), where = each.partition("="), f"{OPTION} {each}"
+        if not text.endswith(TIMES):
+            continue
+        if name not in FACTORS:
+            fail_unknown(where, "networks see no factor of it", name, FACTORS)
+        try:
+            factors[FACTORS.index(name)] = float(text.removesuffix(TIMES))
+        except ValueError:
+            fail(where, f"'{text}'", "a factor is a number before the x, such as bending=2x")
+    return factors
+
+
+def _need_factors(factors: Floats) -> None:
     if not (np.isfinite(factors).all() and (factors >= 0).all() and factors[0] > 0 and factors[3] > 0):
         found = ", ".join(f"{name} {factor:g}" for name, factor in zip(FACTORS, factors))
-        fail(
-            "--material",
-            f"factors {found}",
-            "they are finite and not negative, those of stretch and density positive",
-        )
-    return apply_overrides(fabric_with(own, factors, fabric), absolute)
+        allowed = "they are finite and not negative, those of stretch and density positive"
+        fail(OPTION, f"factors {found}", allowed)
+
+
+def _absolute(known: Sequence[str], material: Sequence[str]) -> list[str]:
+    """Return the words of --material that are values in units; raise `SsilkError` where one is of no known name."""
+    found = [each for each in material if not each.partition("=")[2].endswith(TIMES)]
+    for each in found:
+        if (name := each.partition("=")[0]) not in known:
+            fail_unknown(f"{OPTION} {each}", "networks do not see it", name, known)
+    return found
