@@ -46,7 +46,9 @@ def _of_mesh(body: Body, its: Body) -> list[str]:
     mesh, other = body.mesh, its.mesh
     if other.vertex_count != mesh.vertex_count:
         return [f"{other.path} has {other.vertex_count} points, not {mesh.vertex_count}"]
-    if not np.array_equal(mesh.faces, other.faces):
+    # Polygons, not triangles: which diagonal splits a quad depends on where its points are.
+    own, found = ((each.polygon_counts, each.polygon_indices) for each in (mesh, other))
+    if not all(map(np.array_equal, own, found)):
         return [f"the faces of {other.path} join other points"]
     return []
 
