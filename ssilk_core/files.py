@@ -168,11 +168,21 @@ def need_writable(target: str | Path) -> None:
     if target.is_dir():
         fail(str(target), "this is a folder", "the output is a file", "add a file name")
     folder = next(above for above in target.absolute().parents if above.exists())
+    need_folder(target.parent)
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
         fail(str(target), f"cannot be written ({error.strerror or error})", WRITABLE)
+
+
+def need_folder(target: str | Path) -> None:
+    """Raise `SsilkError` where files are to be written into `target`, which is a file itself, or lies in one."""
+    for above in (Path(target), *Path(target).parents):
+        if above.exists():
+            if not above.is_dir():
+                fail(str(above), "this is a file", "the output is a folder, there already or not", "name another one")
+            return
 
 
 def need_not_input(target: str | Path, *inputs: Path | str | None) -> None:

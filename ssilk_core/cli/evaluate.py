@@ -29,6 +29,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..delivery.bake.fabrics import need_fabric
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
 from . import options as shared
@@ -75,6 +76,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
         shared.check_output(options.output, *options.models, *options.stage, options.index)
+    need_fabric(options.fabric, options.material)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
     results = evaluated(options, asked, partial(open_model, options, report), report)

@@ -20,6 +20,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..delivery.bake.fabrics import need_fabric
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result
 from . import options as shared
@@ -55,6 +56,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.root and not options.stage:
         fail("--root", "a SkelRoot without a stage", "it says which character of --stage is meant", "give --stage")
     shared.check_output(output, options.model)
+    need_fabric(options.fabric, options.material)
     file = load_model(options.model)
     if options.stage:
         file = _on_body(options, file, report)

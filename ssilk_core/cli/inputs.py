@@ -24,6 +24,7 @@ class Kind:
 
 MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
+SHOT = Kind("file", "each motion of a shot is a USD file")
 CHARACTER = Kind("file", "a USD stage with a character is needed")
 KINDS = {
     "model": MODEL,
@@ -52,8 +53,10 @@ def need_inputs(options: argparse.Namespace) -> None:
     for name, kind in KINDS.items():
         value = getattr(options, name, None)
         values = value if isinstance(value, list) else [value] if value else []
-        if options.verb in INDEPENDENT and len(values) > 1:
-            continue
+        if options.verb in INDEPENDENT:
+            if len(values) > 1:
+                continue
+            kind = SHOT if kind is MOTIONS else kind
         for each in values:
             if not (name in OF_STAGE and is_shapes(str(each))):
                 need_input(str(each), kind)

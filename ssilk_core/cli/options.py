@@ -132,7 +132,7 @@ def add_world(verb: argparse.ArgumentParser, of: str) -> None:
 
 def asked_fabric(options: argparse.Namespace) -> Fabric:
     """Return the fabric that the options alone ask for; raise `SsilkError` for an unknown property or a bad value."""
-    return apply_overrides(fabric_named(options.fabric or "default"), options.material)
+    return apply_overrides(fabric_named(options.fabric or "default"), options.material, "--material")
 
 
 def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> Fabric:
@@ -148,7 +148,7 @@ def fabric(options: argparse.Namespace, garment: Garment, report: Reporter) -> F
     if options.fabric or garment.surface is None:
         found = asked_fabric(options)
     else:
-        found = apply_overrides(stated_fabric(garment.surface, report), options.material)
+        found = apply_overrides(stated_fabric(garment.surface, report), options.material, "--material")
     if garment.classes is not None:
         need_stitch(garment.mesh, garment.classes, found)
     if garment.mesh.stiffness is not None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -128,28 +129,30 @@ def setting_names(config: object) -> list[str]:
     return [item.name for item in fields(config) if item.default is not MISSING]  # type: ignore[arg-type]
 
 
-def apply_overrides(config: Config, assignments: list[str]) -> Config:
+def apply_overrides(config: Config, assignments: Sequence[str], option: str = "--set") -> Config:
     """Return `config` with "name=value" assignments applied, each converted to the type of its field.
 
+    Args:
+        option: that has them, for messages.
+
     Raises:
-        SsilkError: a name is no setting's, or a value cannot be converted.
+        SsilkError: one assigns nothing, a name is no setting's, or a value cannot be converted.
     """
     types = {name: type(getattr(config, name)) for name in setting_names(config)}
     changes: dict[str, Any] = {}
     for assignment in assignments:
-        name, _, text = assignment.partition("=")
+        (name, equals, text), where = assignment.partition("="), f"{option} {assignment}"
         if name not in types:
             label = f"'{name}' is a label, not a setting"
             found = label if hasattr(config, name) else "no such setting"
-            fail_unknown(f"option '{assignment}'", found, name, types)
+            fail_unknown(where, found, name, types)
+        if not equals:
+            fail(where, "a name without a value", "NAME=VALUE is needed")
         try:
             changes[name] = (
                 tuple(int(n) for n in text.split(",")) if types[name] is tuple else _converted(types[name], text)
             )
         except (ValueError, KeyError):
-            fail(
-                f"option '{assignment}'",
-                f"'{text}' is not a value for '{name}'",
-                f"a value of type {types[name].__name__} is needed",
-            )
+            found = f"'{text}' is not a value for '{name}'"
+            fail(where, found, f"a value of type {types[name].__name__} is needed")
     return replace(config, **changes)  # type: ignore[type-var]

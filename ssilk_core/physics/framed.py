@@ -61,6 +61,11 @@ class Framed:
         return replace(parts[0], **values)  # type: ignore[type-var]
 
 
+def consecutive(counts: Sequence[int], device: torch.device) -> tuple[Tensor, ...]:
+    """Return the numbers that the frames of several have where these follow each other, (N,) each."""
+    return torch.arange(sum(counts), device=device).split(list(counts))
+
+
 def _selected(value: Any, frames: Tensor) -> Any:
     if isinstance(value, Tensor):
         return value[..., frames]

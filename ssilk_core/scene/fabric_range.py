@@ -27,6 +27,7 @@ UNIT = log(4.0)  # of the logarithm of a factor, as networks see it
 USUAL = 4.0  # factor to which a range goes where none is named, and from its inverse
 MOST = 1000.0  # factor that a range may name
 _MODULI = {"stvk": ("lame_lambda", "lame_mu"), "baraff_witkin": ("stretch", "shear")}
+PROPERTIES = (*(name for moduli in _MODULI.values() for name in moduli), *FACTORS[2:])  # of fabrics of any model
 
 
 def properties(fabric: Fabric) -> tuple[str, ...]:

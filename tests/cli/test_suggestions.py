@@ -76,6 +76,6 @@ def test_python_gets_the_same_suggestions():
         fabric_named("wol")
     with pytest.raises(SsilkError, match=r"did you mean 'seed'\?$"):
         apply_overrides(TrainConfig(), ["sed=1"])
-    with pytest.raises(SsilkError, match=r"^option 'name=lace': 'name' is a label, not a setting; it is one of dens"):
-        apply_overrides(FABRICS["wool"], ["name=lace"])
+    with pytest.raises(SsilkError, match=r"^--material name=lace: 'name' is a label, not a setting; it is one of "):
+        apply_overrides(FABRICS["wool"], ["name=lace"], "--material")
     assert preset_named("draft") is PRESETS["draft"] and fabric_named("wool") is FABRICS["wool"]

@@ -130,8 +130,8 @@ def test_need_writable_makes_nothing_and_refuses_what_cannot_be(tmp_path):
     with pytest.raises(SsilkError, match=r"this is a folder.*add a file name"):
         need_writable(tmp_path)
     (tmp_path / "file").touch()
-    with pytest.raises(SsilkError, match="cannot be written"):
-        need_writable(tmp_path / "file" / "below")
+    with pytest.raises(SsilkError, match="file: this is a file; the output is a folder"):
+        need_writable(tmp_path / "file" / "below" / "shot.usdc")
     with pytest.raises(SsilkError, match="cannot be written"):
         need_writable(Path("/proc/none/shot.usdc"))
 

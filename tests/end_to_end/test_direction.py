@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from ssilk_core.delivery.bake import BakeRequest, load_rollout
 from ssilk_core.delivery.bake.direction import DirectedPoses
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.runtime import Player
+from ssilk_core.quality import levels
 from ssilk_core.scene.assets import GarmentPose
 from ssilk_core.scene.kinematics import deform
 
@@ -74,6 +77,24 @@ def test_a_garment_without_direction_has_the_bytes_that_it_had(stage):
     plain, free = (Sdf.Layer.FindOrOpen(name).ExportToString().splitlines() for name in ("plain.usdc", "free.usdc"))
     differs = [line for line, other in zip(plain, free, strict=True) if line != other]
     assert all("motion_sha256" in line for line in differs), differs  # which says what it was baked from
+
+
+def test_a_bake_warns_of_a_prim_that_directs_nothing(stage, capsys):
+    direct("clip.usda", free={0: 0.0}, prim="/Hero/Skrit")
+    assert main([*BAKE, "clip.usda", "-o", "shot.usdc", "--range", "0-2", "--no-verify"]) == 0
+    assert "warning: clip.usda:/Hero/Skrit: ssilk:free directs nothing" in capsys.readouterr().err
+
+
+def test_a_garment_of_another_name_than_in_its_training_is_directed_by_its_own(stage, capsys):
+    """Its polygons tell which it is."""
+    layer, edit = Sdf.Layer.FindOrOpen("rigged.usda"), Sdf.BatchNamespaceEdit()
+    edit.Add("/Hero/Skirt", "/Hero/hero_skirt_GEO")
+    assert layer.Apply(edit) and layer.Export("renamed.usda")
+    layer.Reload(force=True)
+    direct("clip.usda", free={0: 0.0}, prim="/Hero/hero_skirt_GEO")
+    words = ["bake", "lively.safetensors", "--stage", "renamed.usda", "--motion", "clip.usda", "-o", "shot.usdc"]
+    assert main([*words, "--range", "0-2", "--no-verify"]) == 0
+    assert "clip.usda: 3 poses are held" in capsys.readouterr().err
 
 
 def test_a_held_garment_is_where_skinning_has_it_and_is_let_go_without_a_jump(stage, capsys):
@@ -250,6 +271,23 @@ def test_a_refined_garment_is_held_in_part(stage):
     assert off.min() < 1e-3 < 0.01 < off.max() and free.max() > 0.02
 
 
+def test_a_smaller_model_keeps_the_proxies_that_are_held_and_a_budget_counts_their_shapes(stage, capsys, monkeypatch):
+    """What is refused names a size that is enough."""
+    monkeypatch.setattr(levels, "SHAPES", (1.0, 0.0))
+    monkeypatch.setattr(levels, "JOINTS", (1.0, 0.0))
+    held, frames = proxies_of("rigged.usda")[0], ["clip.usda", "--range", "4-15", "-o", "small.usdc", "--budget"]
+    hold_parts("clip.usda", {f"ssilk:free:{held.rpartition('/')[2]}": {8: 0.0, 14: 1.0}})
+    assert main([*BAKE, *frames, "1kB"]) == 2
+    least = float(re.search(r"this model needs at least ([\d.]+) kB", capsys.readouterr().err)[1])
+    assert main([*BAKE, *frames, f"{least + 0.1:g}kB"]) == 0
+    assert main(["verify", "small.usdc"]) == 0
+    told, taken = capsys.readouterr().err, Path("small.usdc").stat().st_size / 1000
+    assert "1 proxies" in told and 0.95 * least < taken < 1.02 * least
+    shot = Usd.Stage.Open("small.usdc")
+    rig = next(prim for prim in shot.Traverse() if prim.IsA(UsdSkel.Skeleton))
+    assert [name for name in UsdSkel.Skeleton(rig).GetJointsAttr().Get() if "proxy" in name] == [held]
+
+
 def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):
     first, *_ = proxies_of("rigged.usda")
     clip, leaf = Usd.Stage.Open("clip.usda"), first.rpartition("/")[2]
@@ -313,7 +351,7 @@ def test_a_layer_on_the_garment_of_the_shot_comes_before_its_own_stage(stage):
     ("free", "hold", "more", "complaint"),
     [
         ({3: 0.0, 5: 1.5}, None, [], "ssilk:free is 1.5 at time code 5; 0, held to linear blend skinning, to 1"),
-        ({3: float("nan")}, None, [], "ssilk:free is nan at time code 0"),
+        ({3: float("nan")}, None, [], "ssilk:free is nan at time code 3"),
         (None, 0, [], "ssilk:hold is 0; a whole number of frames from 1 to 100 is needed"),
         (None, 2, ["--refine", "2"], "poses that are held for 2 frames, and --refine"),
         ({0: 0.0}, None, ["--refine", "2"], "the garment is held in all frames"),

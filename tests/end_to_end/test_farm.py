@@ -93,6 +93,25 @@ def test_commands_that_are_told_can_be_pasted_into_a_shell(farm, capsys):
     assert cloud == ["deadline", "bundle", "submit", "my job"]
 
 
+def test_a_job_that_no_worker_could_do_is_refused_and_nothing_is_written(farm, capsys):
+    """What can be seen at the submission: no input can be read, or a file lies where a folder is to be."""
+    Path("notes.txt").write_text("mine")
+    Path("clips").mkdir()
+    base = "farm model.safetensors --stage rigged.usda"
+    for words, text in (
+        (f"{base} --motion gone.usda clips --bundle new", "clips: this is a folder; a USD file is needed"),
+        (f"{base} --motion clips --bundle new", "clips: a folder, and no file; each motion of a shot is a USD file"),
+        (f"{base} --motion a.usda -o notes.txt --bundle new", "notes.txt: this is a file; the output is a folder"),
+        (f"{base} --motion a.usda --bundle notes.txt", "notes.txt: this is a file; the output is a folder"),
+        (f"{WORDS.replace('farm', 'bake', 1)} -o a.usda/layers", "a.usda: this is a file; the output is a folder"),
+    ):
+        assert run(words) == 2
+        assert text in capsys.readouterr().err
+    assert Path("notes.txt").read_text() == "mine" and not Path("new").exists()
+    assert run(f"{base} --motion gone.usda a.usda --bundle new") == 0
+    assert "gone.usda: there is no such file" in capsys.readouterr().err
+
+
 def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     """The first chunk fails, those behind it are baked, and the last step says which shot is missing.
 
@@ -107,7 +126,7 @@ def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     assert Path("bundle/layers/shots/b/shot.usda").is_file() and Path("bundle/layers/shots/c/shot.usda").is_file()
     assert not Path("bundle/layers/shots/a").exists()
     Path("a.usda").write_bytes(whole)
-    again = openjd_run(chunk=2)
+    again = openjd_run(chunk=3)
     assert again.returncode == 0 and again.stdout.count("current True") == 2, again.stdout
     assert "Session ended successfully" in again.stdout and "openjd_progress: 100.0" in again.stdout, again.stdout
     assert set(layers("bundle/layers")) == {

@@ -397,8 +397,8 @@ OPTIONS = [
     Case("unknown preset", f"{TRAIN} --preset lavish", ("--preset", "lavish", "one of draft, ")),
     Case("unknown fabric", f"{TRAIN} --fabric tweed", ("--fabric", "tweed", " silk, ")),
     Case("unknown setting", f"{TRAIN} --set magic=1", ("--set magic=1", "no such setting", "iterations", "latent")),
-    Case("setting of the wrong type", f"{TRAIN} --set iterations=many", ("'iterations=many'", "int")),
-    Case("setting without a value", f"{TRAIN} --set latent", ("'latent'", "int")),
+    Case("setting of the wrong type", f"{TRAIN} --set iterations=many", ("--set iterations=many: 'many' is", "int")),
+    Case("setting without a value", f"{TRAIN} --set latent", ("--set latent: a name without a value", "NAME=VALUE")),
     Case("unknown scheme", f"{TRAIN} --set scheme=euler", ("'euler'", "spring_verlet")),
     Case("no iterations", f"{TRAIN} --set iterations=0", ("'iterations'", "0", "between 1 and")),
     Case("zero-length window", f"{TRAIN} --set window=0", ("window of 0 poses", "at least 3")),
@@ -441,7 +441,7 @@ FILES = [
     Case(
         "file in place of the output's folder",
         RIG.replace("new.usda", "clip.usda/new.usda"),
-        ("clip.usda/new.usda", "cannot be written"),
+        ("clip.usda: this is a file", "the output is a folder"),
     ),
     Case(
         "model in an unwritable folder",

@@ -316,6 +316,5 @@ def test_weights_that_are_no_numbers_are_refused(copy, capsys):
     path = shot(copy / "shot.usda", {0.0: [0.0, 0.0], 2.0: [float("nan"), 0.0], 4.0: [1.0, 0.0]})
     assert main([*BAKE, path, "-o", "baked.usda"]) == 2
     told = capsys.readouterr().err
-    assert (
-        "blendShapeWeights hold NaN or infinity, first at time code 1" in told and not (copy / "baked.usda").exists()
-    )
+    assert "blendShapeWeights hold NaN or infinity, first at time code 2;" in told
+    assert not (copy / "baked.usda").exists()

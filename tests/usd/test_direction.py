@@ -61,7 +61,7 @@ def shot(home, tmp_path) -> Usd.Stage:
 def read(shot: Usd.Stage, home: Usd.Stage, who: str = "One", proxies: Sequence[str] = ()):
     files = (stage.GetRootLayer().realPath for stage in (shot, home))
     source, stage = files
-    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, "/Hero/Cape", motion(), proxies)
+    return read_direction(f"{source}:/Crowd/{who}/Walk", stage, ["/Hero/Cape"], motion(), proxies)
 
 
 def test_each_of_a_crowd_is_held_by_its_own_prim_at_the_time_codes_of_the_shot(shot, home):
@@ -87,7 +87,7 @@ def test_a_clip_says_it_by_an_over_at_the_path_of_the_garment(home, tmp_path):
     clip.GetRootLayer().Save()
     path = clip.GetRootLayer().realPath
     write_direction(path, "/Hero/Cape", np.linspace(0, 1, FRAMES), FIRST, 2)
-    found = read_direction(path, home.GetRootLayer().realPath, "/Hero/Cape", motion())
+    found = read_direction(path, home.GetRootLayer().realPath, ["/Hero/Cape"], motion())
     np.testing.assert_allclose(found.free, np.linspace(0, 1, FRAMES))
     assert found.hold == 2
 
@@ -127,6 +127,33 @@ def test_a_subset_of_vertices_that_are_not_there_is_refused(shot, home):
     home.GetRootLayer().Save()
     shot.Reload()
     with pytest.raises(SsilkError, match=r"a subset of points \[0, 4\], .*of which there are 4"):
+        read(shot, home)
+
+
+def test_a_part_of_no_such_name_is_told_with_those_that_there_are(shot, home):
+    define_subset(home, "point", [0, 3])
+    home.GetPrimAtPath("/Hero/Cape").CreateAttribute("ssilk:free:lefft", Sdf.ValueTypeNames.Float).Set(0.0)
+    home.GetRootLayer().Save()
+    shot.Reload()
+    text = r"ssilk:free:lefft names neither .*; its subsets: left; its proxies: A, B; did you mean 'left'\?$"
+    with pytest.raises(SsilkError, match=text):
+        read(shot, home, proxies=["Hips/B", "Hips/A"])
+
+
+def test_a_prim_with_a_misspelt_name_is_told_until_the_garment_itself_is_directed(shot, home):
+    shot.OverridePrim("/Crowd/One/Cpae")
+    key(shot, "/Crowd/One/Cpae", {20.0: 0.0})
+    shot.OverridePrim("/Crowd/Prop")
+    key(shot, "/Crowd/Prop", {20.0: 0.0})
+    (told,) = read(shot, home).unheard
+    assert "shot.usda:/Crowd/One/Cpae: ssilk:free directs nothing; the garment is /Hero/Cape" in told
+    key(shot, "/Crowd/One/Cape", {20.0: 0.0})
+    assert not read(shot, home).unheard and len(read(shot, home, "Two").unheard) == 1
+
+
+def test_a_value_that_is_refused_is_the_one_that_was_keyed(shot, home):
+    key(shot, "/Crowd/One/Cape", {20.0: 0.5, 23.0: np.nan, 28.0: 1.0})  # between the frames at 22 and 24
+    with pytest.raises(SsilkError, match="ssilk:free is nan at time code 23;"):
         read(shot, home)
 
 

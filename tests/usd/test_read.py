@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
 from scipy.spatial.transform import Rotation
+from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 from ssilk_usd.reading.garment import read_garment
 from ssilk_usd.reading.motion import motion_files, read_motion, read_motions
@@ -509,6 +510,14 @@ def test_frames_per_second_sets_the_rate_where_it_is_authored(codes, fps, frames
 def test_a_motion_starts_at_its_own_time_whatever_the_time_codes(codes, fps, start):
     motion = read_motion(clip(JOINTS, {120: 0, 121: 60}, codes=codes, fps=fps), SKELETON)
     assert motion.start == start and motion.start / motion.fps == 120 / codes
+
+
+def test_of_a_damaged_line_the_beginning_is_told(tmp_path):
+    path = tmp_path / "long.usda"
+    path.write_text('#usda 1.0\ndef "A"\n{\n    point3f[] points = [(1, 2 3)' + ", (0, 0, 0)" * 1000 + "]\n}\n")
+    with pytest.raises(SsilkError, match=r"long.usda:4:.* at '3\), .*\.\.\.\); a complete .usd") as refused:
+        open_stage(path)
+    assert len(str(refused.value)) < 700
 
 
 def test_a_single_sample_is_a_motion_of_one_frame():

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Container, Sequence
 
 from ...errors import SsilkError
-from ...events import Message, Reporter
+from ...events import Event, Message, Reporter
 from ...network.checkpoint import load_model
 from .fabrics import in_fabric
 from .request import BakeRequest
@@ -14,7 +14,7 @@ from .task import BakeTask
 
 
 def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
-    """Warn of fabrics that models have not, and of ranges that motions have not.
+    """Warn of fabrics that models have not or were not trained for, and of ranges that motions have not.
 
     Args:
         readable: inputs that can be read: tasks with others fail for that.
@@ -24,14 +24,15 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     """
     lost = {task.name for task in tasks if any(path not in readable for path in task.request.inputs.values())}
     tasks, count = [task for task in tasks if task.name not in lost], len(tasks)
-    for asked, need in ((_fabric, _need_fabric), (_range, _need_range)):
+    for asked, found in ((_fabric, _in_fabric), (_range, _in_range)):
         groups: dict[tuple[str, ...], list[BakeTask]] = {}
         for task in tasks:
             if key := asked(task.request):
                 groups.setdefault(key, []).append(task)
         for alike in groups.values():
             try:
-                need(alike[0].request)
+                for event in found(alike[0].request):
+                    report(event)
             except SsilkError as error:
                 lost |= {task.name for task in alike}
                 if len(lost) == count:
@@ -44,15 +45,16 @@ def _fabric(request: BakeRequest) -> tuple[str, ...]:
     return (request.model, *asked, *request.material) if asked or request.material else ()
 
 
-def _need_fabric(request: BakeRequest) -> None:
-    in_fabric(load_model(request.model), request.model, request.fabric, request.material)
+def _in_fabric(request: BakeRequest) -> tuple[Event, ...]:
+    return in_fabric(load_model(request.model), request.model, request.fabric, request.material)[1]
 
 
 def _range(request: BakeRequest) -> tuple[str, ...]:
     return (request.motion, request.root or "", request.range) if request.range else ()
 
 
-def _need_range(request: BakeRequest) -> None:
+def _in_range(request: BakeRequest) -> tuple[Event, ...]:
     from ssilk_usd.reading.frame_range import read_frame_range
 
     read_frame_range(request.motion, request.time_range, root=request.root)
+    return ()

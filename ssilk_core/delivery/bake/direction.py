@@ -47,6 +47,7 @@ class Direction:
         first: the sample from which held poses are counted.
         parts: where proxies are held each by itself; None where none is.
         shapes: the blendshapes that this takes; None likewise.
+        said: what stages say of these parts.
     """
 
     free: Floats
@@ -55,6 +56,7 @@ class Direction:
     first: int
     parts: HeldParts | None = None
     shapes: PartShapes | None = None
+    said: tuple[SaidPart, ...] = ()
 
     def of(self, deformer: Deformer) -> Direction:
         """Return it with the blendshapes that a garment takes whose proxies are held each by itself."""
@@ -124,6 +126,18 @@ def held_parts(
     if shares[1].any():
         hand = read_hand_pose(request.motion, scene, motion, request.root, needed)
     return HeldParts(shares[0], shares[1], hand)
+
+
+def held_proxies(said: Sequence[SaidPart], deformer: Deformer, names: Sequence[str]) -> set[str]:
+    """Return the joint paths of the proxies that no smaller model may lack: those that are held by their names, and
+    of each group the one that belongs most to it."""
+    found = set[str]()
+    for part in said:
+        if part.vertices is None:
+            found |= {name for name in names if name.rpartition("/")[2] == part.name}
+        else:
+            found.add(names[int(shares_of_group(deformer, part.vertices).argmax())])
+    return found
 
 
 def free_stretches(free: Floats) -> list[tuple[int, int]]:

@@ -11,9 +11,11 @@ from ...errors import fail, fail_unknown
 from ...events import Event, Message
 from ...network.checkpoint import ONE_FABRIC, ModelFile
 from ...network.settings import apply_overrides
-from ...scene.fabric_range import FACTORS, fabric_with, factors_of, properties
+from ...scene.assets import Floats
+from ...scene.fabric_range import FACTORS, PROPERTIES, fabric_with, factors_of, properties
 from ...scene.fabrics import Fabric, fabric_named
 
+OPTION = "--material"
 TIMES = "x"  # at the end of a value that is a factor
 
 
@@ -46,29 +48,48 @@ def in_fabric(
     return file.on_fabric(wanted), tuple(told)
 
 
+def need_fabric(fabric: str | None, material: Sequence[str]) -> None:
+    """Raise `SsilkError` where options, which are those of `in_fabric`, ask for what no model could play."""
+    preset = fabric_named(fabric or "default")
+    _need_factors(_factors(np.ones(len(FACTORS)), material))
+    apply_overrides(preset, _absolute(PROPERTIES, material), OPTION)
+
+
 def _asked(own: Fabric, fabric: str | None, material: Sequence[str]) -> Fabric:
     """Return the fabric that options ask for, with all that networks do not see as the model's own has it."""
-    factors = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
-    absolute = []
+    preset = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
+    factors = _factors(preset, material)
+    _need_factors(factors)
+    return apply_overrides(fabric_with(own, factors, fabric), _absolute(properties(own), material), OPTION)
+
+
+def _factors(preset: Floats, material: Sequence[str]) -> Floats:
+    """Return the factors (5,) of a preset, or those that the words of --material have in their place."""
+    factors = preset.copy()
     for each in material:
-        name, _, text = each.partition("=")
-        where = f"--material {each}"
-        if text.endswith(TIMES):
-            if name not in FACTORS:
-                fail_unknown(where, "networks see no factor of it", name, FACTORS)
-            try:
-                factors[FACTORS.index(name)] = float(text.removesuffix(TIMES))
-            except ValueError:
-                fail(where, f"'{text}'", "a factor is a number before the x, such as bending=2x")
-        elif name not in properties(own):
-            fail_unknown(where, "networks do not see it", name, properties(own))
-        else:
-            absolute.append(each)
+        (name, _, text), where = each.partition("="), f"{OPTION} {each}"
+        if not text.endswith(TIMES):
+            continue
+        if name not in FACTORS:
+            fail_unknown(where, "networks see no factor of it", name, FACTORS)
+        try:
+            factors[FACTORS.index(name)] = float(text.removesuffix(TIMES))
+        except ValueError:
+            fail(where, f"'{text}'", "a factor is a number before the x, such as bending=2x")
+    return factors
+
+
+def _need_factors(factors: Floats) -> None:
     if not (np.isfinite(factors).all() and (factors >= 0).all() and factors[0] > 0 and factors[3] > 0):
         found = ", ".join(f"{name} {factor:g}" for name, factor in zip(FACTORS, factors))
-        fail(
-            "--material",
-            f"factors {found}",
-            "they are finite and not negative, those of stretch and density positive",
-        )
-    return apply_overrides(fabric_with(own, factors, fabric), absolute)
+        allowed = "they are finite and not negative, those of stretch and density positive"
+        fail(OPTION, f"factors {found}", allowed)
+
+
+def _absolute(known: Sequence[str], material: Sequence[str]) -> list[str]:
+    """Return the words of --material that are values in units; raise `SsilkError` where one is of no known name."""
+    found = [each for each in material if not each.partition("=")[2].endswith(TIMES)]
+    for each in found:
+        if (name := each.partition("=")[0]) not in known:
+            fail_unknown(f"{OPTION} {each}", "networks do not see it", name, known)
+    return found

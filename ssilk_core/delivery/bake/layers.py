@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...errors import SsilkError, fail
 from ...events import Message, Reporter, Result, Started, silent
-from ...files import FileHashes, remove_unfinished_in, replacing, sha256
+from ...files import FileHashes, need_folder, remove_unfinished_in, replacing, sha256
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
@@ -113,10 +113,14 @@ class LayerFolder:
 
     The garment of the last task is kept: tasks of one garment that follow each other load it and write its asset
     once.
+
+    Raises:
+        SsilkError: `path` is a file.
     """
 
     def __init__(self, path: str | os.PathLike[str], inputs: InputFiles | None = None) -> None:
         self.path = Path(path)
+        need_folder(self.path)
         self.inputs = inputs or InputFiles()
         self._files = FileHashes()
         self._checked: set[BakeTask] = set()  # tasks of which the names are known to be free

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,7 +25,7 @@ from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
-from .direction import Direction, held_parts
+from .direction import Direction, held_parts, held_proxies
 from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, shapes_of, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -131,7 +131,8 @@ class LoadedGarment:
         sight = Sight.of(self.file, solved=request.latent_iterations > 0)
         source = read.source if request.lbs else self._felt(around, sight)
         loop = read.loop and self._felt_in_loop(request, read.loop, around, sight, source)
-        kept, reduction = self._cut(source) if request.keep else (self, None)
+        said = self._said(request, read) if self.model else None
+        kept, reduction = self._cut(source, said) if request.keep else (self, None)
         character = self.deformer.scene.character
         provenance = {
             **self.provenance,
@@ -163,8 +164,13 @@ class LoadedGarment:
             around=around,
             reduction=reduction,
             riders=self.riders,
-            told=(*self.told, *read.told, *other_bones(motion, read.sampled, character, self.first)),
-            direction=kept._directed(request, read) if kept.model else None,
+            told=(
+                *self.told,
+                *read.told,
+                *other_bones(motion, read.sampled, character, self.first),
+                *(Message(text, "warning") for text in (said.unheard if said else ())),
+            ),
+            direction=kept._directed(request, read, said) if said else None,
             loop=loop,
         ).begun()
 
@@ -216,12 +222,22 @@ class LoadedGarment:
         text = "its joints are as far apart as those of the stage's own body, and are played between this one's bones"
         return motion_on(motion, first, skeleton, self.taller), (Message(f"{motion.path}: {text}"),)
 
+    @cached_property
+    def _places(self) -> tuple[str, ...]:
+        """Paths at which stages may direct the garment: that in the character's stage, and that of its training."""
+        from ssilk_usd.opening.stage import open_stage
+        from ssilk_usd.writing.look import look_source
+
+        mesh, stage = self.deformer.scene.garment.mesh, open_stage(self.request.stage)
+        there, trained = look_source(mesh, stage, self.request.root), split_location(mesh.path)[1]
+        found = [*([str(there.prim.GetPath())] if there else []), *([trained] if trained else [])]
+        return tuple(dict.fromkeys(found))  # a model may know its garment by a name alone
+
     def _loops(self, request: BakeRequest, motion: Motion) -> bool:
         """Return whether a shot is to be a loop; skinning alone repeats by itself."""
         from ssilk_usd.reading.direction import read_loop
 
-        garment = split_location(self.deformer.scene.garment.mesh.path)[1]
-        asked = request.loop or (garment is not None and read_loop(request.motion, request.stage, garment, motion))
+        asked = request.loop or read_loop(request.motion, request.stage, self._places, motion)
         if request.lbs or not asked:
             return False
         need_alone(request)
@@ -271,15 +287,18 @@ class LoadedGarment:
             return motion
         return replace(motion, proximity=seen_proximity(seen, motion, NumpyGarment(self.file)))
 
-    def _directed(self, request: BakeRequest, read: _ReadMotion) -> Direction | None:
-        """Return how the shot directs the garment; None where it moves freely throughout."""
-        from ssilk_usd.reading.direction import SaidDirection, read_direction
+    def _said(self, request: BakeRequest, read: _ReadMotion) -> SaidDirection:
+        """Return what stages say of how the garment is directed."""
+        from ssilk_usd.reading.direction import read_direction
 
         assert self.model is not None
-        garment, said = split_location(self.deformer.scene.garment.mesh.path)[1], SaidDirection(None, 1)
-        if garment is not None:  # a model may know its garment by a name alone
-            names = self.model.scene.rig.joint_names
-            said = read_direction(request.motion, request.stage, garment, read.whole, names)
+        return read_direction(
+            request.motion, request.stage, self._places, read.whole, self.model.scene.rig.joint_names
+        )
+
+    def _directed(self, request: BakeRequest, read: _ReadMotion, said: SaidDirection) -> Direction | None:
+        """Return how the shot directs the garment; None where it moves freely throughout."""
+        assert self.model is not None
         parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole) if said.parts else None
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
@@ -293,7 +312,7 @@ class LoadedGarment:
         first = read.lead + (read.frames.before * samples if read.frames else 0)
         free = np.ones(count) if said.free is None else said.free
         hold, first = (hold * samples, first) if hold > 1 else (1, 0)
-        return Direction(free, hold, read.whole, first, parts)
+        return Direction(free, hold, read.whole, first, parts, said=said.parts)
 
     def _directed_in_loop(
         self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection, parts: HeldParts | None
@@ -320,12 +339,13 @@ class LoadedGarment:
                 fail(request.motion, found, "a loop ends as it begins", "key it so")
         rate = loop.motion.fps / read.sampled.fps
         motion = _sampled(loop.motion, read.sampled.fps, np.arange(loop.samples) * rate)
-        return Direction(loop.tiled(free), hold, motion, 0, parts and parts.of(loop.tiled))
+        return Direction(loop.tiled(free), hold, motion, 0, parts and parts.of(loop.tiled), said=said.parts)
 
-    def _cut(self, motion: Motion) -> tuple[LoadedGarment, SizeReduction]:
+    def _cut(self, motion: Motion, said: SaidDirection | None) -> tuple[LoadedGarment, SizeReduction]:
         """Return the garment cut to the size that the request keeps, so as to be best for this motion."""
-        assert self.model is not None and self.request.keep is not None
-        reducer = Reducer(self.file, [motion])
+        assert self.model is not None and self.request.keep is not None and said is not None
+        held = held_proxies(said.parts, self.deformer, self.model.scene.rig.joint_names)
+        reducer = Reducer(self.file, [motion], held=held)
         found = reducer.reduce(self.request.keep)
         model, deformer = _network_like(self.model, found.file, self.request)
         return replace(self, model=model, deformer=deformer), SizeReduction.of(reducer.whole, found)
@@ -418,8 +438,12 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     assert rollout.model is not None
     model, deformer = _network_like(rollout.model, file, rollout.request)
     direction = rollout.direction
-    if direction is not None and model.scene.rig.joint_names != rollout.model.scene.rig.joint_names:
-        direction = replace(direction, parts=None, shapes=None)  # it may lack a proxy that is held
+    if direction is not None and direction.parts is not None:
+        leaves = {name.rpartition("/")[2] for name in model.scene.rig.joint_names}
+        said = [part for part in direction.said if leaves and (part.vertices is not None or part.name in leaves)]
+        parts = held_parts(said, deformer, model.scene, rollout.request, rollout.whole) if said else None
+        parts = parts.of(rollout.loop.tiled) if parts and rollout.loop else parts
+        direction = replace(direction, parts=parts, shapes=None)
     return replace(rollout, model=model, deformer=deformer, direction=direction, is_fading=False).begun()
 
 

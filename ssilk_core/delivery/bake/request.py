@@ -14,6 +14,7 @@ from ...quality.reduction import ModelSize
 from ...scene.kinematics import MAX_FPS, MAX_HOLD, MIN_FPS
 from ...scene.plain import from_plain
 from ..targets import TARGETS, Target
+from .fabrics import need_fabric
 from .world import parse_world
 
 AT = "@"  # before the time code of a frame
@@ -77,7 +78,7 @@ class BakeRequest:
         asset_identifier: likewise; None for the asset's own layer, and for none in a file.
 
     Raises:
-        SsilkError: an unknown target or refined output, or a number out of range.
+        SsilkError: an unknown target, refined output or fabric, or a number out of range.
     """
 
     model: str
@@ -141,6 +142,7 @@ class BakeRequest:
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")
+        need_fabric(self.fabric, self.material)
         if self.lbs and (self.fabric or self.material):
             found = "linear blend skinning has no fabric"
             fail("--lbs", found, "only the network and the solver have one", "leave --fabric and --material out")

@@ -17,6 +17,7 @@ from ...quality.levels import quality_named, size_at, spend
 from ...quality.reduction import Reducer
 from ...scene.assets import Deformer, GarmentPose, Motion
 from ..targets import GLB
+from .direction import held_proxies
 from .glb import write_glb_shot
 from .load import load_garment, load_rollout, with_model
 from .request import BakeRequest
@@ -59,8 +60,8 @@ def load_sized(
         return rollout
     if quality and request.fps is None:
         request = replace(request, fps=quality_named(quality).rate(rollout.source.fps))
-    reducer = Reducer(garment.file, [rollout.source])
-    size = size_at(quality, reducer.whole)
+    reducer = Reducer(garment.file, [rollout.source], held=_held(rollout))
+    size = reducer.allowed(size_at(quality, reducer.whole))
     size = replace(size, influences=min(size.influences, most))
     if budget:
         at_fps = load_rollout(replace(request, latent_iterations=0))  # solved states take as many bytes
@@ -99,6 +100,13 @@ def _at_quality(request: BakeRequest, quality: str | None, budget: str | None) -
             "leave one of them out",
         )
     return request
+
+
+def _held(rollout: BakeRollout) -> set[str]:
+    """Return the proxies that hold parts of a garment, which stay."""
+    if rollout.direction is None or rollout.model is None:
+        return set()
+    return held_proxies(rollout.direction.said, rollout.deformer, rollout.model.scene.rig.joint_names)
 
 
 def shot_bytes(rollout: BakeRollout, suffix: str, *, include_body: bool) -> ShotBytes:

@@ -39,16 +39,22 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     submitted again.
 
     Raises:
-        SsilkError: no task is left that can be baked, because a model has not the fabric that is asked for, or a
-            motion not the range.
+        SsilkError: no task is left that can be baked, because an input cannot be read, a model has not the fabric
+            that is asked for, or a motion not the range.
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}
+    unread: list[SsilkError] = []
     for name, path in dict.fromkeys(item for task in tasks for item in task.request.inputs.items()):
         try:
             found[path] = files.contents(name, path)
         except SsilkError as error:
-            report(Message(str(error), "warning"))
+            unread.append(error)
+    able = any(found.keys() >= set(task.request.inputs.values()) for task in tasks)
+    for fault in unread if able else unread[:-1]:
+        report(Message(str(fault), "warning"))
+    if not able:
+        raise unread[-1]
     tell_impossible(tasks, found, report)
     return FarmJob(tuple(_pinned(task, found) for level in in_levels(tasks) for task in level), found)
 

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from ...errors import fail
 from ...events import Event, Failed, GarmentEvent, Message, Progress, Result, Started, describe
-from ...files import replacing, split_body, split_location
+from ...files import need_folder, replacing, split_body, split_location
 from ..bake import BakeTask
 from ..bake.layered import in_levels
 from .job import NAME, FarmJob, is_job, write_job
@@ -50,9 +50,10 @@ def write_bundle(folder: Path, job: FarmJob, output: Path | None, options: Bundl
     """Write a job bundle: template, job, parameter values and the files that go in and come out.
 
     Raises:
-        SsilkError: it cannot be written, or would replace files of another program.
+        SsilkError: it cannot be written, is a file, or would replace files of another program.
     """
     tasks = job.tasks
+    need_folder(folder)
     held = [name for name in (NAME, TEMPLATE, VALUES, ASSETS) if (folder / name).is_file()]
     if held and not is_job(folder / NAME):
         fail(

@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..energy.collision import ContactLaw
+from ..framed import consecutive
 from .neighbours import places_among
 
 CLOSING = 0.8  # of a gap, by which it may close in one step
@@ -170,12 +170,12 @@ class ClothContacts:
     @classmethod
     def concatenated(cls, parts: Sequence[ClothContacts]) -> ClothContacts:
         """Return the contacts in the frames of several, one after the other."""
-        before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
+        places = consecutive([part.frames for part in parts], parts[0].frame.device)
         rows = "vertices", "coefficients", "second", "direction", "start", "area", "slack"
         known = torch.cat([part.known for part in parts])
-        frame = torch.cat([part.frame + first for part, first in zip(parts, before)])
+        frame = torch.cat([place[part.frame] for part, place in zip(parts, places)])
         own = (torch.cat([getattr(part, name) for part in parts], dim=-1) for name in rows)
-        return cls(parts[0].law, before[-1], known, frame, *own)
+        return cls(parts[0].law, len(known), known, frame, *own)
 
     def pressing(self, x: Tensor) -> ClothContacts:
         """Return those that have an energy."""

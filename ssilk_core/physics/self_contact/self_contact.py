@@ -25,6 +25,7 @@ from torch import Tensor
 from ...errors import fail
 from ...scene.mesh import topology
 from ..energy.collision import ContactLaw
+from ..framed import consecutive
 from .cloth import TouchingCloth
 from .contacts import SLACK, ClothContacts
 from .neighbours import near_pairs, places_among
@@ -119,8 +120,7 @@ class ClothNeighbours:
     @classmethod
     def concatenated(cls, parts: Sequence[ClothNeighbours]) -> ClothNeighbours:
         """Return those of the frames of several, one after the other."""
-        device, counts = parts[0].at.device, [part.at.shape[-1] for part in parts]
-        places = torch.arange(sum(counts), device=device).split(counts)
+        places = consecutive([part.at.shape[-1] for part in parts], parts[0].at.device)
         return cls.joined(list(zip(places, parts)))
 
     def replace_frames(self, frames: Tensor, other: ClothNeighbours) -> ClothNeighbours:

@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..collision.samples import SampledCloth
 from ..energy.collision import ContactLaw
+from ..framed import consecutive
 from ..self_contact import ClothContacts
 from ..self_contact.contacts import Slopes, at_vertices
 from ..self_contact.neighbours import places_among
@@ -93,9 +93,9 @@ class Friction:
     @classmethod
     def concatenated(cls, parts: Sequence[Friction]) -> Friction:
         """Return that of the frames of several, one after the other."""
-        before = np.cumsum([0, *(part.frames for part in parts)]).tolist()
-        moved = [replace(part, frame=part.frame + first) for part, first in zip(parts, before)]
-        return replace(cls.joined(*moved), frames=before[-1])
+        places = consecutive([part.frames for part in parts], parts[0].frame.device)
+        moved = [replace(part, frame=place[part.frame]) for part, place in zip(parts, places)]
+        return replace(cls.joined(*moved), frames=sum(map(len, places)))
 
     def after(self, body: Tensor, world: PosedWorld | None = None) -> Friction:
         """Return that of a step in which the body has moved to points (B, 3, N), and colliders as `world` has them.

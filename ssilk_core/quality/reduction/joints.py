@@ -9,6 +9,8 @@ remaining error is then half as large.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,15 +36,27 @@ def candidate_joints(scene: Scene, weights: Floats) -> Ints:
     return np.where(np.take_along_axis(wanted, order, axis=1), order, -1)
 
 
-def removal_order(scene: Scene, influences: InfluenceCandidates, mass: Floats) -> list[int]:
-    """Return all proxies in order of removal, as combined joint indices.
+def with_those_above(scene: Scene, names: Collection[str]) -> frozenset[int]:
+    """Return the proxies of these joint paths and those that they hang from, as combined joint indices."""
+    character, found = scene.character.skeleton.joint_count, set[int]()
+    for proxy in reversed(range(character, len(scene.parents))):
+        if scene.joint_names[proxy] in names or proxy in found:
+            found |= {proxy, int(scene.parents[proxy])}
+    return frozenset(proxy for proxy in found if proxy >= character)
+
+
+def removal_order(
+    scene: Scene, influences: InfluenceCandidates, mass: Floats, held: Collection[int] = ()
+) -> list[int]:
+    """Return the proxies in order of removal, as combined joint indices.
 
     Args:
         mass: of the vertices, shape (V,).
+        held: proxies that stay, with all that they hang from.
     """
     character = scene.character.skeleton.joint_count
     order: list[int] = []
-    kept = set(range(character, len(scene.parents)))
+    kept = set(range(character, len(scene.parents))).difference(held)
     while kept:
         ends = sorted(kept - {int(scene.parents[proxy]) for proxy in kept})
         gone = min(ends, key=lambda end: _missed(influences, scene.parents, mass, [*order, end]))

@@ -6,7 +6,7 @@ The latents stay the same, because nothing that is removed feeds back into them:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
@@ -20,7 +20,7 @@ from ...scene.assets import PINNED, Floats, Motion, SkinWeights
 from ...scene.mesh.topology import vertex_areas
 from .files import with_basis, with_weights
 from .influences import VERTICES_PER_BLOCK, InfluenceCandidates, fit_weights, measure_costs, transform_by_each
-from .joints import candidate_joints, dense, move_to_parents, removal_order
+from .joints import candidate_joints, dense, move_to_parents, removal_order, with_those_above
 from .observed import observe
 from .shapes import Modes, basis, modes
 from .size import ModelSize
@@ -52,6 +52,7 @@ class Reducer:
         file: the model to reduce; one of a family of bodies is measured on the first of these.
         motions: representative motions, on which errors are measured.
         frames: number of frames to measure on.
+        held: joint paths of proxies that every smaller model keeps, with the proxies above them.
 
     Attributes:
         whole: size of the model.
@@ -60,7 +61,9 @@ class Reducer:
         SsilkError: there is no motion, or it is of another character.
     """
 
-    def __init__(self, file: ModelFile, motions: Sequence[Motion], *, frames: int = FRAMES) -> None:
+    def __init__(
+        self, file: ModelFile, motions: Sequence[Motion], *, frames: int = FRAMES, held: Collection[str] = ()
+    ) -> None:
         self.file, self.scene, self.player = file, file.scene, Player(file.on_base())
         self.seen = observe(self.player, motions, frames)
         self.activations, self.matrices = self.seen.decode(self.player)
@@ -74,12 +77,18 @@ class Reducer:
             joints=self.scene.rig.proxy_count,
             influences=int((self.weights > 0).sum(axis=1).max()),
         )
+        self.held = with_those_above(self.scene, held)
         self._skinned = lru_cache(4)(self._fitted)
         self._followed = lru_cache(4)(self._modes)
 
+    def allowed(self, size: ModelSize) -> ModelSize:
+        """Return the nearest size that a smaller model may have."""
+        kept = size.within(self.whole)
+        return replace(kept, joints=max(kept.joints, len(self.held)))
+
     def reduce(self, size: ModelSize) -> ReducedModel:
         """Return the model reduced to a size; parts that are already smaller stay as they are."""
-        kept, file = size.within(self.whole), self.file
+        kept, file = self.allowed(size), self.file
         skin = (kept.joints, kept.influences)
         if skin != (self.whole.joints, self.whole.influences):
             weights = dense(self.influences.joints, self._skinned(*skin), len(self.scene.joint_names))
@@ -92,7 +101,7 @@ class Reducer:
 
     def predict_error(self, size: ModelSize) -> float:
         """Predict the error of a model of this size [m], RMS weighted by mass, without building it."""
-        kept = size.within(self.whole)
+        kept = self.allowed(size)
         if kept == self.whole:
             return 0.0
         skin = (kept.joints, kept.influences)
@@ -117,8 +126,8 @@ class Reducer:
 
     @cached_property
     def order(self) -> list[int]:
-        """Proxies in order of removal."""
-        return removal_order(self.scene, self.influences, self.mass)
+        """Proxies in order of removal, without those that are kept."""
+        return removal_order(self.scene, self.influences, self.mass, self.held)
 
     @cached_property
     def _points(self) -> NDArray:

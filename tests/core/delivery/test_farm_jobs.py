@@ -16,7 +16,7 @@ from openjd.model import IntRangeExpr, create_job, decode_job_template, preproce
 from pxr import Tf
 
 from ssilk_core.delivery.bake import BakeRequest, BakeResult, BakeTask, FrameSpan, Verification, plan_layers
-from ssilk_core.delivery.bake.inputs import InputHashes
+from ssilk_core.delivery.bake.inputs import InputContents, InputFiles, InputHashes
 from ssilk_core.delivery.bake.layered import in_levels
 from ssilk_core.delivery.bake.naming import file_name, pattern_name, prim_name
 from ssilk_core.delivery.bake.record import (
@@ -270,7 +270,7 @@ def test_a_template_passes_the_specification(device, gpu):
     assert [dependency.dependsOn for dependency in check.dependencies] == ["Bake"]
 
 
-def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over():
+def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over(monkeypatch):
     over = {"vest": (), "coat": ("vest",), "cape": ("vest", "coat"), "hat": ()}
     tasks = [
         replace(TASK, garment=name, shot=shot, over=names) for shot in ("walk", "run") for name, names in over.items()
@@ -288,6 +288,7 @@ def test_outer_garments_come_in_steps_after_those_that_they_are_certified_over()
     circle = [replace(TASK, garment="a", over=("b",)), replace(TASK, garment="b", over=("a",))]
     assert in_levels(circle) == [circle]  # each fails with a sentence
     # Steps count the tasks of the job as it was submitted, in whatever order they came.
+    monkeypatch.setattr(InputFiles, "contents", lambda self, name, path: InputContents(((path, "0"),)))
     backwards = submitted(tasks[::-1], lambda event: None).tasks
     assert [task.name for task in backwards] == [task.name for level in in_levels(tasks[::-1]) for task in level]
     assert {task.name for task in backwards[: len(levels[0])]} == {task.name for task in levels[0]}

@@ -220,6 +220,18 @@ def test_a_model_that_keeps_all_is_the_whole_one(reducer, file):
     assert found.file is file and found.size == WHOLE and found.rms == found.largest == 0
 
 
+def test_what_is_held_stays_with_all_that_it_hangs_from(reducer, file, motion):
+    scene = reducer.scene
+    last = scene.joint_names[reducer.order[0]]  # which goes first otherwise
+    held = Reducer(file, [motion], held=[last])
+    above = {name for name in scene.rig.joint_names if last == name or last.startswith(f"{name}/")}
+    size = ModelSize(shapes=2, joints=0, influences=2)
+    found = held.reduce(size)
+    assert set(found.file.scene.rig.joint_names) == above
+    assert found.size == held.allowed(size) == replace(size, joints=len(above))
+    assert held.predict_error(size) == pytest.approx(held.predict_error(found.size))
+
+
 def test_a_stepper_that_sees_the_smaller_cloth_goes_its_own_way_a_little(scene, toy_model, motion):
     """Its states are not quite the whole model's, of which the loss is told."""
     file = model_file(toy_model(scene, scale=0.1, shapes=6).eval(), FABRICS["silk"], {})

@@ -27,6 +27,7 @@ from .trial import allowed_seconds, tried
 
 Reader = TypeVar("Reader", bound=Callable[..., Any])
 StageLike: TypeAlias = str | Path | Usd.Stage
+LONGEST_QUOTE = 200  # characters of a damaged file that are told
 USD_SUFFIXES = (*LAYER_SUFFIXES, ".usdz")
 # Readers traverse instance proxies, because a referenced character may be instanceable.
 PRIMS = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
@@ -83,8 +84,11 @@ def _allowed() -> str:
 
 
 def usd_reason(error: Tf.ErrorException) -> str:
-    """Return the first message of a USD error on one line."""
-    return " ".join(error.args[0].commentary.split()) if error.args else "unknown reason"
+    """Return the first message of a USD error on one line; of a line of a file that it quotes, the beginning."""
+    if not error.args:
+        return "unknown reason"
+    says, quote, quoted = " ".join(error.args[0].commentary.split()).partition("'")
+    return f"{says}{quote}{quoted[:LONGEST_QUOTE]}..." if len(quoted) > LONGEST_QUOTE else says + quote + quoted
 
 
 @needs_whole_files
@@ -100,6 +104,8 @@ def open_stage(source: StageLike) -> Usd.Stage:
     if isinstance(source, Usd.Stage):
         return source
     file, shapes = split_body(str(source))
+    if Path(file).is_dir():
+        fail(str(source), "this is a folder", "a USD file is needed", "name one of its files")
     if not Path(file).is_file():
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
     if Path(file).suffix == ".safetensors":

@@ -18,6 +18,11 @@ def change_times(attributes: Iterable[Usd.Attribute]) -> list[float]:
     return sorted({time for attribute in attributes for time in _changes(attribute)})
 
 
+def samples_about(attribute: Usd.Attribute, code: float) -> list[float]:
+    """Return the time samples that decide an attribute's value at a time code: two, one, or none at all."""
+    return sorted(set(attribute.GetBracketingTimeSamples(code)))
+
+
 def xform_attributes(prim: Usd.Prim) -> Iterator[Usd.Attribute]:
     """Yield the attributes that place a prim in the world, its own first, up to a reset of the transform stack."""
     while prim and not prim.IsPseudoRoot():

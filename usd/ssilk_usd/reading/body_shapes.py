@@ -20,6 +20,7 @@ from ssilk_core.scene.assets.body_shape import OFF
 
 from ..names import SHAPES_SET
 from ..opening.stage import StageLike, explains_damage, location, open_stage, value
+from ..opening.times import samples_about
 from .carried import carried_by
 from .character import geom_to_core, is_skinned
 from .mesh import is_drawn
@@ -147,7 +148,9 @@ class _Shot:
     def _finite(self, rows: Floats, prim: Usd.Prim) -> Floats:
         bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
         if len(bad):
-            found = f"blendShapeWeights hold NaN or infinity, first at time code {self.codes[bad[0]]:g}"
+            code, attribute = float(self.codes[bad[0]]), UsdSkel.Animation(self.animation).GetBlendShapeWeightsAttr()
+            keys = (key for key in samples_about(attribute, code) if not np.isfinite(attribute.Get(key)).all())
+            found = f"blendShapeWeights hold NaN or infinity, first at time code {next(keys, code):g}"
             fail(location(prim), found, "all must be finite", "repair the animation")
         return rows if len(rows) == len(self.codes) else np.repeat(rows, len(self.codes), axis=0)
 

@@ -18,7 +18,7 @@ from difflib import get_close_matches
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
 
-from ssilk_core.errors import fail
+from ssilk_core.errors import did_you_mean, fail
 from ssilk_core.files import split_location
 from ssilk_core.scene.assets import Floats, Ints, Motion, Scene
 from ssilk_core.scene.held_parts import hand_pose
@@ -26,12 +26,15 @@ from ssilk_core.scene.kinematics import MAX_HOLD, local_transforms, sample_motio
 
 from ..names import FREE, HOLD, LOOP, POSED
 from ..opening.stage import PRIMS, explains_damage, has_value, listed, location, open_stage
-from ..opening.times import change_times
+from ..opening.times import change_times, samples_about
 from .mesh import is_garment
 from .motion import find_animation, read_motion
 from .skin import match_joints
 
+DIRECTING = FREE, HOLD, LOOP, POSED
 ROUNDING = 1e-6
+MOST_NAMES = 6  # in a message
+NEAR = 0.7  # likeness of names from which on one may be the other misspelt
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,23 +64,25 @@ class SaidDirection:
         free: at each frame of the motion, 0 to 1, shape (F,); None where it is 1 throughout.
         hold: frames that each pose is held.
         parts: those that are held by themselves.
+        unheard: of prims that direct nothing, and may be the garment's with a misspelt name.
     """
 
     free: Floats | None
     hold: int
     parts: tuple[SaidPart, ...] = ()
+    unheard: tuple[str, ...] = ()
 
 
 @explains_damage
 def read_direction(
-    source: str, stage: str, garment: str, motion: Motion, proxies: Sequence[str] = ()
+    source: str, stage: str, garment: Sequence[str], motion: Motion, proxies: Sequence[str] = ()
 ) -> SaidDirection:
     """Return how a garment is directed over a motion.
 
     Args:
         source: of the motion, "file[:/Prim/Path]".
         stage: the character's file.
-        garment: path of the garment in it.
+        garment: paths by which the garment is known, that in the stage first; without any nothing is said.
         proxies: of the model, joint paths.
 
     Raises:
@@ -93,7 +98,8 @@ def read_direction(
     hold = next((prim for prim in prims if has_value(prim, HOLD)), None)
     seconds = (motion.start + np.arange(motion.frame_count)) / motion.fps
     parts = tuple(_parts(prims, seconds, {name.rpartition("/")[2] for name in proxies}))
-    return SaidDirection(_free(free, seconds) if free else None, _hold(hold) if hold else 1, parts)
+    unheard = tuple(dict.fromkeys(text for each in (shot, home) for text in _unheard(each, home, garment, prims)))
+    return SaidDirection(_free(free, seconds) if free else None, _hold(hold) if hold else 1, parts, unheard)
 
 
 @explains_damage
@@ -132,7 +138,7 @@ def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, 
 
 
 @explains_damage
-def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
+def read_loop(source: str, stage: str, garment: Sequence[str], motion: Motion) -> bool:
     """Return whether a shot is said to be a cycle; arguments and errors as `read_direction`."""
     file, _ = split_location(source)
     shot, home = open_stage(file), open_stage(stage)  # prims live as long as these
@@ -145,10 +151,11 @@ def read_loop(source: str, stage: str, garment: str, motion: Motion) -> bool:
     return found
 
 
-def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: str, motion: Motion) -> list[Usd.Prim]:
+def _prims(shot: Usd.Stage, home: Usd.Stage, source: str, garment: Sequence[str], motion: Motion) -> list[Usd.Prim]:
     """Return the garment's prims in the shot, then in the character's stage."""
     _, placed = find_animation(shot, split_location(source)[1] or split_location(motion.path)[1], None)
-    return [*_in_shot(shot, garment, placed), *filter(None, [home.GetPrimAtPath(garment)])]
+    there = [prim for path in garment for prim in _in_shot(shot, path, placed)]
+    return list(dict.fromkeys([*there, *filter(None, map(home.GetPrimAtPath, garment))]))
 
 
 def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd.Prim]:
@@ -169,13 +176,35 @@ def _in_shot(shot: Usd.Stage, garment: str, placed: Usd.Prim | None) -> list[Usd
 
 def _refuse_misspelt(prim: Usd.Prim) -> None:
     """Refuse attributes whose names are nearly those that direct a garment: they would direct nothing."""
-    known = FREE, HOLD, LOOP, POSED
     for attribute in prim.GetPropertiesInNamespace("ssilk"):
         name = attribute.GetName()
         base = ":".join(name.split(":", 2)[:2])
-        if base not in known and (near := get_close_matches(base, known, n=1, cutoff=0.88)):
-            allowed = f"{', '.join(known)} direct a garment"
+        if base not in DIRECTING and (near := get_close_matches(base, DIRECTING, n=1, cutoff=0.88)):
+            allowed = f"{', '.join(DIRECTING)} direct a garment"
             fail(location(prim), f"an attribute {name}", allowed, f"did you mean '{near[0]}'?")
+
+
+def _unheard(stage: Usd.Stage, home: Usd.Stage, garment: Sequence[str], prims: Sequence[Usd.Prim]) -> Iterator[str]:
+    """Yield of prims without a type that direct nothing, and whose names are nearly the garment's.
+
+    There is nothing to tell where the stage directs the garment itself: others may be of another character.
+    """
+    leaves = [path.rpartition("/")[2].lower() for path in garment]
+    if any(prim.GetStage() == stage and _directing(prim) for prim in prims):
+        return
+    for prim in stage.TraverseAll():
+        there = home.GetPrimAtPath(prim.GetPath())
+        if prim.GetTypeName() or (there and there.GetTypeName()) or prim in prims or not (said := _directing(prim)):
+            continue
+        if get_close_matches(prim.GetName().lower(), leaves, cutoff=NEAR):
+            text = f"{said[0]} directs nothing; the garment is {garment[0]}, rename the prim if that is meant"
+            yield f"{location(prim)}: {text}"
+
+
+def _directing(prim: Usd.Prim) -> list[str]:
+    """Return the names of a prim's attributes that direct a garment."""
+    names = (attribute.GetName() for attribute in prim.GetPropertiesInNamespace("ssilk"))
+    return [name for name in names if ":".join(name.split(":", 2)[:2]) in DIRECTING]
 
 
 def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Iterator[SaidPart]:
@@ -191,12 +220,21 @@ def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Ite
             values = _keyed(prim, what, seconds)
             vertices = None if name in proxies else _subset(prims, name)
             if name not in proxies and vertices is None:
-                known = f"its proxies are {', '.join(sorted(proxies)[:3])}, ..." if proxies else "it has no proxies"
+                subsets = sorted({child.GetName() for each in prims for child in _subsets(each)})
                 found = f"{what} names neither a proxy of the model nor a subset of the garment"
-                fail(location(prim), found, f"{known}; a UsdGeomSubset may name vertices", "rename it")
+                allowed = f"its subsets: {_named(subsets)}; its proxies: {_named(sorted(proxies))}"
+                fail(location(prim), found, allowed, did_you_mean(name, [*subsets, *proxies]) or "rename it")
             share = values if posed else 1 - values
             if share.any():
                 yield SaidPart(f"{location(prim)}.{what}", name, share, posed, vertices)
+
+
+def _subsets(prim: Usd.Prim) -> list[Usd.Prim]:
+    return [child for child in prim.GetFilteredChildren(PRIMS) if child.IsA(UsdGeom.Subset)]
+
+
+def _named(names: Sequence[str]) -> str:
+    return ", ".join([*names[:MOST_NAMES], *(["..."] if len(names) > MOST_NAMES else [])]) or "none"
 
 
 def _subset(prims: Sequence[Usd.Prim], name: str) -> Ints | None:
@@ -242,10 +280,15 @@ def _keyed(prim: Usd.Prim, name: str, seconds: Floats) -> Floats:
     bad = ~((values >= -ROUNDING) & (values <= 1 + ROUNDING))
     if bad.any():
         at = int(np.argmax(bad))
+        wrong, code = float(values[at]), float(codes[at])
+        for key in samples_about(attribute, code):  # what somebody has keyed, in place of what is made of it
+            if not 0 <= (keyed := float(attribute.Get(key))) <= 1:
+                wrong, code = keyed, key
+                break
         held = "held to linear blend skinning, to 1, free"
         ends = "the network's, to 1, posed by hand" if name.startswith(POSED) else held
         allowed = f"0, {ends}, are allowed"
-        fail(location(prim), f"{name} is {values[at]:g} at time code {codes[at]:g}", allowed)
+        fail(location(prim), f"{name} is {wrong:g} at time code {code:g}", allowed)
     return np.broadcast_to(values.clip(0, 1), seconds.shape)
 
 

@@ -190,7 +190,8 @@ def _parents(joints: tuple[str, ...], where: str) -> Ints:
     need_unique(joints, where)
     broken = next((name for name in joints if not Sdf.Path.IsValidPathString(name)), None)
     if broken is not None:
-        fail(where, f"joint '{broken}' is not a path", "joints are paths like 'Hips/Spine'", "rename it")
+        allowed = "joints are paths of letters, digits and _, like 'Hips/Spine'"
+        fail(where, f"joint '{broken}' is not a path", allowed, "rename it")
     topology = UsdSkel.Topology(joints)
     valid, reason = topology.Validate()
     if not valid:

@@ -66,13 +66,16 @@ class LeftOut:
         return "; ".join(f"{mesh} loses {', '.join(names)}" for mesh, names in self.names.items())
 
 
-def look_source(mesh: Mesh, stage: Usd.Stage) -> LookSource | None:
+def look_source(mesh: Mesh, stage: Usd.Stage, root: str | None = None) -> LookSource | None:
     """Return the prim of a stage that a mesh was read from, or is of the same polygons as; None without one.
+
+    Where a root is named, it is a prim below that.
 
     A garment that was trained from another file is found by its polygons, those marked as garments and those of its
     name first.
     """
-    return next(_look_sources(mesh, stage), None)
+    sources = _look_sources(mesh, stage)
+    return next((each for each in sources if not root or each.prim.GetPath().HasPrefix(root)), None)
 
 
 def stiff_otherwise(mesh: Mesh, stage: Usd.Stage) -> str | None:
