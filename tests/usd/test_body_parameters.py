@@ -187,13 +187,25 @@ def test_what_the_body_cannot_be_is_refused(hero, shapes, told):
     assert str(refused.value).startswith(f"{hero}:{shapes}: {told}")
 
 
-MALFORMED = {
-    "weightRange": (Sdf.ValueTypeNames.Float2, (0.5, 1), r"weightRange is \(0.5, 1\); a range holds 0"),
-    "jointOffsets": (Sdf.ValueTypeNames.Vector3fArray, [(0, 1, 0)], "1 ssilk:jointOffsets.* for 0 ssilk:offset"),
-}
+def test_the_ends_of_a_range_are_allowed_as_they_were_written(hero):
+    """A float2 stores 0.35 as 0.349999994, and -0.2 as -0.200000003."""
+    stage = Usd.Stage.Open(hero)
+    say(stage.GetPrimAtPath("/Hero/Body/wide"), "weightRange", Sdf.ValueTypeNames.Float2, (-0.2, 0.35))
+    stage.Save()
+    wide = body_parameters(open_stage(hero))["wide"]
+    assert (wide.low, wide.high) == (-0.2, 0.35)
+    for end in ("-0.2", "0.35"):
+        assert open_stage(f"{hero}:wide={end}")
 
 
-@pytest.mark.parametrize(("name", "kind", "value", "told"), [(name, *each) for name, each in MALFORMED.items()])
+MALFORMED = (
+    ("weightRange", Sdf.ValueTypeNames.Float2, (0.5, 1), r"weightRange is \(0.5, 1\); a range holds 0"),
+    ("weightRange", Sdf.ValueTypeNames.Float, 2.0, "weightRange is 2.0; a float2 is needed"),
+    ("jointOffsets", Sdf.ValueTypeNames.Vector3fArray, [(0, 1, 0)], "1 ssilk:jointOffsets.* for 0 ssilk:offset"),
+)
+
+
+@pytest.mark.parametrize(("name", "kind", "value", "told"), MALFORMED)
 def test_malformed_marks_are_refused(hero, name, kind, value, told):
     stage = Usd.Stage.Open(hero)
     say(stage.GetPrimAtPath("/Hero/Body/wide"), name, kind, value)

@@ -290,7 +290,12 @@ def _said(shape: Usd.Prim) -> BodyParameter:
         attribute.Get() if shape and (attribute := shape.GetAttribute(name)) else None
         for name in (WEIGHT_RANGE, OFFSET_JOINTS, JOINT_OFFSETS)
     )
-    low, high = USUAL_RANGE if given is None else map(float, given)
+    bounds = USUAL_RANGE if given is None else given
+    if np.shape(bounds) != (2,):
+        allowed = "a float2 is needed, the least weight and the most"
+        fail(_where(shape), f"{WEIGHT_RANGE} is {bounds}", allowed, "mend it")
+    # As they were written: 0.35, and not the 0.349999994 that a float2 stores.
+    low, high = (float(str(np.float32(bound))) for bound in bounds)
     if not (np.isfinite([low, high]).all() and low <= 0 <= high and low < high):
         allowed = "a range holds 0, the body without the shape"
         fail(_where(shape), f"{WEIGHT_RANGE} is ({low:g}, {high:g})", allowed, "mend it")
