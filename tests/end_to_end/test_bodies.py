@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 
@@ -762,12 +762,18 @@ def test_a_garment_is_put_onto_a_body_by_shapes(shapes, capsys):
 
 def test_a_body_by_shapes_is_baked_as_its_stage_is_and_the_motion_is_played_between_its_bones(shapes, capsys):
     member_clip("tall_clip.usda", 1.15)
+    stage = Usd.Stage.Open("shapes.usda")
+    red = UsdShade.Material.Define(stage, "/Hero/Red")
+    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/Hero/Body")).Bind(red)
+    stage.Save()
     assert run("bake family.safetensors --motion tall_clip.usda --stage taller.usda -o by_stage.usda") == 0
     capsys.readouterr()
     assert run("bake family.safetensors --motion clip.usda --stage shapes.usda:taller=1 -o by_shapes.usda") == 0
     told = capsys.readouterr()
     assert "are played between this one's bones" in told.out + told.err
     assert "a body of the model's family, that of taller.usda:/Hero" in told.out + told.err
+    bound = UsdShade.MaterialBindingAPI(Usd.Stage.Open("by_shapes.usda").GetPrimAtPath("/Hero/Body"))
+    assert bound.ComputeBoundMaterial()[0].GetPath().name == "Red"
     found, farther = shown("by_shapes.usda", 12), 0.15 * 0.2 * np.sin(12 / 7)  # the hub's way grows with the legs
     for name, points in shown("by_stage.usda", 12).items():
         np.testing.assert_allclose(found[name], points + [farther, 0, 0], atol=1e-3)
