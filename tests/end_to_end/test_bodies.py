@@ -27,6 +27,7 @@ from ssilk_core.physics.intersections.layers import ClothLayers
 from ssilk_core.scene.kinematics import bind_pose, invert_rigid
 from ssilk_core.training.wardrobe.listing import read_list
 
+from .test_riders import add_rider, disc_on
 from .test_shaped_bodies import add_shape
 from .test_skeletons import JOINTS as OTHER_JOINTS
 from .test_skeletons import put_on, stretch_in, write_clip, write_other
@@ -812,6 +813,25 @@ def test_a_hand_poses_proxies_of_a_body_by_shapes_about_where_these_are(shapes):
     for parts in (each.direction.parts for each in held):
         hand = parts.hand[:, number - scenes[0].character.skeleton.joint_count, :3, 3]
         np.testing.assert_allclose(hand, np.tile(binds[1][:3, 3] + [0.1, -0.2, 0.3], (len(hand), 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_what_rides_on_a_garment_goes_along_to_a_body_by_shapes(shapes, soft):
+    """It lies in the stage as on the stage's own body: a button of 1 cm, beneath the cloth of the heavier one."""
+    request = BakeRequest(model="family.safetensors", stage="shapes.usda:heavier=1", motion="clip.usda")
+    own, its = (load_garment(replace(request, stage=stage)).deformer.scene.garment.mesh
+                for stage in ("shapes.usda", request.stage))  # fmt: skip
+    face = int(np.linalg.norm(its.points - own.points, axis=1)[own.faces].mean(axis=1).argmax())
+    points, foot = disc_on(own, face, np.full(3, 1 / 3), 0.01)
+    home = Usd.Stage.Open("shapes.usda")
+    rider = add_rider(home, "/Hero/Button", points)
+    if soft:
+        rider.CreateAttribute("ssilk:rideSoft", Sdf.ValueTypeNames.Bool).Set(True)
+    home.Save()
+    ((mesh,),) = (each.meshes for each in load_garment(request).riders)
+    there = its.points[its.faces[face]].mean(axis=0)
+    assert np.linalg.norm(there - foot) > 0.02
+    np.testing.assert_allclose(np.linalg.norm(mesh.points - there, axis=1).max(), 0.01, atol=4e-3)
 
 
 def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):

@@ -13,7 +13,7 @@ import numpy as np
 from ...devices import select_device
 from ...errors import fail
 from ...events import Event, Message
-from ...files import split_location
+from ...files import split_body, split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
@@ -430,7 +430,13 @@ def _on_stage(
     stage = open_stage(request.stage)
     on = worn(file, stage, request.root)
     told: list[Event] = [*on.told, *_stiffened(on.scene.garment.mesh, stage)]
-    riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event))
+    own = split_body(split_location(request.stage)[0])[0]
+
+    def laid() -> Mesh:
+        return worn(file, open_stage(own), request.root).scene.garment.mesh
+
+    shaped = laid if shapes_of(request.stage) else None
+    riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event), shaped)
     return on, _units(stage, request.receiver), riders, tuple(told)
 
 
