@@ -56,8 +56,10 @@ def executed(node: ast.AST, without: type[ast.AST] | tuple[()] = ()) -> Iterator
     waiting = [node]
     while waiting:
         yield (one := waiting.pop())
+        if isinstance(one, ast.expr | ast.Import | ast.ImportFrom):  # which hold no statements
+            continue
         for child in reversed(list(ast.iter_child_nodes(one))):
-            if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
                 continue
             if not isinstance(child, without):
                 waiting.append(child)
@@ -68,7 +70,22 @@ def loaded(node: ast.AST) -> Iterator[ast.AST]:
     yield from executed(node, without=ast.FunctionDef)
 
 
+def written(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield all statements, wherever they are."""
+    waiting = [node]
+    while waiting:
+        yield (one := waiting.pop())
+        if not isinstance(one, ast.expr | ast.Import | ast.ImportFrom):
+            waiting.extend(ast.iter_child_nodes(one))
+
+
 Nodes = Callable[[ast.AST], Iterator[ast.AST]]
+
+
+@cache
+def parsed(code: str) -> ast.Module:
+    """Return a module's code as a tree, which nobody changes; several tests look at each."""
+    return ast.parse(code)
 
 
 def imports(path: Path, package: tuple[str, ...], nodes: Nodes = executed) -> Iterator[tuple[str, ...]]:
@@ -78,7 +95,7 @@ def imports(path: Path, package: tuple[str, ...], nodes: Nodes = executed) -> It
 
 @cache
 def _imports(code: str, package: tuple[str, ...], nodes: Nodes) -> tuple[tuple[str, ...], ...]:
-    return tuple(_each_import(ast.parse(code), package, nodes))
+    return tuple(_each_import(parsed(code), package, nodes))
 
 
 def _each_import(code: ast.AST, package: tuple[str, ...], nodes: Nodes) -> Iterator[tuple[str, ...]]:
@@ -94,7 +111,7 @@ def _each_import(code: ast.AST, package: tuple[str, ...], nodes: Nodes) -> Itera
 def public_classes(folder: Path) -> Iterator[tuple[str, str]]:
     """Yield the name of each public class at the top of a module under a folder, and the module's path."""
     for path, _ in modules(folder):
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        for node in parsed(path.read_text(encoding="utf-8")).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 yield node.name, str(path.relative_to(ROOT))
 
@@ -116,7 +133,7 @@ def resolved(target: tuple[str, ...], home: Path) -> tuple[str, ...]:
     raise AssertionError(target)
 
 
-def graph(home: Path, nodes: Nodes = ast.walk) -> dict[str, set[str]]:
+def graph(home: Path, nodes: Nodes = written) -> dict[str, set[str]]:
     """Return the modules of a package, and which others of it each imports, by default anywhere in its code."""
     found: dict[str, set[str]] = {}
     for path, package in modules(home):
@@ -210,14 +227,14 @@ def test_circles_of_modules_and_of_folders_are_found(tmp_path):
 
 @pytest.mark.parametrize(("path", "package"), modules(CORE), ids=lambda value: getattr(value, "stem", None))
 def test_imports_within_the_core_are_relative(path, package):
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in written(parsed(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
             assert node.level or (node.module or "").split(".")[0] != "ssilk_core", ast.unparse(node)
 
 
 @pytest.mark.parametrize(("path", "package"), modules(USD), ids=lambda value: getattr(value, "stem", None))
 def test_usd_needs_little_of_the_core(path, package):
-    for nodes, allowed in ((ast.walk, USED_BY_USD), (executed, RUN_BY_USD)):
+    for nodes, allowed in ((written, USED_BY_USD), (executed, RUN_BY_USD)):
         for target in imports(path, package, nodes):
             assert target[0] not in ("torch", "bpy"), target
             assert target[0] != "ssilk_core" or allowed & {target[1], ".".join(target[1:3])}, target
@@ -269,7 +286,7 @@ def defined(path: Path) -> set[str]:
 @cache
 def _defined(code: str) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(code)):
+    for node in ast.walk(parsed(code)):
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             found.add(node.name)
         elif isinstance(node, ast.Import | ast.ImportFrom):

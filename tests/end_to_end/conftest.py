@@ -149,6 +149,22 @@ def glb_world(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def graphs(monkeypatch: pytest.MonkeyPatch) -> dict[str, dict[str, torch.Tensor]]:
+    """The numbers of what `ssilk export` writes, by the name of the file; the graph itself, which takes seconds, is
+    looked at in `tests/core/network/test_export.py`."""
+    from ssilk_core.network.model import export
+
+    written: dict[str, dict[str, torch.Tensor]] = {}
+
+    def keep(model: torch.nn.Module, path: Path) -> None:
+        written[path.name] = {name: value.clone() for name, value in export.FrameNetwork(model).state_dict().items()}
+        path.touch()
+
+    monkeypatch.setattr(export, "export_onnx", keep)
+    return written
+
+
+@pytest.fixture
 def copy(world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the module's `world`, the current folder."""
     shutil.copytree(world, tmp_path, dirs_exist_ok=True)

@@ -126,7 +126,7 @@ def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     assert Path("bundle/layers/shots/b/shot.usda").is_file() and Path("bundle/layers/shots/c/shot.usda").is_file()
     assert not Path("bundle/layers/shots/a").exists()
     Path("a.usda").write_bytes(whole)
-    again = openjd_run(chunk=2)
+    again = openjd_run(chunk=3)
     assert again.returncode == 0 and again.stdout.count("current True") == 2, again.stdout
     assert "Session ended successfully" in again.stdout and "openjd_progress: 100.0" in again.stdout, again.stdout
     assert set(layers("bundle/layers")) == {

@@ -29,12 +29,14 @@ from ssilk_core.scene.kinematics import matrix_from_quaternion, motion_transform
 
 onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: the extra 'dev' brings it")
 
-FRAMES = 20
+FRAMES, POINTS = 20, 5
+NOTHING = [0.0, 0, 0, 1, -1]  # the proximity of a point that nothing is near
 
 
 @pytest.fixture(scope="module")
 def model(scene, toy_model):
-    return toy_model(scene, scale=0.1, translations=True).eval()
+    """Its proxies move, and it sees colliders: of all networks it has the most inputs and outputs."""
+    return toy_model(scene, scale=0.1, translations=True, proximity_points=POINTS).eval()
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +86,8 @@ def played(session, model, shots, near=None) -> list[np.ndarray]:
 @pytest.mark.parametrize("count", [1, 3])
 def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, count):
     motions = [toy_motion(scene, 2 * FRAMES).clip(4 * shot, 4 * shot + FRAMES) for shot in range(count)]
-    weights, rotations, translations = played(exported[0], model, motion_inputs(model, motions))
+    near = np.tile(NOTHING, (FRAMES, count, POINTS, 1))
+    weights, rotations, translations, _ = played(exported[0], model, motion_inputs(model, motions), near)
     for shot, motion in enumerate(motions):
         (expected,) = garment_poses(model, motion, motion.fps)
         np.testing.assert_allclose(weights[:, shot], expected.weights, atol=2e-5)
@@ -117,30 +120,24 @@ def test_what_goes_in_and_comes_out_is_told(exported, model):
     assert session.get_outputs()[1].shape[1] == told["weights"] == model.config.shapes + 1
 
 
-def test_a_network_that_sees_colliders_is_exported_and_where_it_sees_them_told(
-    scene, toy_model, toy_motion, tmp_path, capsys
-):
-    seeing = toy_model(scene, scale=0.1, proximity_points=5).eval()
-    save_model(tmp_path / "toy.safetensors", model_file(seeing, FABRICS["silk"], {}))
-    assert main(["export", str(tmp_path / "toy.safetensors"), "-o", str(tmp_path / "toy.onnx"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out.splitlines()[-1])["detail"]
-    assert told["sees colliders at vertices"] == proximity_vertices(scene, seeing.config).tolist()
+def test_colliders_are_seen_and_where_they_are_is_told(exported, model, scene, toy_motion):
+    session, told = exported
+    assert told["sees colliders at vertices"] == proximity_vertices(scene, model.config).tolist()
     assert told["and up to [m]"] == pytest.approx(proximity_reach(scene))
-    session = onnxruntime.InferenceSession(tmp_path / "toy.onnx", providers=["CPUExecutionProvider"])
-    assert next(each.shape[1] for each in session.get_inputs() if each.name == "static") == told["static descriptors"]
     plain = toy_motion(scene, FRAMES)
     dice = np.random.default_rng(4)
-    away = dice.normal(size=(FRAMES, 5, 3))
+    away = dice.normal(size=(FRAMES, POINTS, 3))
     away /= np.linalg.norm(away, axis=2, keepdims=True)
-    near = np.concatenate([away, dice.uniform(-0.1, 0.1, (FRAMES, 5, 1)), dice.normal(size=(FRAMES, 5, 1))], axis=2)
-    nothing, found = np.tile([0.0, 0, 0, 1, -1], (FRAMES, 5, 1)), []
+    depth, plane = dice.uniform(-0.1, 0.1, (FRAMES, POINTS, 1)), dice.normal(size=(FRAMES, POINTS, 1))
+    near, found = np.concatenate([away, depth, plane], axis=2), []
+    nothing = np.tile(NOTHING, (FRAMES, POINTS, 1))
     for values in (nothing, near):
         motion = replace(plain, proximity=values)
-        weights, *_, resting = played(session, seeing, motion_inputs(seeing, [motion]), values[:, None])
+        weights, *_, resting = played(session, model, motion_inputs(model, [motion]), values[:, None])
         found.append(weights[:, 0])
-        (expected,) = garment_poses(seeing, motion, motion.fps)
+        (expected,) = garment_poses(model, motion, motion.fps)
         np.testing.assert_allclose(found[-1], expected.weights, atol=2e-5)
-        own = RestingPoints(Player(model_file(seeing, FABRICS["silk"], {})))(plain)
+        own = RestingPoints(Player(model_file(model, FABRICS["silk"], {})))(plain)
         hub = scene.character.skeleton.hub
         roots = motion_transforms(plain, scene.character.skeleton.parents)[:, hub, :3, 3]
         np.testing.assert_allclose(resting[:, 0] + roots[:, None], own, atol=1e-5)

@@ -16,7 +16,7 @@ from ssilk_core.network.descriptors import pose_features, six_d
 from ssilk_core.network.feedback import feedback_size
 from ssilk_core.network.model.batch import BatchPlayer, motion_inputs
 from ssilk_core.network.model.descriptors import motion_descriptors, turned_vectors
-from ssilk_core.network.model.export import export_onnx
+from ssilk_core.network.model.export import INPUTS, FrameNetwork, export_onnx
 from ssilk_core.network.model.network import GarmentModel
 from ssilk_core.network.parameters import descriptor_sizes, parameter_shapes
 from ssilk_core.network.rollout import decode, garment_poses
@@ -176,20 +176,31 @@ def test_a_file_holds_what_the_decoder_gives(model, scene, toy_motion, tmp_path)
 
 @pytest.mark.parametrize("kind", ["paper", "points beside proxies"])
 def test_an_engine_plays_the_graph_alike(calm, scene, toy_motion, tmp_path, kind):
+    """The paper's own graph is played as PyTorch's: the one with points has its operations, and exports take long."""
     onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: the extra 'dev' brings it")
     model, motion = calm(kind), toy_motion(scene, 20)
-    export_onnx(model, tmp_path / "paper.onnx")
-    session = onnxruntime.InferenceSession(tmp_path / "paper.onnx", providers=["CPUExecutionProvider"])
+    network, names = FrameNetwork(model), list(INPUTS)
+    if model.feedback.count:
+        export_onnx(model, tmp_path / "paper.onnx")
+        session = onnxruntime.InferenceSession(tmp_path / "paper.onnx", providers=["CPUExecutionProvider"])
+        names = [each.name for each in session.get_inputs()]
+        assert session.get_inputs()[0].shape[1] == network.state_size
+    assert ("matrices" in names) == (model.feedback.count > 0)
+
+    def step(given: dict[str, np.ndarray]) -> list[np.ndarray]:
+        if model.feedback.count:
+            return session.run(None, given)
+        return [each.numpy() for each in network(**{name: torch.as_tensor(value) for name, value in given.items()})]
+
     shots, static = motion_inputs(model, [motion]), descriptor_sizes(scene, model.joints, model.config)[0]
-    sizes = {each.name: each.shape[1] for each in session.get_inputs()}
-    assert ("matrices" in sizes) == (model.feedback.count > 0)
-    before = now = np.zeros((1, sizes["before"]), np.float32)
+    before = now = np.zeros((1, network.state_size), np.float32)
     weights = []
     for frame, pose in enumerate(shots.pose.numpy()):
         given = {"before": before, "now": now, "static": pose[:, :static], "rates": pose[:, static:]}
         body = {"matrices": np.moveaxis(shots.character[frame].numpy(), -1, 0), "bend": shots.bend[frame].numpy().T}
-        given |= {name: value for name, value in body.items() if name in sizes}
-        state, found, *_ = session.run(None, given | {"begins": np.full((1, 1), frame < 2)})
+        given |= {name: value for name, value in body.items() if name in names}
+        with torch.no_grad():
+            state, found, *_ = step(given | {"begins": np.full((1, 1), frame < 2)})
         before, now = now, state
         weights.append(found[0])
     (expected,) = garment_poses(model, motion, motion.fps)

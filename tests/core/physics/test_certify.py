@@ -23,12 +23,12 @@ from ssilk_core.scene.assets import LOOSE, Body, Garment, Mesh, ProxyRig, Scene,
 N, SIDE = 16, 0.16  # cells along a sheet, and its length [m]
 
 
-def sheet() -> tuple[np.ndarray, np.ndarray]:
-    """A square around the origin in the plane z = 0, two triangles in each cell."""
-    y, x = (np.mgrid[: N + 1, : N + 1] / N - 0.5) * SIDE
-    a = (np.arange(N)[:, None] * (N + 1) + np.arange(N)).reshape(-1)
+def sheet(n: int = N) -> tuple[np.ndarray, np.ndarray]:
+    """A square around the origin in the plane z = 0, two triangles in each of n x n cells."""
+    y, x = (np.mgrid[: n + 1, : n + 1] / n - 0.5) * SIDE
+    a = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).reshape(-1)
     points = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
-    return points, np.concatenate([np.c_[a, a + 1, a + N + 1], np.c_[a + 1, a + N + 2, a + N + 1]])
+    return points, np.concatenate([np.c_[a, a + 1, a + n + 1], np.c_[a + 1, a + n + 2, a + n + 1]])
 
 
 def skin_of(path: str, count: int) -> SkinWeights:
@@ -188,7 +188,7 @@ def test_cloth_that_a_limb_came_through_is_lifted_off_it(scene):
 
 
 def test_cloth_between_plates_without_room_is_told_and_kept(scene):
-    points, faces = sheet()
+    points, faces = sheet(6)
     near = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * 0.35 * SIDE - [0, 0, 0.01]
     plates, square = np.concatenate([near, near + [0, 0, 0.02]]), np.array([[0, 1, 2], [0, 2, 3]])
     body = Mesh("/plates", plates, np.concatenate([square, square[:, ::-1] + len(near)]))  # both face the cloth

@@ -26,13 +26,17 @@ def sheet(count: int, size: float) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
-@pytest.fixture
-def mesh() -> Mesh:
-    """Two sheets, 10 cm wide and 1 m apart."""
-    points, faces = sheet(4, 0.1)
+def sheets(count: int) -> Mesh:
+    """Two sheets of 2 count^2 triangles, 10 cm wide and 1 m apart."""
+    points, faces = sheet(count, 0.1)
     return Mesh(
         "/sheets", np.concatenate([points, points + [0, 0, 1.0]]), np.concatenate([faces, faces + len(points)])
     )
+
+
+@pytest.fixture
+def mesh() -> Mesh:
+    return sheets(4)
 
 
 def contours_of(mesh: Mesh, kind: int = LOOSE, device: torch.device = CPU) -> IntersectionContours:
@@ -94,17 +98,18 @@ def test_cloth_leaves_the_other_by_the_shortest_way(mesh) -> None:
 
 
 @pytest.mark.parametrize("steep", [True, False])
-def test_the_kernel_is_the_reference(mesh, monkeypatch, steep) -> None:
+def test_the_kernel_is_the_reference(monkeypatch, steep) -> None:
     pytest.importorskip("triton")
     from ssilk_core.physics.kernels import contours as kernel
 
     monkeypatch.setattr(kernel, "TILE", 8)
     monkeypatch.setattr(kernel, "SLOTS", 256)
-    frames = [crossing(mesh, seed, 2e-3 if steep else 2e-2) for seed in range(3)]
+    mesh = sheets(3)  # a few tiles: the interpreter is slow
+    frames = [crossing(mesh, seed, 2e-3 if steep else 2e-2) for seed in range(2)]
     x = torch.tensor(np.stack([mesh.points, *frames], axis=2))
     reference = x.clone().requires_grad_()
     expected = contours_of(mesh).lengths(reference)
-    weights = torch.tensor([1.0, 2, 3, 4])
+    weights = torch.tensor([1.0, 2, 3])
     (expected * weights).sum().backward()
     monkeypatch.setattr(kernels, "available", lambda device: True)
     own = x.float().to(DEVICE).requires_grad_()
