@@ -239,7 +239,9 @@ def _matrices(values: Floats) -> Vt.Matrix4dArray:
 
 
 def _skin(query: UsdSkel.SkinningQuery, joints: Sequence[str], offsets: Mapping[str, Floats]) -> _Skin | None:
-    """Return a mesh with what moves it; None where that is malformed, which readers of it tell."""
+    """Return a mesh with what moves it; None where no joint does, or that is malformed, which readers of it tell."""
+    if not query.HasJointInfluences():
+        return None
     mesh = UsdGeom.Mesh(query.GetPrim())
     points = np.array(mesh.GetPointsAttr().Get(EARLIEST) or [], dtype=np.float64).reshape(-1, 3)
     given = query.ComputeVaryingJointInfluences(len(points), EARLIEST)
