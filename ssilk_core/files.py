@@ -151,11 +151,11 @@ def split_location(text: str) -> tuple[str, str | None]:
 def split_body(text: str) -> tuple[str, str]:
     """Split "file[:SHAPE=WEIGHT,...]", a body of a stage, into the file and its shapes ("" without any).
 
-    A path of a prim after it stays with the file: `split_location` goes first.
+    Names of shapes may have colons, as namespaces do. A path of a prim after it stays with the file: `split_location`
+    goes first.
     """
-    file, colon, shapes = text.rpartition(":")
-    named = bool(colon) and "=" in shapes and "/" not in shapes and Path(file).suffix in USD_NAMES
-    return (file, shapes) if named else (text, "")
+    found = re.fullmatch(rf"(.*?[^/](?:{'|'.join(map(re.escape, USD_NAMES))})):([^/]*=[^/]*)", text, flags=re.DOTALL)
+    return (found[1], found[2]) if found else (text, "")
 
 
 def need_writable(target: str | Path) -> None:

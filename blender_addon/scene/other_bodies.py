@@ -9,7 +9,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ssilk_core.files import split_location
+from ssilk_core.files import split_body, split_location
 
 from ..arrays.joints import Joints
 from ..arrays.try_on import member_points
@@ -76,13 +76,13 @@ def points_of_stage(scene: GatheredScene, path: str) -> list[np.ndarray]:
     """Return where the character of a stage has the points of a scene's bodies [m], shape (V, 3) each.
 
     Args:
-        path: of the file, which may begin with "//" and end with ":/Root".
+        path: of the file, which may begin with "//" and end with ":SHAPE=WEIGHT,..." or ":/Root".
 
     Raises:
         SsilkError: there is no such file, or none that can be read; its character is none of the family.
     """
     file, root = split_location(bpy.path.abspath(path))
-    if not path or not Path(file).is_file():
+    if not path or not Path(split_body(file)[0]).is_file():
         raise SetupError(f"There is no file '{file}'; choose the stage of another character of the family.")
     expose_usd()
     from ssilk_usd.reading.character import read_character

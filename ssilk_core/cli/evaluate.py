@@ -283,7 +283,8 @@ def _listed(options: argparse.Namespace) -> ListedClips:
 
     folder: Path = options.motions
     if not folder.is_dir():
-        fail(str(folder), "there is no such folder", "one of motion files is needed")
+        found = "a file, and no folder" if folder.exists() else "there is no such folder"
+        fail(str(folder), found, "a folder of motion files is needed")
     files = {path.stem: path for path in motion_files([folder])}
     index = read_index(options.index) if options.index else []
     splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}

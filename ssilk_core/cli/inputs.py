@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import did_you_mean, fail
 from ..files import split_body, split_location
-from ..scene.shape_weights import is_shapes
+from ..scene.shape_weights import ALLOWED, is_shapes
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,9 @@ def need_input(named: str, kind: Kind) -> None:
     path = Path(split_body(split_location(named)[0])[0])
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
+    file, colon, rest = named.rpartition(":")
+    if colon and Path(file).is_file():
+        fail(named, f"'{rest}' is neither weights of shapes nor the path of a prim", ALLOWED)
     found, near = f"there is no such {kind.name}", ""
     if path.is_symlink():
         found = "a link that leads to no file"

@@ -235,7 +235,8 @@ class Bench:
 
         folder: Path = self.options.motions
         if not folder.is_dir():
-            fail(str(folder), "there is no such folder", "a folder of motion files is needed")
+            found = "a file, and no folder" if folder.exists() else "there is no such folder"
+            fail(str(folder), found, "a folder of motion files is needed")
         files = {path.stem: path for path in motion_files([folder])}
         names = self.options.clips or list(files)[:CLIPS]
         missing = sorted(set(names) - files.keys())

@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     film = suffix == FILM
     check_output(options.output, *options.shots)
     players = [open_shot(path) for path in options.shots]
-    labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
+    labels = options.label or (captions(options.shots) if len(players) > 1 else [])
     look = _look(options, film)
     props = [props_of(path, report) for path in options.shots]
     if suffix == PAGE:
@@ -80,6 +80,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     report(Result("view", {"picture": str(options.output), "frames": count}))
     return EXIT_OK
+
+
+def captions(shots: Sequence[Path]) -> list[str]:
+    """Return what shots are called: by their files, or by their folders where files have one name, as in layers."""
+    names = [path.stem for path in shots]
+    folders = [path.absolute().parent.name for path in shots]
+    return [folder if names.count(name) > 1 else name for name, folder in zip(names, folders)]
 
 
 def _write_page(

@@ -117,4 +117,6 @@ def _kind(value: Any) -> Hashable:
             *map(_kind, value.own().values()),
             *(each.data_ptr() if isinstance(each, Tensor) else each for each in shared),
         )
+    if not (value is None or isinstance(value, (int, float))):  # a graph would keep what this one holds
+        raise TypeError(f"no graph can be captured of a {type(value).__name__}")
     return value

@@ -200,6 +200,9 @@ def test_a_stage_of_that_body_shows_the_same(ready, tried, tmp_path):
         for role, there in shown_at(ready, tried, share).items():
             assert np.abs(there - (2, 0, 0) - points[role]).max() < 10 * EXACT, (share, role)
     assert sum(thing.get("ssilk_tried_on") is not None for thing in ready.data.objects) == 1
+    tried.ssilk.try_on.stage = f"{stage}:Full=1"  # keys were applied
+    with pytest.raises(RuntimeError, match="its bodies have no blendshapes"):
+        ready.ops.ssilk.try_on()
 
 
 def state_of(bpy: ModuleType) -> list[Any]:

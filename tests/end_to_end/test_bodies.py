@@ -11,21 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdSkel, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.character import read_character
 
 from ssilk_core.cli import main
 from ssilk_core.cli.main import parser as command_line
-from ssilk_core.delivery.bake import worn
+from ssilk_core.delivery.bake import BakeRequest, load_garment, load_rollout, worn
+from ssilk_core.delivery.bake.load import with_model
 from ssilk_core.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE
 from ssilk_core.events import silent
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.physics.intersections.layers import ClothLayers
-from ssilk_core.scene.kinematics import bind_pose
+from ssilk_core.scene.kinematics import bind_pose, invert_rigid
 from ssilk_core.training.wardrobe.listing import read_list
 
+from .test_riders import add_rider, disc_on
 from .test_shaped_bodies import add_shape
 from .test_skeletons import JOINTS as OTHER_JOINTS
 from .test_skeletons import put_on, stretch_in, write_clip, write_other
@@ -760,12 +762,19 @@ def test_a_garment_is_put_onto_a_body_by_shapes(shapes, capsys):
 
 def test_a_body_by_shapes_is_baked_as_its_stage_is_and_the_motion_is_played_between_its_bones(shapes, capsys):
     member_clip("tall_clip.usda", 1.15)
+    stage = Usd.Stage.Open("shapes.usda")
+    red = UsdShade.Material.Define(stage, "/Hero/Red")
+    UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath("/Hero/Body")).Bind(red)
+    stage.Save()
     assert run("bake family.safetensors --motion tall_clip.usda --stage taller.usda -o by_stage.usda") == 0
     capsys.readouterr()
     assert run("bake family.safetensors --motion clip.usda --stage shapes.usda:taller=1 -o by_shapes.usda") == 0
     told = capsys.readouterr()
     assert "are played between this one's bones" in told.out + told.err
     assert "a body of the model's family, that of taller.usda:/Hero" in told.out + told.err
+    stage = Usd.Stage.Open("by_shapes.usda")
+    (body,) = (prim for prim in stage.Traverse() if prim.GetName() == "Body")
+    assert UsdShade.MaterialBindingAPI(body).ComputeBoundMaterial()[0].GetPath().name == "Red"
     found, farther = shown("by_shapes.usda", 12), 0.15 * 0.2 * np.sin(12 / 7)  # the hub's way grows with the legs
     for name, points in shown("by_stage.usda", 12).items():
         np.testing.assert_allclose(found[name], points + [farther, 0, 0], atol=1e-3)
@@ -773,6 +782,54 @@ def test_a_body_by_shapes_is_baked_as_its_stage_is_and_the_motion_is_played_betw
     Path("moved").mkdir()
     shutil.move("shapes.usda", "moved/shapes.usda")
     assert run("verify by_shapes.usda --stage moved/shapes.usda") == 0
+
+
+def test_a_hand_poses_proxies_of_a_body_by_shapes_about_where_these_are(shapes):
+    """The shot has the proxies of the stage's own body: what these are moved by there, they are moved by here."""
+    home, clip = Usd.Stage.Open("shapes.usda"), Usd.Stage.Open("clip.usda")
+    proxy = home.GetPrimAtPath("/Hero/Skirt").GetAttribute("ssilk:proxyJoints").Get()[0]
+    request = BakeRequest(model="family.safetensors", stage="shapes.usda:heavier=1", motion="clip.usda")
+    scenes = [load_rollout(replace(request, stage=stage)).deformer.scene for stage in ("shapes.usda", request.stage)]
+    number = scenes[0].joint_names.index(proxy)
+    parent = int(scenes[0].parents[number])
+    binds = [invert_rigid(each.bind_transforms[parent]) @ each.bind_transforms[number] for each in scenes]
+    animation = UsdSkel.Animation(clip.GetPrimAtPath("/Clip"))
+    animation.GetJointsAttr().Set([*animation.GetJointsAttr().Get(), proxy])
+    animation.GetScalesAttr().Set([Gf.Vec3h(1)] * 4)
+    at = binds[0][:3, 3] + [0.1, -0.2, 0.3]
+    for attribute, value in (
+        (animation.GetRotationsAttr(), Gf.Quatf(0.8, 0.6, 0, 0)), (animation.GetTranslationsAttr(), Gf.Vec3f(*at)),
+    ):  # fmt: skip
+        for code in attribute.GetTimeSamples():
+            attribute.Set([*attribute.Get(code), value], code)
+    over = clip.OverridePrim("/Hero/Skirt")
+    over.CreateAttribute(f"ssilk:posed:{proxy.rpartition('/')[2]}", Sdf.ValueTypeNames.Float).Set(1.0)
+    clip.Save()
+    assert np.abs(binds[1] - binds[0])[:3, 3].max() > 0.02
+    rollout = load_rollout(request)
+    held = [rollout, with_model(rollout, load_garment(request).file)]  # a budget tries smaller models
+    for parts in (each.direction.parts for each in held):
+        hand = parts.hand[:, number - scenes[0].character.skeleton.joint_count, :3, 3]
+        np.testing.assert_allclose(hand, np.tile(binds[1][:3, 3] + [0.1, -0.2, 0.3], (len(hand), 1)), atol=1e-5)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_what_rides_on_a_garment_goes_along_to_a_body_by_shapes(shapes, soft):
+    """It lies in the stage as on the stage's own body: a button of 1 cm, beneath the cloth of the heavier one."""
+    request = BakeRequest(model="family.safetensors", stage="shapes.usda:heavier=1", motion="clip.usda")
+    own, its = (load_garment(replace(request, stage=stage)).deformer.scene.garment.mesh
+                for stage in ("shapes.usda", request.stage))  # fmt: skip
+    face = int(np.linalg.norm(its.points - own.points, axis=1)[own.faces].mean(axis=1).argmax())
+    points, foot = disc_on(own, face, np.full(3, 1 / 3), 0.01)
+    home = Usd.Stage.Open("shapes.usda")
+    rider = add_rider(home, "/Hero/Button", points)
+    if soft:
+        rider.CreateAttribute("ssilk:rideSoft", Sdf.ValueTypeNames.Bool).Set(True)
+    home.Save()
+    ((mesh,),) = (each.meshes for each in load_garment(request).riders)
+    there = its.points[its.faces[face]].mean(axis=0)
+    assert np.linalg.norm(there - foot) > 0.02
+    np.testing.assert_allclose(np.linalg.norm(mesh.points - there, axis=1).max(), 0.01, atol=4e-3)
 
 
 def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):

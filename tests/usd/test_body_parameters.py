@@ -12,8 +12,12 @@ from ssilk_usd.reading.body_shapes import with_body_shapes
 from ssilk_usd.reading.character import read_character
 from ssilk_usd.reading.motion import read_motion
 from ssilk_usd.reading.shown import shown_otherwise
+from ssilk_usd.writing.left_behind import left_behind
+from ssilk_usd.writing.look import as_it_looks
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.files import split_location
+from ssilk_core.scene.assets import Garment
 from ssilk_core.scene.family import with_joints
 
 from .test_read import RECIPES, author
@@ -187,13 +191,25 @@ def test_what_the_body_cannot_be_is_refused(hero, shapes, told):
     assert str(refused.value).startswith(f"{hero}:{shapes}: {told}")
 
 
-MALFORMED = {
-    "weightRange": (Sdf.ValueTypeNames.Float2, (0.5, 1), r"weightRange is \(0.5, 1\); a range holds 0"),
-    "jointOffsets": (Sdf.ValueTypeNames.Vector3fArray, [(0, 1, 0)], "1 ssilk:jointOffsets.* for 0 ssilk:offset"),
-}
+def test_the_ends_of_a_range_are_allowed_as_they_were_written(hero):
+    """A float2 stores 0.35 as 0.349999994, and -0.2 as -0.200000003."""
+    stage = Usd.Stage.Open(hero)
+    say(stage.GetPrimAtPath("/Hero/Body/wide"), "weightRange", Sdf.ValueTypeNames.Float2, (-0.2, 0.35))
+    stage.Save()
+    wide = body_parameters(open_stage(hero))["wide"]
+    assert (wide.low, wide.high) == (-0.2, 0.35)
+    for end in ("-0.2", "0.35"):
+        assert open_stage(f"{hero}:wide={end}")
 
 
-@pytest.mark.parametrize(("name", "kind", "value", "told"), [(name, *each) for name, each in MALFORMED.items()])
+MALFORMED = (
+    ("weightRange", Sdf.ValueTypeNames.Float2, (0.5, 1), r"weightRange is \(0.5, 1\); a range holds 0"),
+    ("weightRange", Sdf.ValueTypeNames.Float, 2.0, "weightRange is 2.0; a float2 is needed"),
+    ("jointOffsets", Sdf.ValueTypeNames.Vector3fArray, [(0, 1, 0)], "1 ssilk:jointOffsets.* for 0 ssilk:offset"),
+)
+
+
+@pytest.mark.parametrize(("name", "kind", "value", "told"), MALFORMED)
 def test_malformed_marks_are_refused(hero, name, kind, value, told):
     stage = Usd.Stage.Open(hero)
     say(stage.GetPrimAtPath("/Hero/Body/wide"), name, kind, value)
@@ -245,3 +261,13 @@ def test_joints_follow_in_whichever_space_a_program_writes_its_bind_pose(tmp_pat
     np.testing.assert_allclose(its.skeleton.rest_transforms[1:], grown.rest_transforms[1:], atol=1e-5)
     turned = [each.skeleton.rest_transforms[0, :3, :3] for each in (its, own)]
     np.testing.assert_allclose(*turned, atol=1e-6)
+
+
+def test_looks_and_what_nobody_writes_are_found_on_a_body_by_shapes(hero):
+    stage = Usd.Stage.Open(hero)
+    UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Eyes")).CreateDisplayColorAttr([Gf.Vec3f(0.5, 0.25, 0)])
+    stage.Save()
+    character = read_character(f"{hero}:tall=1")
+    eyes = next(body.mesh for body in character.bodies if body.mesh.path.endswith("Eyes"))
+    assert as_it_looks(Garment(eyes), split_location(character.path)[0]).colour == pytest.approx((0.5, 0.25, 0))
+    assert left_behind(character, [eyes]) == left_behind(read_character(hero), [eyes]) == ["the Mesh Body"]

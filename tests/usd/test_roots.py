@@ -99,6 +99,21 @@ def test_a_body_that_hangs_from_one_root_is_no_finding():
     assert not list(carried_by_no_joint(read_character(str(DEMO))))
 
 
+MAKEHUMAN = ("root", "root/thigh_L", "root/thigh_L/foot_L", "root/thigh_R", "root/thigh_R/foot_R", "root/spine",
+             "root/spine/head")  # fmt: skip
+
+
+@pytest.mark.parametrize(("height", "hub"), [(0.9, "root"), (0.0, "root/spine")])
+def test_a_joint_without_skin_carries_the_limbs_that_begin_at_it(height, hub):
+    """MakeHuman's root moves no skin: thighs and spine begin a few centimetres from it."""
+    places = np.array(
+        [(0.0, 0, 0), (0.05, 0.9, 0), (0.1, 0.1, 0), (-0.05, 0.9, 0), (-0.1, 0.1, 0), (0, 0.95, 0), (0, 1.7, 0)]
+    )
+    places[0, 1] = height
+    moved = [np.array([0.0, 1, 1, 1, 1, 2, 2])]
+    assert MAKEHUMAN[carrying_joint(moved, np.array(UsdSkel.Topology(MAKEHUMAN).GetParentIndices()), places)] == hub
+
+
 STILL = ("root", "root/pelvis", "root/pelvis/chest", "root/bow", "root/bow/top", "root/bow/bottom")
 
 

@@ -46,7 +46,11 @@ def _of_mesh(body: Body, its: Body) -> list[str]:
     mesh, other = body.mesh, its.mesh
     if other.vertex_count != mesh.vertex_count:
         return [f"{other.path} has {other.vertex_count} points, not {mesh.vertex_count}"]
-    if not np.array_equal(mesh.faces, other.faces):
+    # Polygons, not triangles: which diagonal splits a quad depends on where its points are.
+    counts, theirs = mesh.polygon_counts, other.polygon_counts
+    assert counts is not None and theirs is not None
+    same = np.array_equal(counts, theirs) and np.array_equal(mesh.indices_of_corners, other.indices_of_corners)
+    if not same:
         return [f"the faces of {other.path} join other points"]
     return []
 

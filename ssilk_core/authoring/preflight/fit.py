@@ -18,7 +18,7 @@ from .settle import DEEPEST, FARTHEST, Settled, settle
 
 COLLISION_MARGIN = FABRICS["default"].contact_distance  # [m]
 TOO_DEEP = f"leaves a garment that is more than {1000 * DEEPEST:g} mm deep as it is, because it is not fitted"
-NOT_SETTLED = "leaves this garment as it is, because settling found no shape that is less deep in the body"
+NOT_SETTLED = "leaves this garment as it is, because no shape was found that is less deep in the body"
 PIERCED = (
     "the body goes through the cloth, and settling leaves that part as it is because it would have to move "
     f"cloth by more than {1000 * FARTHEST:g} mm"
@@ -295,7 +295,7 @@ def _not_all(settled: Settled) -> str:
 
 def _why_left(settled: Settled) -> list[str]:
     if not len(settled.pierced):
-        return [] if settled.moved else [_why_still(settled)]
+        return [] if settled.moved else [f"settling {_why_still(settled)}"]
     rest = np.setdiff1d(settled.after.vertices, settled.pierced)
     part = f"at {len(settled.pierced)} of them " if len(rest) else ""
     return [part + PIERCED]

@@ -12,8 +12,8 @@ animated on twos would jerk the cloth otherwise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -48,6 +48,7 @@ class Direction:
         parts: where proxies are held each by itself; None where none is.
         shapes: the blendshapes that this takes; None likewise.
         said: what stages say of these parts.
+        hand_moves: of proxies that are posed by hand, as for `read_hand_pose`.
     """
 
     free: Floats
@@ -57,6 +58,7 @@ class Direction:
     parts: HeldParts | None = None
     shapes: PartShapes | None = None
     said: tuple[SaidPart, ...] = ()
+    hand_moves: Mapping[str, Floats] = field(default_factory=dict)
 
     def of(self, deformer: Deformer) -> Direction:
         """Return it with the blendshapes that a garment takes whose proxies are held each by itself."""
@@ -94,13 +96,19 @@ class Direction:
 
 
 def held_parts(
-    said: Sequence[SaidPart], deformer: Deformer, scene: Scene, request: BakeRequest, motion: Motion
+    said: Sequence[SaidPart],
+    deformer: Deformer,
+    scene: Scene,
+    request: BakeRequest,
+    motion: Motion,
+    moves: Mapping[str, Floats],
 ) -> HeldParts:
     """Return how proxies are held each by itself; a proxy's own value comes before those of groups.
 
     Args:
         scene: of the model, with the proxies' own names, which a target may change.
         motion: the character's, at whose samples they are held.
+        moves: as for `read_hand_pose`.
 
     Raises:
         SsilkError: the model has no proxies, or one is held to a pose by hand that the request's motion has not.
@@ -124,7 +132,7 @@ def held_parts(
         shares.append(share)
     hand = np.tile(np.eye(4), (*shares[1].shape, 1, 1))
     if shares[1].any():
-        hand = read_hand_pose(request.motion, scene, motion, request.root, needed)
+        hand = read_hand_pose(request.motion, scene, motion, request.root, needed, moves)
     return HeldParts(shares[0], shares[1], hand)
 
 

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -12,15 +13,15 @@ import numpy as np
 from ...devices import select_device
 from ...errors import fail
 from ...events import Event, Message
-from ...files import split_location
+from ...files import split_body, split_location
 from ...network.checkpoint import ModelFile, load_model
 from ...quality.levels import SizeReduction
 from ...quality.reduction import Reducer
-from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Skeleton
+from ...scene.assets import Character, Deformer, Floats, Mesh, Motion, Scene, Skeleton
 from ...scene.cycles import rounds
 from ...scene.family import has_bones, motion_on
 from ...scene.held_parts import HeldParts
-from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, sample_motion
+from ...scene.kinematics import MAX_FPS, MIN_FPS, lbs_deformer, local_transforms, sample_motion
 from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
@@ -87,6 +88,7 @@ class LoadedGarment:
         first: the skeleton of the first body of the model's family; None where it lies on no other one of that.
         taller: height of the hub over the ground, relative to that body's, of a body that weights of the stage's
             shapes make; None for others.
+        moves: likewise how far each of its proxies is from where that body has it, along its parent's axes [m], (3,).
     """
 
     request: BakeRequest
@@ -105,6 +107,7 @@ class LoadedGarment:
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
     taller: float | None = None
+    moves: Mapping[str, Floats] = field(default_factory=dict)
     played: GarmentRecord | None = None
 
     @property
@@ -296,23 +299,31 @@ class LoadedGarment:
             request.motion, request.stage, self._places, read.whole, self.model.scene.rig.joint_names
         )
 
+    def _hand_moves(self, read: _ReadMotion) -> Mapping[str, Floats]:
+        """Return how far proxies are from where a shot poses them, which has those of the first body, as joints."""
+        of_first = read.told or (self.first and has_bones(read.sampled, self.first))
+        return self.moves if of_first else {}
+
     def _directed(self, request: BakeRequest, read: _ReadMotion, said: SaidDirection) -> Direction | None:
         """Return how the shot directs the garment; None where it moves freely throughout."""
         assert self.model is not None
-        parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole) if said.parts else None
+        moves, parts = self._hand_moves(read), None
+        if said.parts:
+            parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole, moves)
         hold = request.hold or said.hold
         if hold > 1 and request.refine:
             found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
             fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
         if read.loop is not None:
-            return self._directed_in_loop(request, read, read.loop, said, parts)
+            looped = self._directed_in_loop(request, read, read.loop, said, parts)
+            return looped and replace(looped, hand_moves=moves)
         if said.free is None and hold == 1 and parts is None:
             return None
         samples, count = request.samples_per_frame, read.whole.frame_count
         first = read.lead + (read.frames.before * samples if read.frames else 0)
         free = np.ones(count) if said.free is None else said.free
         hold, first = (hold * samples, first) if hold > 1 else (1, 0)
-        return Direction(free, hold, read.whole, first, parts, said=said.parts)
+        return Direction(free, hold, read.whole, first, parts, said=said.parts, hand_moves=moves)
 
     def _directed_in_loop(
         self, request: BakeRequest, read: _ReadMotion, loop: Loop, said: SaidDirection, parts: HeldParts | None
@@ -390,6 +401,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         body=on.body,
         first=first.scene.character.skeleton if on.member else None,
         taller=_taller(first, on) if shapes_of(request.stage) else None,
+        moves=_moves(first.scene, scene) if shapes_of(request.stage) and on.member else {},
     )
 
 
@@ -399,6 +411,13 @@ def _taller(file: ModelFile, on: WornModel) -> float | None:
         return None
     bodies = file.bodies.family.bodies
     return bodies.height_ratio(np.array(on.member[: bodies.size]))
+
+
+def _moves(base: Scene, other: Scene) -> dict[str, Floats]:
+    """Return how far proxies are from their parents otherwise than on a base, along the parents' axes [m], (3,)."""
+    after, before = (local_transforms(each.bind_transforms, each.parents)[:, :3, 3] for each in (other, base))
+    moved = (after - before)[base.character.skeleton.joint_count :]
+    return dict(zip(base.rig.joint_names, moved))
 
 
 def _on_stage(
@@ -411,7 +430,13 @@ def _on_stage(
     stage = open_stage(request.stage)
     on = worn(file, stage, request.root)
     told: list[Event] = [*on.told, *_stiffened(on.scene.garment.mesh, stage)]
-    riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event))
+    own = split_body(split_location(request.stage)[0])[0]
+
+    def laid() -> Mesh:
+        return worn(file, open_stage(own), request.root).scene.garment.mesh
+
+    shaped = laid if shapes_of(request.stage) else None
+    riders = riders_of(stage, on.scene.garment.mesh, request.root, lambda event: told.append(event), shaped)
     return on, _units(stage, request.receiver), riders, tuple(told)
 
 
@@ -441,7 +466,8 @@ def with_model(rollout: BakeRollout, file: ModelFile) -> BakeRollout:
     if direction is not None and direction.parts is not None:
         leaves = {name.rpartition("/")[2] for name in model.scene.rig.joint_names}
         said = [part for part in direction.said if leaves and (part.vertices is not None or part.name in leaves)]
-        parts = held_parts(said, deformer, model.scene, rollout.request, rollout.whole) if said else None
+        given = model.scene, rollout.request, rollout.whole, direction.hand_moves
+        parts = held_parts(said, deformer, *given) if said else None
         parts = parts.of(rollout.loop.tiled) if parts and rollout.loop else parts
         direction = replace(direction, parts=parts, shapes=None)
     return replace(rollout, model=model, deformer=deformer, direction=direction, is_fading=False).begun()

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -18,8 +19,17 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 
-def riders_of(stage: Usd.Stage, garment: Mesh, root: str | None, report: Reporter = silent) -> tuple[Rider, ...]:
+def riders_of(
+    stage: Usd.Stage,
+    garment: Mesh,
+    root: str | None,
+    report: Reporter = silent,
+    laid: Callable[[], Mesh] | None = None,
+) -> tuple[Rider, ...]:
     """Return what rides on a garment, at rest.
+
+    Args:
+        laid: returns the garment where the stage's riders lie on it, where that is on another body: they go along.
 
     Raises:
         SsilkError: as `read_riders` does, a rider lies far from the garment, or its vertices cannot carry it.
@@ -27,18 +37,33 @@ def riders_of(stage: Usd.Stage, garment: Mesh, root: str | None, report: Reporte
     from ssilk_usd.reading.riders import read_riders
 
     file, prim = split_location(garment.path)
-    found = []
-    for said in read_riders(stage, prim or file or "", root=root, report=report):
+    told, found = read_riders(stage, prim or file or "", root=root, report=report), []
+    start = laid() if laid and told else garment
+    for said in told:
         points = np.concatenate([mesh.points for mesh in said.meshes])
         attachment: Attachment | None = None
         if said.soft:
-            triangle_beneath(points, garment, said.path)  # which it is near to
+            triangle_beneath(points, start, said.path)  # which it is near to
         elif said.vertices is None:
-            attachment = Attachment.beneath(points, garment, said.path)
+            attachment = Attachment.beneath(points, start, said.path)
         else:
-            attachment = Attachment.to_vertices(said.vertices, garment, said.path)
-        found.append(Rider(said.path, said.name, said.meshes, attachment))
+            attachment = Attachment.to_vertices(said.vertices, start, said.path)
+        meshes = said.meshes
+        if start is not garment:
+            meshes = tuple(_along(each, start, garment, attachment) for each in meshes)
+        found.append(Rider(said.path, said.name, meshes, attachment))
     return tuple(found)
+
+
+def _along(mesh: Mesh, start: Mesh, end: Mesh, attachment: Attachment | None) -> Mesh:
+    """Return a rider's mesh moved as the cloth beneath it is; a soft one point by point."""
+    if attachment is None:
+        beneath = [Attachment.beneath(point[None], start, mesh.path) for point in mesh.points]
+        moves = [each.shares @ (end.points - start.points)[each.vertices] for each in beneath]
+        return replace(mesh, points=mesh.points + np.array(moves))
+    rest, posed = (each.points[attachment.vertices] for each in (start, end))
+    moved = attachment.transforms(rest, posed[None])[0]
+    return replace(mesh, points=mesh.points @ moved[:3, :3].T + moved[:3, 3])
 
 
 SOFT = 1e-3  # [m] by which soft riders may be off without a warning

@@ -87,8 +87,8 @@ class StepInputs(Framed):
 
     @property
     def is_plain(self) -> bool:
-        """Whether all of it is tensors of fixed sizes: the cloth of one garment meets its body, and nothing rubs."""
-        changing = self.neighbours, self.contacts, self.friction, self.world
+        """Whether all of it is tensors of fixed sizes: one garment meets its body alone, and nothing rubs."""
+        changing = self.neighbours, self.contacts, self.friction, self.world, self.beneath
         return all(each is None for each in changing) and not isinstance(self.pierced, PiercedOutfit)
 
 

@@ -299,6 +299,8 @@ class Simulator:
         solutions, between = [], partial(self.poser.between, past.root, past.matrices, poses, moves=past.moves)
         if past.before is not None:
             past = replace(past, before=past.last - (past.last - past.before) / PARTS)
+        if past.friction is not None:  # what sticks creeps less far in a shorter step
+            past = replace(past, friction=replace(past.friction, creep=past.friction.creep / PARTS))
         at = between(0.0)
         for share in np.arange(1, PARTS + 1) / PARTS:
             past = replace(past, pierced=self._pierced(past.local, at))

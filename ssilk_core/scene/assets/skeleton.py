@@ -13,6 +13,7 @@ from .arrays import Floats, Ints, assign, frozen, need_finite
 
 _STRAY = 0.05  # of all bodies that may be bound to joints above or beside the one that carries them
 _STRAY_ABOVE = 0.002  # of all bodies that the joint which holds them together may move, and yet carry none
+_BEGIN = 0.2  # of the mean distance of the body's joints, within which limbs begin at the joint that holds them
 _WHOLE = 0.999  # of a body, and no more, that one joint may move where several do
 
 
@@ -119,8 +120,9 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
     Game skeletons have joints above the hips, which may stand still while the character runs, and joints beside the
     hips for what hands hold. Bodies that one joint moves as a whole, such as props and shadows, do not count beside
     others. Where limbs have roots of their own, as deforming bones of control rigs have, it is the root amid them,
-    whether or not a joint that moves nothing itself, and may stand still, holds them together. Where bodies of their
-    own, as horse and rider, hang from such a joint, it is the largest body's.
+    whether or not a joint that moves nothing itself, and may stand still, holds them together. Such a joint carries
+    them where all begin at it, as at MakeHuman's root, and not on the floor beneath. Where bodies of their own, as
+    horse and rider, hang from such a joint, it is the largest body's.
 
     Args:
         moved: `moved_by_joints` of each body.
@@ -139,6 +141,10 @@ def carrying_joint(moved: Sequence[Floats], parents: Ints, places: Floats) -> in
         if len(bending) > 1:
             return carrying_joint([max(bending, key=np.sum)], parents, places)
     roots = np.flatnonzero((parents == above) & (below > 0))
+    if above >= 0:
+        ways = np.linalg.norm(places - places[above], axis=-1)
+        if ways[roots].max() < _BEGIN * (ways @ own) / own.sum():
+            return above
     away = np.linalg.norm(places[roots, None] - places, axis=-1) @ own
     return int(roots[away.argmin()])
 

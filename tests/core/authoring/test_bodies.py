@@ -172,6 +172,20 @@ def test_what_is_no_member_is_told_by_name(scene, change, told):
         need_family([scene.character, other])
 
 
+def test_quads_are_the_same_whichever_way_they_are_split(scene, members):
+    """Readers split a quad along its shorter diagonal, which another body may have elsewhere."""
+    corners, splits = np.array([0, 1, 2, 3]), ([[0, 1, 2], [0, 2, 3]], [[0, 1, 3], [1, 2, 3]])
+
+    def split(character, faces):
+        body = character.bodies[0]
+        mesh = replace(body.mesh, faces=faces, polygon_counts=[4], polygon_indices=corners, uvs=None)
+        return replace(character, bodies=(replace(body, mesh=mesh),))
+
+    base, other = (split(each, faces) for each, faces in zip(members, splits))
+    assert not differences(base, other)
+    assert BodyFamily.of([base, other]).size == 1
+
+
 def test_turned_joints_are_told_and_refused_for_training(scene, members):
     binds = np.array(members[1].skeleton.bind_transforms)
     binds[2, :3, :3] = binds[2, :3, :3] @ [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]

@@ -13,10 +13,12 @@ import torch
 from ssilk_core.physics.collision import CollisionBody
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.friction import CREEP, Friction
+from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.scene.assets import LOOSE, Body, Garment, Mesh, ProxyRig, Scene, SkinWeights
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import bind_pose
 
 CPU = torch.device("cpu")
 G, DT, MU = 9.81, 1 / 60, 0.5
@@ -174,3 +176,16 @@ def test_a_shot_with_friction_moves_less_over_its_body(scene, toy_motion):
         assert all(frame.residual <= 1e-2 for frame in found[mu])
     apart = [np.abs(a.points - b.points).max() for a, b in zip(found[0.0], found[0.6], strict=True)]
     assert max(apart[:2]) < 1e-12 < max(apart)  # the first frames are quasi-static
+
+
+def test_in_shorter_steps_cloth_creeps_as_fast_as_in_whole_ones(scene, toy_grid) -> None:
+    """Also in the first of them: shots in the midst of theirs are solved with it."""
+    cloth, _ = lying(scene, toy_grid, 1)
+    simulator = Simulator(cloth, FABRIC, SimulationOptions(fps=1 / DT))
+    poses = simulator.poser.pose(*(each[None] for each in bind_pose(cloth.character.skeleton)))
+    rubbing = simulator.potential.friction(poses.lbs, poses.body, None, DT)
+    assert rubbing.creep == pytest.approx(CREEP * DT)
+    x = poses.lbs.double() + poses.root
+    past = StepHistory(x, x, poses.root, poses.lbs, friction=rubbing, matrices=poses.matrices)
+    asked = next(simulator._in_parts(past, poses))
+    assert asked.past.friction.creep == pytest.approx(CREEP * asked.dt) and asked.dt < DT

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.physics import captured
 from ssilk_core.physics.collision.inner_cloth import InnerSurface
 from ssilk_core.physics.constants import GRAVITY
 from ssilk_core.physics.energy.collision import ContactLaw
@@ -135,3 +136,13 @@ def test_without_garments_beneath_nothing_is_added(world) -> None:
     scene, _ = world
     potential = Refiner(scene, CLOTH, RefineOptions(iterations=1), fps=FPS).potential
     assert type(potential) is IncrementalPotential and potential.sample_count == len(potential.cloth.area)
+
+
+def test_no_graph_is_captured_where_garments_lie_beneath(world) -> None:
+    """It would keep these where they were in its first frames."""
+    scene, inner = world
+    over, root = OverPotential(scene, CLOTH, [inner], device=CPU), torch.zeros(3, 1, dtype=torch.float64)
+    inputs = StepInputs(None, root, beneath=over.posed([inner.mesh.points[..., None].copy()], root))
+    assert not inputs.is_plain and replace(inputs, beneath=None).is_plain
+    with pytest.raises(TypeError, match="PosedBeneath"):
+        captured._kind(inputs)

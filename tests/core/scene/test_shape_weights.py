@@ -13,6 +13,7 @@ BODIES = {
     "C:/hero.usda:tall=1,heavy=-.5": ("C:/hero.usda", "tall=1,heavy=-.5"),
     "C:/v=2/hero.usda": ("C:/v=2/hero.usda", ""),
     "v=2/hero": ("v=2/hero", ""),
+    "a/hero.usd:body:tall=1": ("a/hero.usd", "body:tall=1"),
     "tall=1": ("tall=1", ""),
 }
 
@@ -28,6 +29,7 @@ def test_weights_alone_are_of_the_stage_of_the_command():
     assert not any(map(is_shapes, ("tall.usd", "a/tall=1.usd", "hero.usd:tall=1", "a=b/tall")))
     assert body_of("tall=1", "a/hero.usd:heavy=1") == "a/hero.usd:tall=1"
     assert body_of("other.usd:tall=1", "hero.usd") == "other.usd:tall=1"
+    assert split_body(body_of("body:tall=1", "hero.usd")) == ("hero.usd", "body:tall=1")
 
 
 def test_weights_are_compared_whichever_way_they_are_written():

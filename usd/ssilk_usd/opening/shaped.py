@@ -239,7 +239,9 @@ def _matrices(values: Floats) -> Vt.Matrix4dArray:
 
 
 def _skin(query: UsdSkel.SkinningQuery, joints: Sequence[str], offsets: Mapping[str, Floats]) -> _Skin | None:
-    """Return a mesh with what moves it; None where that is malformed, which readers of it tell."""
+    """Return a mesh with what moves it; None where no joint does, or that is malformed, which readers of it tell."""
+    if not query.HasJointInfluences():
+        return None
     mesh = UsdGeom.Mesh(query.GetPrim())
     points = np.array(mesh.GetPointsAttr().Get(EARLIEST) or [], dtype=np.float64).reshape(-1, 3)
     given = query.ComputeVaryingJointInfluences(len(points), EARLIEST)
@@ -290,7 +292,12 @@ def _said(shape: Usd.Prim) -> BodyParameter:
         attribute.Get() if shape and (attribute := shape.GetAttribute(name)) else None
         for name in (WEIGHT_RANGE, OFFSET_JOINTS, JOINT_OFFSETS)
     )
-    low, high = USUAL_RANGE if given is None else map(float, given)
+    bounds = USUAL_RANGE if given is None else given
+    if np.shape(bounds) != (2,):
+        allowed = "a float2 is needed, the least weight and the most"
+        fail(_where(shape), f"{WEIGHT_RANGE} is {bounds}", allowed, "mend it")
+    # As they were written: 0.35, and not the 0.349999994 that a float2 stores.
+    low, high = (float(str(np.float32(bound))) for bound in bounds)
     if not (np.isfinite([low, high]).all() and low <= 0 <= high and low < high):
         allowed = "a range holds 0, the body without the shape"
         fail(_where(shape), f"{WEIGHT_RANGE} is ({low:g}, {high:g})", allowed, "mend it")

@@ -11,9 +11,10 @@ mesh.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from types import MappingProxyType
 
 import numpy as np
 from pxr import Usd, UsdGeom, UsdSkel
@@ -103,13 +104,21 @@ def read_direction(
 
 
 @explains_damage
-def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, needed: Sequence[str]) -> Floats:
+def read_hand_pose(
+    source: str,
+    scene: Scene,
+    motion: Motion,
+    root: str | None,
+    needed: Sequence[str],
+    moves: Mapping[str, Floats] = MappingProxyType({}),
+) -> Floats:
     """Return where the animation of a shot has a garment's proxies, as `HeldParts.hand`; those it lacks are at rest.
 
     Args:
         motion: at whose frames.
         root: the character, as for `read_motion`.
         needed: proxies that it must have, joint paths.
+        moves: how far each that it has is from there, along its parent's axes [m], shape (3,).
 
     Raises:
         SsilkError: it lacks one.
@@ -119,8 +128,9 @@ def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, 
     shot = open_stage(file)  # prims live as long as it
     animation, _ = find_animation(shot, prim, root)
     animated = tuple(str(name) for name in UsdSkel.Animation(animation).GetJointsAttr().Get() or ())
-    for name, found in zip(needed, match_joints(tuple(needed), animated)):
-        if found < 0:
+    there = dict(zip(rig.joint_names, match_joints(rig.joint_names, animated)))
+    for name in needed:
+        if there[name] < 0:
             what = f"{POSED} asks for proxy '{name}' as it was posed, and this animation has no such joint"
             fail(location(animation), what, "it needs the proxies among its joints", "animate it, or say ssilk:free")
     rest = local_transforms(scene.bind_transforms, scene.parents)[skeleton.joint_count :]
@@ -133,8 +143,11 @@ def read_hand_pose(source: str, scene: Scene, motion: Motion, root: str | None, 
     )
     every = read_motion(source, whole, root=root)
     at = (motion.start + np.arange(motion.frame_count)) / motion.fps * every.fps - every.start
-    poses = sample_motion(every, at.clip(0, every.frame_count - 1))
-    return hand_pose(scene, Motion(every.path, motion.fps, *poses))
+    rotations, translations = sample_motion(every, at.clip(0, every.frame_count - 1))
+    none = np.zeros(3)
+    off = [none if there[name] < 0 else moves.get(name, none) for name in rig.joint_names]
+    translations[:, skeleton.joint_count :] += np.array(off).reshape(-1, 3)
+    return hand_pose(scene, Motion(every.path, motion.fps, rotations, translations))
 
 
 @explains_damage

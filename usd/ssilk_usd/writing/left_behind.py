@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pxr import Usd, UsdGeom
 
-from ssilk_core.files import split_location
+from ssilk_core.files import split_body, split_location
 from ssilk_core.scene.assets import Character, Mesh
 
 from ..opening.stage import PRIMS, open_stage
@@ -24,7 +24,7 @@ def left_behind(character: Character, written: Sequence[Mesh]) -> list[str]:
         written: the meshes that are.
     """
     file, path = split_location(character.path)
-    if not Path(file).is_file():
+    if not Path(split_body(file)[0]).is_file():
         return []
     stage = open_stage(file)  # which lives for as long as it has a name
     root = stage.GetPrimAtPath(path or "/")

@@ -17,7 +17,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.files import split_location
+from ssilk_core.files import split_body, split_location
 from ssilk_core.scene.assets import Garment, Ints, Mesh
 
 from ..opening.stage import EARLIEST, PRIMS, location, open_stage
@@ -94,7 +94,7 @@ def as_it_looks(garment: Garment, source: str) -> Garment:
 
     Where the file has no such prim, or none of these on it, those of the garment stay.
     """
-    stage = open_stage(source) if Path(source).is_file() else None
+    stage = open_stage(source) if Path(split_body(source)[0]).is_file() else None
     look = look_source(garment.mesh, stage) if stage else None
     if look is None:
         return garment
@@ -142,12 +142,12 @@ def copy_looks(
 
     Args:
         root: prim that materials are written beneath.
-        source: file of the stage.
+        source: file of the stage, with the shapes of a body.
         meshes: each with the path of its prim in `stage`.
         output: where the layer of `stage` will lie, which relative paths of textures are relative to.
     """
     left = LeftOut()
-    if not Path(source).is_file():
+    if not Path(split_body(source)[0]).is_file():
         return left
     opened = open_stage(source)
     found = [(mesh, path, look_source(mesh, opened)) for mesh, path in meshes]
