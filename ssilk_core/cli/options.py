@@ -109,7 +109,8 @@ def add_known_fabric(verb: argparse.ArgumentParser) -> None:
         default=[],
         metavar="NAME=VALUE",
         help="change a property of that fabric (repeatable): density=0.3 in its unit, or bending=2x for twice that "
-        f"of the training's fabric; factors are {', '.join(FACTORS)}",
+        f"of the training's fabric; factors are {', '.join(FACTORS)}. A bake with --feedback or --quality hero takes "
+        "friction=0.4 of any model",
     )
 
 

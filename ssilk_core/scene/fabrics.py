@@ -39,8 +39,8 @@ class Fabric:
             millimetre.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
-        friction: Coulomb's coefficient, of cloth on the body, on floors and props, and on cloth. The simulator alone
-            knows it: networks are trained without.
+        friction: Coulomb's coefficient, of cloth on the body, on floors and props, and on cloth. The simulator knows
+            it, and refinement that looks back: networks are trained without.
     """
 
     name: str
@@ -184,7 +184,10 @@ def fabric_of_surface(surface: SurfaceMaterial) -> Fabric:
     return replace(FABRICS["default"], name=surface.path.rpartition("/")[2], **said)  # type: ignore[arg-type]
 
 
-FRICTION = "'ssilk simulate' alone knows friction (--material friction=0.4); networks are trained without it"
+FRICTION = (
+    "'ssilk simulate' and 'bake --refine N --feedback' know friction (--material friction=0.4); networks are trained "
+    "without it"
+)
 
 
 def surface_message(surface: SurfaceMaterial, fabric: Fabric) -> str:

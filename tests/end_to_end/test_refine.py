@@ -161,6 +161,16 @@ def test_with_feedback_the_cloth_goes_on_from_refined_frames(there, hero, capsys
     assert main(["verify", "cut.usda"]) == 3 and "3 samples; 5 are needed" in capsys.readouterr().err
 
 
+def test_with_feedback_cloth_of_any_model_may_rub(there, capsys):
+    words = ["--refine", "3", "--refined-output", "points", "--feedback"]
+    assert main([*BAKE, "-o", "smooth.usda", *words]) == 0
+    capsys.readouterr()
+    assert main([*BAKE, "-o", "rough.usda", *words, "--material", "friction=2"]) == 0
+    assert "friction 2 in refinement; the network plays without it" in capsys.readouterr().err
+    assert np.abs(points_of("rough.usda") - points_of("smooth.usda")).max() > 1e-4
+    assert main(["verify", "rough.usda"]) == 0
+
+
 def test_with_feedback_the_cloth_is_on_its_way_when_a_range_begins(there):
     """The motion before the range is refined as well: its frames do not begin at rest."""
     request = BakeRequest(model="model.safetensors", stage="rigged.usda", motion="brief.usda")
@@ -183,6 +193,9 @@ def test_samples_within_frames_are_refined_too(there):
         (["--refine", "-1"], "a whole number from 0 to 10000"),
         (["--refine", "2", "--budget", "1MB"], "a budget for refined frames"),
         (["--feedback"], "--feedback: no --refine"),
+        (["--refine", "2", "--material", "friction=0.4"], "--material friction=0.4: networks know no friction"),
+        (["--quality", "hero", "--material", "friction=-1"], "friction = -1"),
+        (["--quality", "hero", "--material", "bending=2x"], "for a model of one fabric"),
     ],
 )
 def test_what_cannot_be_done_is_refused(there, capsys, words, complaint):

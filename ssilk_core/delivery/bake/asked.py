@@ -42,11 +42,12 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
 
 def _fabric(request: BakeRequest) -> tuple[str, ...]:
     asked = [request.fabric] if request.fabric else []
-    return (request.model, *asked, *request.material) if asked or request.material else ()
+    rubs = ["feedback"] if request.feedback else []
+    return (request.model, *rubs, *asked, *request.material) if asked or request.material else ()
 
 
 def _in_fabric(request: BakeRequest) -> tuple[Event, ...]:
-    return in_fabric(load_model(request.model), request.model, request.fabric, request.material)[1]
+    return in_fabric(load_model(request.model), request.model, request.fabric, request.material, request.feedback)[1]
 
 
 def _range(request: BakeRequest) -> tuple[str, ...]:

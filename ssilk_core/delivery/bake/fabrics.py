@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,10 +18,15 @@ from ...scene.fabrics import Fabric, fabric_named
 
 OPTION = "--material"
 TIMES = "x"  # at the end of a value that is a factor
+RUBS = "friction="  # how a property begins that networks never see, and refinement may know
+FEEDBACK_RUBS = (  # what is allowed, and what to do
+    "refinement knows it where each frame goes on from the last",
+    "bake with --refine N --feedback or --quality hero, or take 'ssilk simulate'",
+)
 
 
 def in_fabric(
-    file: ModelFile, where: str, fabric: str | None, material: Sequence[str]
+    file: ModelFile, where: str, fabric: str | None, material: Sequence[str], rubs: bool = False
 ) -> tuple[ModelFile, tuple[Event, ...]]:
     """Return a model in the fabric that options ask for, and what there is to tell of that.
 
@@ -28,10 +34,18 @@ def in_fabric(
         where: the model's path, for messages.
         fabric: name of a preset; None for the model's own fabric.
         material: "NAME=VALUE" properties of it, or "NAME=FACTORx" of what the model's own fabric has.
+        rubs: what follows the network knows friction, which any model may then be given.
 
     Raises:
-        SsilkError: the model knows one fabric alone, or its networks do not see a property that is asked for.
+        SsilkError: the model knows one fabric alone, its networks do not see a property that is asked for, or
+            nothing knows the friction that is.
     """
+    rough, others = _friction_apart(material, rubs)
+    if rough:
+        found, in_words = in_fabric(file, where, fabric, others)
+        found = replace(found, fabric=apply_overrides(found.fabric, rough, OPTION))
+        text = f"{where}: friction {found.fabric.friction:g} in refinement; the network plays without it"
+        return found, (*in_words, Message(text))
     if not fabric and not material:
         return file, ()
     if file.fabrics is None:
@@ -48,11 +62,19 @@ def in_fabric(
     return file.on_fabric(wanted), tuple(told)
 
 
-def need_fabric(fabric: str | None, material: Sequence[str]) -> None:
+def need_fabric(fabric: str | None, material: Sequence[str], rubs: bool = False) -> None:
     """Raise `SsilkError` where options, which are those of `in_fabric`, ask for what no model could play."""
-    preset = fabric_named(fabric or "default")
-    _need_factors(_factors(np.ones(len(FACTORS)), material))
-    apply_overrides(preset, _absolute(PROPERTIES, material), OPTION)
+    preset, (rough, others) = fabric_named(fabric or "default"), _friction_apart(material, rubs)
+    _need_factors(_factors(np.ones(len(FACTORS)), others))
+    apply_overrides(preset, [*_absolute(PROPERTIES, others), *rough], OPTION)
+
+
+def _friction_apart(material: Sequence[str], rubs: bool) -> tuple[list[str], list[str]]:
+    """Return the words of --material that are friction, and the others; raise `SsilkError` where nothing knows it."""
+    rough = [each for each in material if each.startswith(RUBS)]
+    if rough and not rubs:
+        fail(f"{OPTION} {rough[0]}", "networks know no friction", *FEEDBACK_RUBS)
+    return rough, [each for each in material if each not in rough]
 
 
 def _asked(own: Fabric, fabric: str | None, material: Sequence[str]) -> Fabric:

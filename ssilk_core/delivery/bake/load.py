@@ -376,7 +376,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         partial(stage_contents, request.stage), partial(_on_stage, file, request)
     )
     first, own, file, scene = file, on.file, on.file, on.scene
-    file, in_words = in_fabric(own, request.model, request.fabric, request.material)
+    file, in_words = in_fabric(own, request.model, request.fabric, request.material, request.feedback)
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
     return LoadedGarment(

@@ -63,9 +63,10 @@ class BakeRequest:
             (`delivery.bake.certificate`).
         hide_covered: hide the body's faces that the garment covers in every frame (see `skin.hidden_faces`).
         colliders, wind, gusts, gravity: what surrounds the character, in place of what its shot says: prims, and
-            numbers as text (`delivery.bake.world`). Colliders are met by refinement alone.
+            numbers as text (`delivery.bake.world`). Networks see colliders where they were trained with some.
         fabric, material: that the garment is of, where its model was trained for a range of fabrics: a preset, and
-            properties as text (`delivery.bake.fabrics`); the model's own by default.
+            properties as text (`delivery.bake.fabrics`); the model's own by default. Friction may be given to any
+            model that is refined with feedback.
         hold: frames for which each pose of the garment is held, as in animation on twos; 0 for what the stage says.
         start_cloth: shot or cache with the cloth that the first frame begins with, "FILE[:/PRIM][@CODE]", at its last
             frame or at a time code (`delivery.bake.start`); None to begin at rest.
@@ -142,7 +143,7 @@ class BakeRequest:
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")
-        need_fabric(self.fabric, self.material)
+        need_fabric(self.fabric, self.material, rubs=True)  # a level of quality may yet bring feedback
         if self.lbs and (self.fabric or self.material):
             found = "linear blend skinning has no fabric"
             fail("--lbs", found, "only the network and the solver have one", "leave --fabric and --material out")

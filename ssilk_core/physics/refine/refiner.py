@@ -12,7 +12,10 @@ below the network's. Inertia m/(2 dt^2) |x - target|^2 holds each frame x
 - with feedback, to the course 2 x' - x'' of the two previous refined frames as they were before they were lifted, one
   frame after the other; several shots can advance at once. Each starts from the network's state, from that plus the
   last correction, or as a step of the simulator does, whichever has least energy: the network's course may differ
-  from that of the refined cloth. With enough iterations this is the simulator.
+  from that of the refined cloth. What pressed in the refined frame before rubs (`simulate.friction`). With enough
+  iterations this is the simulator.
+
+Without feedback there is no friction: what slips is told by the frame before, which the solver does not have.
 
 Garments beneath it are met where they are in each frame, and stay there (`simulate.over_cloth`).
 
@@ -37,6 +40,7 @@ from ...scene.kinematics import split_at_cuts
 from ..collision.inner_cloth import InnerSurface, PosedBeneath
 from ..simulate import SimulationOptions, Simulator
 from ..simulate.characters import PosedCharacters
+from ..simulate.friction import Friction
 from ..simulate.history import StepHistory
 from ..simulate.incremental_potential import StepInputs
 from ..simulate.newton import SolverOptions, State, minimise_from, need_finite
@@ -120,6 +124,7 @@ class _Tail:
         before: the same one frame earlier, with feedback; None where there is none.
         root, lbs: root and garment under linear blend skinning in the last frame, shapes (3, N) and (V, 3, N).
         correction: displacement of the last frame by refinement, shape (V, 3, N).
+        friction: of what presses in the last frame, with feedback; None without, and for cloth without friction.
     """
 
     last: Tensor
@@ -127,12 +132,14 @@ class _Tail:
     root: Tensor
     lbs: Tensor
     correction: Tensor
+    friction: Friction | None = None
 
     def first(self, count: int) -> _Tail:
         """Return those of the first shots."""
         before = None if self.before is None else self.before[..., :count]
         last, root, lbs = (values[..., :count] for values in (self.last, self.root, self.lbs))
-        return _Tail(last, before, root, lbs, self.correction[..., :count])
+        friction = self.friction and self.friction.select(torch.arange(count, device=last.device))
+        return _Tail(last, before, root, lbs, self.correction[..., :count], friction)
 
 
 class Refiner:
@@ -325,7 +332,7 @@ class Refiner:
         if tail is None:
             return None if self.options.feedback else StepHistory(world, None, poses.root, poses.lbs)
         if self.options.feedback:
-            return StepHistory(tail.last, tail.before, tail.root, tail.lbs)
+            return StepHistory(tail.last, tail.before, tail.root, tail.lbs, friction=tail.friction)
         earlier = ((tail.last, world), (tail.root, poses.root), (tail.lbs, poses.lbs))
         last, root, lbs = (torch.cat([first, rest[..., :-1]], dim=-1) for first, rest in earlier)
         return StepHistory(last, None, root, lbs)
@@ -334,7 +341,9 @@ class Refiner:
         """Return the previous states for the frames after these."""
         correction = refined - world
         if self.options.feedback:
-            return _Tail(refined, tail.last if tail else None, poses.root, poses.lbs, correction)
+            x, dt = (refined - poses.root).to(self.potential.dtype), self.simulator.dt
+            friction = self.potential.friction(x, poses.body, None, dt, poses.world)
+            return _Tail(refined, tail.last if tail else None, poses.root, poses.lbs, correction, friction)
         return _Tail(world[..., -1:], None, poses.root[:, -1:], poses.lbs[..., -1:], correction[..., -1:])
 
     def _describe(self, before: State, inputs: StepInputs, refined: Tensor, root: Tensor) -> Iterator[RefinedFrame]:

@@ -79,10 +79,21 @@ class Friction:
 
     @classmethod
     def on_world(
-        cls, cloth: SampledCloth, law: ContactLaw, x: Tensor, world: PosedWorld, body: int, mu: float, dt: float
+        cls,
+        cloth: SampledCloth,
+        law: ContactLaw,
+        samples: Tensor,
+        x: Tensor,
+        world: PosedWorld,
+        body: int,
+        mu: float,
+        dt: float,
     ) -> Friction:
-        """Return that of cloth at positions x (V, 3, N) on colliders, beside a body of so many vertices."""
-        samples = cloth.positions(x)
+        """Return that of cloth at positions x (V, 3, N) on colliders, beside a body of so many vertices.
+
+        Args:
+            samples: positions of those that meet colliders, the first of the cloth's, shape (S, 3, N).
+        """
         near = world.touched(samples, law.start)
         row, frame = near.row, near.frame
         held = samples[row, :, frame].T - world.on_surfaces(near.corners, near.weights, frame)

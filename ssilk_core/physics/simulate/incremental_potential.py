@@ -248,10 +248,10 @@ class IncrementalPotential:
         mu = self.fabric.friction
         if not mu:
             return None
-        samples, found = self.cloth.positions(x), self.body_distance(x, StepInputs(body, x.new_zeros(3, x.shape[-1])))
-        assert found is not None
+        samples = self._own_samples(x)
+        found = self.contacts.smoothed(samples, body)
         distance = found.distance(samples)
-        force = self.cloth.area * self.law.pressure(distance)
+        force = self.cloth.area[: self.sample_count] * self.law.pressure(distance)
         reach = torch.where(force > 0, 2 * distance.abs() + self.law.start, -1.0).float()
         row, frame, corners, weights = self.contacts.touched(samples.float(), reach, body)
         normal = torch.nn.functional.normalize(found.normal[row, :, frame].T, dim=0)
@@ -270,7 +270,7 @@ class IncrementalPotential:
         )
         parts = [rubbing]
         if world is not None and world.has_colliders:
-            parts.append(Friction.on_world(self.cloth, self.law, x, world, len(body.points), mu, dt))
+            parts.append(Friction.on_world(self.cloth, self.law, samples, x, world, len(body.points), mu, dt))
         if neighbours is not None:
             parts.append(Friction.of_contacts(self.self_contact.contacts(x, neighbours), x, mu, dt))
         return Friction.joined(*parts)

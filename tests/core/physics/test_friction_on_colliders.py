@@ -11,7 +11,9 @@ import pytest
 import torch
 from scipy.optimize import brentq
 
+from ssilk_core.physics.collision.inner_cloth import InnerSurface
 from ssilk_core.physics.energy.collision import ContactLaw
+from ssilk_core.physics.refine import RefineOptions, Refiner
 from ssilk_core.physics.simulate import SimulationOptions, Simulator, simulate
 from ssilk_core.physics.simulate.friction import CREEP
 from ssilk_core.physics.simulate.history import StepHistory
@@ -110,6 +112,33 @@ def test_cloth_sticks_or_slides_on_a_slope_as_coulomb_says(scene, toy_grid, slop
     else:  # implicit Euler from rest
         assert moved[0] == pytest.approx(pull * DT**2 * steps * (steps + 1) / 2, rel=0.01)
     assert abs(moved[1]) < 1e-4 and abs(moved[2]) < 1e-4
+
+
+@pytest.mark.usefixtures("few_contacts")
+def test_refined_frames_that_look_back_stick_or_slide_as_coulomb_says(scene, toy_grid) -> None:
+    """A sheet rests in the first frame, and then is pulled along the plane; the network's stays in the air."""
+    steps, cloth = 4, lying(scene, toy_grid, LEVEL)
+    rotated, placed = bind_pose(cloth.character.skeleton)
+    motion = Motion("/still", FPS, np.tile(rotated, (steps + 1, 1, 1)), np.tile(placed, (steps + 1, 1, 1)))
+    points = cloth.garment.mesh.points
+    network = np.stack([points, *[points + [0.0, 0.02, 0.01]] * steps])
+    beneath = InnerSurface(Mesh("/beneath", points - [0.0, 0.5, 0.0], cloth.garment.mesh.faces), 1e-3)
+
+    def moved(pull: float, mu: float = MU, feedback: bool = True, beneath: Sequence[InnerSurface] = ()) -> Floats:
+        options = RefineOptions(iterations=100, feedback=feedback, tolerance=1e-6)
+        refiner = Refiner(cloth, replace(CLOTH, friction=mu), options, fps=FPS, beneath=beneath)
+        world = ShotWorld(FPS, (plane(),), gravity=np.array([[0.0, -G, 0], *[[pull, -G, 0]] * steps]))
+        below = [[each.mesh.points for each in beneath]] * len(network)
+        found = np.stack([each.points for each in refiner.frames(motion, network, world, below)])
+        return (found[-1] - found[0]).mean(axis=0)
+
+    assert 0 < moved(0.9 * MU * G)[0] < steps * DT * CREEP
+    sliding, share = moved(1.5 * MU * G), DT**2 * steps * (steps + 1) / 2  # implicit Euler from rest
+    np.testing.assert_allclose(sliding, [0.5 * MU * G * share, 0, 0], atol=2e-5)
+    over = moved(1.5 * MU * G, beneath=[beneath])  # its samples are there twice, and rub once
+    np.testing.assert_allclose(over, sliding, atol=1e-6)
+    smooth = [moved(1.5 * MU * G, mu, feedback=False) for mu in (MU, 0.0)]  # without looking back
+    np.testing.assert_array_equal(*smooth)
 
 
 def test_cloth_is_carried_by_planes_that_move_are_skinned_or_turn_in_shots_of_one_batch(scene, toy_grid) -> None:

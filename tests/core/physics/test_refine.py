@@ -20,6 +20,7 @@ from ssilk_core.scene.fabrics import Fabric
 pytestmark = pytest.mark.usefixtures("few_contacts")
 
 CLOTH = Fabric("toy", bending=1e-4, margin=0.01)
+ROUGH = replace(CLOTH, friction=0.4)
 FRAMES = 9
 
 
@@ -35,11 +36,11 @@ def rollout(scene, toy_model, toy_motion):
 KEPT: dict[tuple[object, ...], tuple[object, ...]] = {}  # with what it is of, whose place in memory is in the key
 
 
-def refined(scene, motion, points, **options):
+def refined(scene, motion, points, cloth=CLOTH, **options):
     """Refined vertices (F, V, 3) and what was changed in each frame; what several tests ask for is computed once."""
-    key = id(scene), id(motion), id(points), clearing.ROUNDS, *sorted(options.items())
+    key = id(scene), id(motion), id(points), cloth, clearing.ROUNDS, *sorted(options.items())
     if key not in KEPT:
-        frames = list(Refiner(scene, CLOTH, RefineOptions(**options), fps=motion.fps).frames(motion, points))
+        frames = list(Refiner(scene, cloth, RefineOptions(**options), fps=motion.fps).frames(motion, points))
         changed = np.stack([frame.points for frame in frames]), [frame.change for frame in frames]
         KEPT[key] = (*changed, scene, motion, points)
     return KEPT[key][:2]
@@ -83,17 +84,26 @@ def test_without_feedback_a_stretch_by_itself_comes_out_alike(monkeypatch, scene
     np.testing.assert_allclose(part[1:], whole[4:8], atol=close)  # the first has no past, and no drag
 
 
+def on_the_ball(scene):
+    """The scene with a garment that touches the body, on which it rubs."""
+    mesh = scene.garment.mesh
+    near = replace(mesh, points=mesh.points + [0, 0, 0.07])
+    return replace(scene, garment=replace(scene.garment, mesh=near))
+
+
 def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
-    motion, points = rollout[0].clip(0, 4), rollout[1][:4]
+    motion, points, scene = rollout[0].clip(0, 4), rollout[1][:4], on_the_ball(scene)
     solver = SolverOptions(tolerance=1e-3, iterations=200)
     options = SimulationOptions(solver=solver, quasi_static_solver=solver)
-    (expected,) = simulate(scene, CLOTH, [motion], options)
+    (expected,) = simulate(scene, ROUGH, [motion], options)
     start = points.copy()
-    start[0] = quasi_static_states(scene, CLOTH, motion.clip(0, 1), options)[0]  # what the simulator begins with
-    found, changes = refined(scene, motion, start, iterations=200, tolerance=1e-3, feedback=True)
+    start[0] = quasi_static_states(scene, ROUGH, motion.clip(0, 1), options)[0]  # what the simulator begins with
+    found, changes = refined(scene, motion, start, ROUGH, iterations=200, tolerance=1e-3, feedback=True)
     assert max(change.residual for change in changes) < 1e-3
     np.testing.assert_allclose(found, expected, atol=5e-4)
-    alone, _ = refined(scene, motion, start, iterations=20, tolerance=1e-3)
+    (smooth,) = simulate(scene, CLOTH, [motion], options)
+    assert np.abs(smooth - expected).max() > 2e-3  # so that friction is seen
+    alone, _ = refined(scene, motion, start, ROUGH, iterations=20, tolerance=1e-3)
     assert np.abs(alone - expected).max() > 1e-3
 
 
@@ -129,14 +139,14 @@ def test_with_feedback_a_shot_begins_at_rest(scene, rollout) -> None:
 
 
 def test_shots_at_once_are_what_each_is_by_itself(scene, rollout) -> None:
-    motion, points = rollout
+    motion, points, scene = *rollout, on_the_ball(scene)
     shots = [(motion, points), (motion.clip(3, FRAMES), points[3:])]
-    refiner = Refiner(scene, CLOTH, RefineOptions(iterations=3, feedback=True), fps=motion.fps)
+    refiner = Refiner(scene, ROUGH, RefineOptions(iterations=3, feedback=True), fps=motion.fps)
     frames = list(refiner.shots_at_once(*zip(*shots)))
     assert [len(frame) for frame in frames] == [2] * (FRAMES - 3) + [1] * 3
     for number, shot in enumerate(shots):
         found = np.stack([frame[number].points for frame in frames if len(frame) > number])
-        alone, changes = refined(scene, *shot, iterations=3, feedback=True)
+        alone, changes = refined(scene, *shot, ROUGH, iterations=3, feedback=True)
         assert np.abs(found - alone).max() < 1e-5
         assert frames[2][number].change.after == pytest.approx(changes[2].after, rel=1e-4)
     with pytest.raises(SsilkError, match="the longest first"):
