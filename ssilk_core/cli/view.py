@@ -59,7 +59,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     film = suffix == FILM
     check_output(options.output, *options.shots)
     players = [open_shot(path) for path in options.shots]
-    labels = options.label or ([path.stem for path in options.shots] if len(players) > 1 else [])
+    labels = options.label or (captions(options.shots) if len(players) > 1 else [])
     look = _look(options, film)
     props = [props_of(path, report) for path in options.shots]
     if suffix == PAGE:
@@ -80,6 +80,14 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     report(Result("view", {"picture": str(options.output), "frames": count}))
     return EXIT_OK
+
+
+def captions(shots: Sequence[Path]) -> list[str]:
+    """Return the names of files, with as many folders above as tell them apart."""
+    parts = [path.absolute().with_suffix("").parts for path in shots]
+    depths = range(1, 1 + max(map(len, parts)))
+    depth = next((depth for depth in depths if len({each[-depth:] for each in parts}) == len(parts)), 1)
+    return ["/".join(each[-depth:]) for each in parts]
 
 
 def _write_page(
