@@ -10,6 +10,7 @@ import numpy as np
 from bpy.props import IntProperty
 
 from ..arrays.try_on import KNOTS
+from ..errors import SetupError
 from ..outside.work import Work
 from ..preferences import interpreter, preferences
 from ..quality import tried_on
@@ -40,7 +41,10 @@ class TryOn(RigOperator, bpy.types.Operator):
         self.mark, self.ends = tried_on.mark_of(garment), list[np.ndarray]()
         self.body = f"'{Path(path).name}'"
         if settings.body == KEYS:
-            values = {item.key: item.value for item in settings.keys if item.key}
+            chosen = [item for item in settings.keys if item.key]
+            values = {item.key: item.value for item in chosen}
+            if len(values) < len(chosen):
+                raise SetupError("A shape key is chosen twice; remove one.")
             self.ends = points_with_keys(garment, self.gathered, values)
             self.body = ", ".join(f"'{name}' {value:g}" for name, value in values.items())
 

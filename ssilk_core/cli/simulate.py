@@ -237,6 +237,7 @@ def _written(
         counter = OutfitCounter(garments, [Path(split_location(shot.source)[0]).stem for shot in shots[0]])
         told = Countdown(total, report)
         for frame in simulator.frames(motions, worlds):
+            figures.add(frame)
             rows = [rows for rows, _ in simulator.potential.garments]
             points = [frame.points[own] for own in rows]
             for cache, own in zip(caches, points):

@@ -83,10 +83,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 
 def captions(shots: Sequence[Path]) -> list[str]:
-    """Return what shots are called: by their files, or by their folders where files have one name, as in layers."""
-    names = [path.stem for path in shots]
-    folders = [path.absolute().parent.name for path in shots]
-    return [folder if names.count(name) > 1 else name for name, folder in zip(names, folders)]
+    """Return the names of files, with as many folders above as tell them apart."""
+    parts = [path.absolute().with_suffix("").parts for path in shots]
+    depths = range(1, 1 + max(map(len, parts)))
+    depth = next((depth for depth in depths if len({each[-depth:] for each in parts}) == len(parts)), 1)
+    return ["/".join(each[-depth:]) for each in parts]
 
 
 def _write_page(

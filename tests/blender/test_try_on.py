@@ -276,6 +276,7 @@ def pin(thing: Any) -> None:
         (lambda garment, pillar: choose_keys(garment), "No shape key is chosen"),
         (lambda garment, pillar: choose_keys(garment, Slim=1.0), r"shape key 'Slim' \(there is 'Full'\)"),
         (lambda garment, pillar: choose_keys(garment, Full=0.0), "have these values of their shape keys already"),
+        (lambda garment, pillar: setattr(garment.ssilk.try_on.keys.add(), "key", "Full"), "chosen twice; remove one"),
         (lambda garment, pillar: pin(pillar), "'Pillar' shows one shape key alone"),
         (lambda garment, pillar: setattr(garment.ssilk.try_on, "body", "STAGE"), "There is no file"),
     ],

@@ -6,13 +6,11 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from ssilk_core.cli import main
 from ssilk_core.cli.inputs import CHARACTER, MODEL, MOTIONS, need_input
-from ssilk_core.cli.view import captions
 from ssilk_core.errors import SsilkError
 
 
@@ -48,11 +46,6 @@ def test_a_shape_without_a_weight_is_told(tmp_path):
     need_input(f"{tmp_path}/hero.usda:tall=1", CHARACTER)
     said = refusal(f"{tmp_path}/hero.usda:tall", CHARACTER)
     assert "'tall' is neither weights of shapes nor the path of a prim; a body of a stage is named as" in said
-
-
-def test_shots_of_one_name_are_called_by_their_folders():
-    shots = [Path("shots/heavy_walk/shot.usda"), Path("shots/tall_walk/shot.usda"), Path("lbs.usdc")]
-    assert captions(shots) == ["heavy_walk", "tall_walk", "lbs"]
 
 
 def test_nothing_heavy_is_loaded_to_say_so(tmp_path, monkeypatch):

@@ -848,6 +848,15 @@ def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):
     assert run(f"{bake}=0.9") == 2 and "was baked on another body" in capsys.readouterr().err
 
 
+def test_a_body_that_shapes_cannot_make_is_told_at_submission(shapes, capsys):
+    farm = "farm family.safetensors --motion clip.usda --bundle job --stage shapes.usda:heavier=2"
+    told = "shape 'heavier' weighs 2; 0 to 1 is allowed"
+    assert run(f"{farm} --stage shapes.usda") == 0
+    assert told in capsys.readouterr().err
+    assert run(farm) == 2
+    assert told in capsys.readouterr().err
+
+
 def test_an_evaluation_has_bodies_by_shapes_under_their_names(shapes):
     (shapes / "clips").mkdir()
     shutil.copy("clip.usda", "clips")

@@ -7,6 +7,7 @@ from collections.abc import Container, Sequence
 
 from ...errors import SsilkError
 from ...events import Event, Message, Reporter
+from ...files import split_body
 from ...network.checkpoint import load_model
 from .fabrics import in_fabric
 from .request import BakeRequest
@@ -14,7 +15,9 @@ from .task import BakeTask
 
 
 def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
-    """Warn of fabrics that models have not or were not trained for, and of ranges that motions have not.
+    """Warn of fabrics that models have not or were not trained for, and of what stages and motions have not.
+
+    That is blendshapes that make a body, and ranges.
 
     Args:
         readable: inputs that can be read: tasks with others fail for that.
@@ -24,7 +27,7 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     """
     lost = {task.name for task in tasks if any(path not in readable for path in task.request.inputs.values())}
     tasks, count = [task for task in tasks if task.name not in lost], len(tasks)
-    for asked, found in ((_fabric, _in_fabric), (_range, _in_range)):
+    for asked, found in ((_fabric, _in_fabric), (_body, _of_shapes), (_range, _in_range)):
         groups: dict[tuple[str, ...], list[BakeTask]] = {}
         for task in tasks:
             if key := asked(task.request):
@@ -48,6 +51,17 @@ def _fabric(request: BakeRequest) -> tuple[str, ...]:
 
 def _in_fabric(request: BakeRequest) -> tuple[Event, ...]:
     return in_fabric(load_model(request.model), request.model, request.fabric, request.material, request.feedback)[1]
+
+
+def _body(request: BakeRequest) -> tuple[str, ...]:
+    return (request.stage,) if split_body(request.stage)[1] else ()
+
+
+def _of_shapes(request: BakeRequest) -> tuple[Event, ...]:
+    from ssilk_usd.opening.stage import open_stage
+
+    open_stage(request.stage)  # refuses shapes that it has not, and weights beyond their ranges
+    return ()
 
 
 def _range(request: BakeRequest) -> tuple[str, ...]:

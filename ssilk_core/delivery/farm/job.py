@@ -172,7 +172,7 @@ def numbers(text: str, count: int) -> list[int]:
     Raises:
         SsilkError: it names none, or one that does not exist.
     """
-    where, allowed = "--tasks", f"numbers from 0 to {count - 1} are needed, such as 0-9,12"
+    where, allowed = "--tasks", f"numbers from 0 to {count - 1} are needed, such as 0-{count - 1}"
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
 
+from ssilk_core.cli.view import captions
 from ssilk_core.delivery.view import output
 from ssilk_core.delivery.view.output import write_film, write_image
 from ssilk_core.delivery.view.panels import GAP, add_captions, compare, contact_sheet
@@ -120,3 +122,10 @@ def test_captions_stand_in_their_corners():
     changed = (add_captions(lbs, bottom="1.25 s") != lbs).any(axis=2)
     assert changed[90:].any() and not changed[:80].any()
     assert (lbs == 200).all()
+
+
+def test_shots_of_one_name_are_told_apart_by_their_folders():
+    assert captions([Path("a/walk.usdc"), Path("b/run.usdc")]) == ["walk", "run"]
+    assert captions([Path("shots/walk/shot.usda"), Path("shots/run/shot.usda")]) == ["walk/shot", "run/shot"]
+    assert captions([Path("x/walk/cape/anim.usdc"), Path("x/run/cape/anim.usdc")])[1] == "run/cape/anim"
+    assert captions([Path("walk.usdc"), Path("walk.usdc")]) == ["walk", "walk"]

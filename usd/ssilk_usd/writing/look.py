@@ -155,6 +155,7 @@ def copy_looks(
         if look is None:
             text = f"its look, if it had any: {source} has no mesh of its polygons"
             todo = f"'ssilk rig STAGE --onto {source}' writes a stage that has it"
+            todo += f", for its own body 'ssilk rig {source} --garment FILE'"
             left.add(mesh.path.rpartition("/")[2], f"{text}; {todo}")
         elif twin := _twin(mesh, look, opened):
             text = f"its look, unless it is that of {look.prim.GetPath()}: {twin.GetPath()} has the same polygons"
