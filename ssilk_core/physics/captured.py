@@ -32,16 +32,17 @@ def rounded_up(frames: int) -> int:
     return max(LEAST, 1 << (frames - 1).bit_length())
 
 
-def captured(work: Callable[[], object], pool: Any = None) -> torch.cuda.CUDAGraph:
-    """Return the graph of some work, which it does twice: kernels are compiled first, and libraries begin."""
-    stream = torch.cuda.Stream()
-    stream.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(stream):
-        work()
-    torch.cuda.current_stream().wait_stream(stream)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool=pool):
-        work()
+def captured(work: Callable[[], object], device: torch.device, pool: Any = None) -> torch.cuda.CUDAGraph:
+    """Return the graph of some work, which a GPU does twice: kernels are compiled first, and libraries begin."""
+    with torch.cuda.device(device):
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            work()
+        torch.cuda.current_stream().wait_stream(stream)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph, pool=pool):
+            work()
     return graph
 
 
@@ -81,7 +82,7 @@ class _Graph:
         def work() -> None:
             self._found = function(*given)
 
-        self._graph = captured(work, pool)
+        self._graph = captured(work, own[0].device, pool)
 
     def __call__(self, leaves: Sequence[Tensor], frames: int) -> list[Tensor]:
         for own, leaf in zip(self._own, leaves, strict=True):

@@ -38,6 +38,7 @@ class NewtonSteps:
 
     def __init__(self, scene: Scene, fabric: Fabric, fps: float, device: torch.device) -> None:
         self.potential = IncrementalPotential(scene, fabric, device=device, dtype=torch.float32)
+        self.potential.in_graphs = False  # a training counts its memory before
         self.dt = 1 / fps
 
     @torch.no_grad()

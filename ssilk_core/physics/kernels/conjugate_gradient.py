@@ -138,7 +138,8 @@ class _CapturedSolve:
             for _ in range(self._several):
                 own.iterate()
 
-        self._begin, self._iterate = captured(lambda: own.begin(reduction)), captured(iterate)
+        device = right.device
+        self._begin, self._iterate = captured(lambda: own.begin(reduction), device), captured(iterate, device)
 
     def __call__(self, blocks: Tensor, inverse: Tensor, right: Tensor, iterations: int) -> tuple[Tensor, int]:
         own, frames = self._own, right.shape[-1]

@@ -28,7 +28,7 @@ from torch import Tensor
 from ...scene.assets import Ints, Scene
 from ...scene.fabrics import Fabric
 from .. import loops
-from ..captured import Captured
+from ..captured import Captured, replays
 from ..collision import Contacts, PosedBody, SmoothedDistance
 from ..collision.inner_cloth import PosedBeneath
 from ..collision.pierced import PiercedCloth, PiercedOutfit
@@ -100,11 +100,14 @@ class IncrementalPotential:
         size: diagonal of the garment's bounding box at rest [m].
         cloth: the samples at which it meets things, those that meet the body and the world first.
         sample_count: of these.
+        in_graphs: whether a GPU may keep graphs of it, which hold memory as long as it lives.
 
     Args:
         dtype: of positions, energies and gradients; Hessians are float32.
         limbs: which of the limbs that are posed must not cross the garment, bool (L,); all by default.
     """
+
+    in_graphs = True
 
     def __init__(
         self,
@@ -144,6 +147,10 @@ class IncrementalPotential:
     def self_contact(self) -> SelfContact:
         """What knows where the garment touches itself; nothing is spent on it where nobody asks."""
         return self._self_contact()
+
+    def replays(self, x: Tensor, inputs: StepInputs) -> bool:
+        """Return whether `captured` serves positions x (V, 3, N)."""
+        return self.in_graphs and inputs.is_plain and replays(x)
 
     @cached_property
     def captured(self) -> CapturedPotential:

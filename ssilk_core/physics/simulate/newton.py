@@ -27,7 +27,6 @@ from torch import Tensor
 
 from ...errors import fail
 from .. import kernels
-from ..captured import replays
 from ..collision import SmoothedDistance
 from ..framed import Framed
 from ..self_contact import ClothContacts, ClothNeighbours
@@ -115,7 +114,7 @@ class State(Framed):
     @classmethod
     def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
-        if inputs.is_plain and replays(x):
+        if potential.replays(x, inputs):
             energy, *planes = potential.captured.state(x, inputs)
             return cls(x, SmoothedDistance(*planes) if planes else None, energy)
         body_distance = potential.body_distance(x, inputs)
@@ -316,7 +315,7 @@ class Search:
             around = replace(self.inputs, neighbours=self.state.neighbours)
             self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
         given = self.state.x, self.inputs, self.state.body_distance
-        if self.inputs.is_plain and replays(self.state.x):
+        if self.potential.replays(self.state.x, self.inputs):
             (gradient,) = self.potential.captured.gradient(*given)
         else:
             gradient = self.potential.gradient(*given)
@@ -341,7 +340,7 @@ def newton_step(
     """
     right = -gradient[potential.free].float()
     given = state.x, inputs, state.body_distance, fixed, exact_hessian
-    if inputs.is_plain and replays(state.x):
+    if potential.replays(state.x, inputs):
         blocks, inverse = potential.captured.hessian(*given)
         matrix = BlockMatrix(potential.block_pattern, blocks, inverse=inverse)
     else:
