@@ -123,7 +123,7 @@ WRONG = {
         "key 'over': a, b are worn over one another",
     ),
     "graded": ('[cape]\ngraded = "yes"', "key 'graded': 'yes'; true or false is needed"),
-    "family": ("[cape]\nfamily = 3", "key 'family': 3; a path or a list of paths is needed"),
+    "family": ("[cape]\nfamily = 3", "key 'family': 3; true, or a list of bodies, is needed"),
     "motions": ("[cape]\nmotions = []", "key 'motions': []; a path or a list of paths is needed"),
 }
 
