@@ -74,7 +74,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
     )
     verb.add_argument("--tolerance", type=shared.NumberRange(1e-9, 1e3), default=1e-2, metavar="G",
-                      help="largest residual acceleration of a vertex, in units of g (default 0.01)")  # fmt: skip
+                      help="RMS acceleration that may be left in the cloth, in g (default 0.01)")  # fmt: skip
     verb.add_argument("--iterations", type=shared.NumberRange(1, 10**6, int), default=100, metavar="N",
                       help="most iterations of the solver in each frame, or part of one (default 100)")  # fmt: skip
     verb.add_argument("--self-contact", action="store_true",

@@ -13,6 +13,7 @@ from ...scene.family import with_joints
 
 BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotation matrices
 ALLOWED, TODO = "a model bakes on the character it was trained with", "train on this character"
+BOTH = f"{TODO}, or on both bodies with --family"
 ONTO = f"{TODO}, or put the garment onto its joints by 'ssilk rig --onto' with a map of joints"
 
 
@@ -76,7 +77,7 @@ def _need_same_binds(found: Skeleton, trained: Skeleton, order: Ints) -> None:
             found.path,
             f"joint '{names[joint]}' is bound {away[joint]:.3g} m from where the model has it",
             ALLOWED,
-            TODO,
+            BOTH,
         )
     turned = np.abs(difference[:, :3, :3]).max(axis=(1, 2))
     joint = int(turned.argmax())
@@ -85,5 +86,5 @@ def _need_same_binds(found: Skeleton, trained: Skeleton, order: Ints) -> None:
             found.path,
             f"joint '{names[joint]}' is bound at another rotation than the model has it",
             ALLOWED,
-            TODO,
+            BOTH,
         )

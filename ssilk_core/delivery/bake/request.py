@@ -140,6 +140,9 @@ class BakeRequest:
         if not 0 <= self.latent_iterations <= MAX_REFINE or int(self.latent_iterations) != self.latent_iterations:
             found = f"{self.latent_iterations:g} iterations"
             fail("--latent-iterations", found, f"1 to {MAX_REFINE} are allowed, or 0 for none")
+        if self.hold > 1 and self.refine:
+            found = f"poses that are held for {self.hold} frames, and --refine"
+            fail("--hold", found, "the solver moves each frame", "leave one of them out")
         if self.lbs and self.latent_iterations:
             found = "linear blend skinning has no latents"
             fail("--latent-iterations", found, "only the network has them", "leave one of them out")

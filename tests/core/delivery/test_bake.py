@@ -20,7 +20,7 @@ CHANGED = BakeRequest(
     latent_iterations=2, latent_elements="few", refined_output="points", hide_covered=True,
     keep=ModelSize(shapes=8, joints=4, influences=2), device="cuda", garment="cape", shot="walk",
     range="1001-1100", handles=8, level_of="coat", asset_version="v012", asset_identifier="studio:/cape",
-    colliders=("/Floor", "/Wall"), wind="0,0,5", gusts="2", gravity="0,-3,0", hold=2, loop=True,
+    colliders=("/Floor", "/Wall"), wind="0,0,5", gusts="2", gravity="0,-3,0", hold=1, loop=True,
     fabric="silk", material=("bending=2x", "drag=0.1"), start_cloth="before.usdc@1000",
 )  # fmt: skip
 
@@ -66,6 +66,7 @@ def test_what_is_no_request_is_not_read(document):
         ({"asset_version": "v\n1"}, "--asset-version: 'v.*'; 1 to 1000 printable characters are allowed"),
         ({"lbs": True, "fabric": "silk"}, "linear blend skinning has no fabric"),
         ({"hold": 101}, "--hold: 101 frames; 1 to 100 are allowed"),
+        ({"hold": 2, "refine": 4}, "--hold: poses that are held for 2 frames, and --refine"),
         ({"asset_identifier": ""}, "--asset-identifier: ''; 1 to 1000 printable characters are allowed"),
         ({"refined_output": "voxels"}, "--refined-output: 'voxels'; it is one of joints, points"),
         ({"lbs": True, "keep": ModelSize(shapes=1, joints=1, influences=1)}, "leave keep out"),
