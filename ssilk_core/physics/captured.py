@@ -47,7 +47,7 @@ def captured(work: Callable[[], object], device: torch.device, pool: Any = None)
 
 
 class Captured:
-    """A function of values of N frames, each a tensor with the frames last, a `Framed` one, or None.
+    """A function of values of N frames, each a tensor with the frames last, a `Framed` one without tuples, or None.
 
     It returns tensors with the frames last. What frames share must stay as it is in between calls.
     """
@@ -111,7 +111,7 @@ def _kind(value: Any) -> Hashable:
     """Return what values have in common that one graph serves."""
     if isinstance(value, Tensor):
         return value.shape[:-1], value.dtype
-    if isinstance(value, Framed):
+    if isinstance(value, Framed) and not any(isinstance(own, tuple) for own in value.own().values()):
         shared = (getattr(value, name) for name in sorted(value.SHARED))
         return (
             type(value),

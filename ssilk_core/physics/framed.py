@@ -12,8 +12,8 @@ from torch import Tensor
 
 
 class Framed:
-    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, None, or
-    numbers that all frames share.
+    """A frozen dataclass of N frames. Its fields are tensors with the frames last, others of its kind, tuples of
+    these, None, or numbers that all frames share.
 
     Attributes:
         SHARED: names of fields that all frames share.
@@ -69,12 +69,16 @@ def consecutive(counts: Sequence[int], device: torch.device) -> tuple[Tensor, ..
 def _selected(value: Any, frames: Tensor) -> Any:
     if isinstance(value, Tensor):
         return value[..., frames]
+    if isinstance(value, tuple):
+        return tuple(_selected(each, frames) for each in value)
     return value if _is_shared(value) else value.select(frames)
 
 
 def _concatenated(values: list[Any]) -> Any:
     if isinstance(values[0], Tensor):
         return torch.cat(values, dim=-1)
+    if isinstance(values[0], tuple):
+        return tuple(_concatenated(list(each)) for each in zip(*values, strict=True))
     return values[0] if _is_shared(values[0]) else type(values[0]).concatenated(values)
 
 

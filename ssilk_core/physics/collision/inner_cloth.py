@@ -30,6 +30,7 @@ from ...scene.assets import PINNED, TIGHT, Floats, Ints, Mesh, Scene
 from ...scene.mesh import topology
 from ...scene.mesh.blocks import compact_blocks
 from .. import kernels
+from ..framed import Framed
 from ..operators import SparseOperator
 from .closest_point import triangle_patches
 from .contacts import NO_CONTACT_DISTANCE, no_planes
@@ -55,19 +56,10 @@ class InnerSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class PosedBeneath:
+class PosedBeneath(Framed):
     """The surfaces of several garments beneath one, in N frames."""
 
     parts: tuple[PosedBody, ...]
-
-    def select(self, frames: Tensor) -> PosedBeneath:
-        """Return those in the frames with indices (M,)."""
-        return PosedBeneath(tuple(part.select(frames) for part in self.parts))
-
-    @classmethod
-    def concatenated(cls, several: Sequence[PosedBeneath]) -> PosedBeneath:
-        """Return those in the frames of several, one after the other."""
-        return cls(tuple(PosedBody.concatenated(own) for own in zip(*(each.parts for each in several))))
 
 
 class InnerCloth:

@@ -13,7 +13,6 @@ crossing is decided at rest, so that the same cloth is pushed until it is past t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +66,7 @@ class PiercedCloth(Framed):
 
 
 @dataclass(frozen=True, eq=False)
-class PiercedOutfit:
+class PiercedOutfit(Framed):
     """That of several garments, which are posed together; None for those that no limb can pierce."""
 
     parts: tuple[PiercedCloth | None, ...]
@@ -80,16 +79,6 @@ class PiercedOutfit:
     def on(self, limbs: PosedLimbs) -> PiercedOutfit:
         """Return the same cloth, as `PiercedCloth.on` does."""
         return PiercedOutfit(tuple(part and part.on(limbs) for part in self.parts))
-
-    def select(self, frames: Tensor) -> PiercedOutfit:
-        """Return that of the frames with indices (M,)."""
-        return PiercedOutfit(tuple(part and part.select(frames) for part in self.parts))
-
-    @classmethod
-    def concatenated(cls, several: Sequence[PiercedOutfit]) -> PiercedOutfit:
-        """Return that of the frames of several, one after the other."""
-        parts = zip(*(each.parts for each in several))
-        return cls(tuple(PiercedCloth.concatenated(own) if own[0] else None for own in parts))
 
 
 class Piercing:

@@ -54,6 +54,7 @@ class Asked:
 
     @property
     def on_gpu(self) -> bool:
+        """Whether a GPU solves it."""
         return self.past.last.device.type == "cuda"
 
 
