@@ -19,7 +19,7 @@ import numpy as np
 from .assets import Floats, Ints
 
 HELD = 1e-5  # of the mean square distance of skin, along an axis: what is less says little of stretch along it
-SHARED = 1e-6  # of the weight of a whole point, below which skin counts as none
+NO_SKIN = 1e-6  # of the weight of a whole point, below which skin counts as none
 
 
 def following_moves(
@@ -45,12 +45,12 @@ def following_moves(
             whole[its_rows] = its
             shared = own * whole[rows]
             whole[its_rows] = 0
-            if shared.sum() > SHARED:
+            if shared.sum() > NO_SKIN:
                 wide = _gradient(points[both[0]], moves[both[0]], both[1])
                 found[joint] = _affine_move(joints[joint], points[rows], moves[rows], shared, wide)
                 continue
         at = joint
-        while at >= 0 and of_joint[at][1].sum() <= SHARED:
+        while at >= 0 and of_joint[at][1].sum() <= NO_SKIN:
             at = parents[at]
         if at >= 0:
             rows, own = of_joint[at]
