@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ..network.model.network import GarmentModel
-from ..physics.collision import CollisionBody, Contacts, signed_distance_to_planes
+from ..physics.collision import CollisionBody, Contacts
 from ..physics.collision.contacts import no_planes
 from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
@@ -143,10 +143,7 @@ class Objective:
         if self.inner and beneath:
             normal, offset = self.inner.deeper((normal, offset), x, beneath)
         if obstacles:
-            distance, away = obstacles.nearest(x)
-            nearer = distance < signed_distance_to_planes(x, normal, offset)
-            offset = torch.where(nearer, (away * x).sum(1) - distance, offset)
-            normal = torch.where(nearer[:, None], away, normal)
+            return obstacles.nearer_planes(x, normal, offset, self.clearance)
         return normal, offset + self.clearance
 
     def _buried(self, frames: Tensor) -> Tensor | None:

@@ -27,6 +27,8 @@ from ..network.model.descriptors import proximity_features, proximity_length
 from ..network.model.feedback import BodyFrames
 from ..network.model.network import GarmentModel
 from ..network.proximity import proximity_reach
+from ..physics import kernels
+from ..physics.collision import signed_distance_to_planes
 from ..physics.skinning import Skinning
 from ..scene.assets import SkinWeights
 from ..scene.family import BodyFamily
@@ -90,12 +92,44 @@ class Obstacles:
 
     def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distances of points (M, 3, N) to the nearest box [m], (M, N), and directions away, (M, 3, N)."""
+        if kernels.supports(points):
+            from ..physics.kernels.boxes import nearest_box_kernel
+
+            return nearest_box_kernel(points, self.parts)
         found = [self._away(points, box) for box in range(len(self.radius))]
         distance, away = found[0]
         for other, direction in found[1:]:
             nearer = other < distance
             distance, away = torch.where(nearer, other, distance), torch.where(nearer[:, None], direction, away)
         return distance, away
+
+    def clearance(self, points: Tensor) -> Tensor:
+        """Return the least distance of points (M, 3, N) to each box [m], shape (K, N)."""
+        if kernels.supports(points):
+            from ..physics.kernels.boxes import box_clearance_kernel
+
+            return box_clearance_kernel(points, self.parts)
+        return torch.stack([self.distance(points, box).amin(dim=0) for box in range(len(self.radius))])
+
+    def nearer_planes(
+        self, points: Tensor, normal: Tensor, offset: Tensor, clearance: float
+    ) -> tuple[Tensor, Tensor]:
+        """Return planes of points (M, 3, N), moved outwards: those given, or of the nearest box where it is nearer.
+
+        Args:
+            normal: (M, 3, N), and offset: (M, N) [m]; they may be changed.
+            clearance: by which planes are moved [m].
+        """
+        if kernels.supports(points):
+            from ..physics.kernels.boxes import nearer_planes_kernel
+
+            normal, offset = normal.contiguous(), offset.contiguous()
+            nearer_planes_kernel(points, self.parts, normal, offset, clearance)
+            return normal, offset
+        distance, away = self.nearest(points)
+        nearer = distance < signed_distance_to_planes(points, normal, offset)
+        offset = torch.where(nearer, (away * points).sum(1) - distance, offset)
+        return torch.where(nearer[:, None], away, normal), offset + clearance
 
     def _local(self, points: Tensor, box: int) -> Tensor:
         return torch.einsum("nba,mbn->man", self.turn[box], points - self.centre[box].T)
@@ -219,7 +253,7 @@ class ObstacleDrawer:
         beside = torch.where(chance[3] < UNTOUCHED, beside, torch.full_like(beside, -LARGE))
 
         def in_the_way(box: Obstacles) -> Tensor:
-            cloth = beside - box.distance(points, 0).amin(dim=0)
+            cloth = beside - box.clearance(points)[0]
             return torch.maximum(-self._clearance(box, frames)[0], cloth).clamp_min(0)
 
         level, (box, way) = self._floors(points, gravity, lies), self._others(points)
@@ -267,9 +301,8 @@ class ObstacleDrawer:
         """Return how far the body is outside of each obstacle in its frames (T, N), at least, [m], shape (K, N)."""
         with torch.no_grad():
             points = self._skin(self._body, None, self._skin.weights, self.bank.character(frames.flatten()))
-        repeated = obstacles.repeated(len(frames))
-        least = [repeated.distance(points, box).amin(dim=0) for box in range(len(obstacles.radius))]
-        return torch.stack(least).unflatten(1, frames.shape).amin(dim=1) - SKIN
+        least = obstacles.repeated(len(frames)).clearance(points)
+        return least.unflatten(1, frames.shape).amin(dim=1) - SKIN
 
     def _floors(self, points: Tensor, gravity: Tensor, level: Tensor) -> Obstacles:
         """Return floors and walls that pass through the middle of the garment; level ones where `level` (N,) says."""

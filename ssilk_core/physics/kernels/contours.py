@@ -2,8 +2,9 @@
 """Lengths of intersection contours, and their gradients; reference: `intersections.contours`.
 
 Triangles lie in tiles of `TILE`. A program of the search owns a tile in a frame, and writes pairs of its triangles
-with those of the same and of later tiles into `SLOTS` places of its own; a pair that finds none is left out. Sums are
-of whole numbers, which are the same in any order: results are deterministic.
+with those of the same and of later tiles into `SLOTS` places of its own; a pair that finds none is left out. It
+compares the boxes of `BOXES` tiles at once, and goes through those that meet its own. Sums are of whole numbers,
+which are the same in any order: results are deterministic.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from torch import Tensor
 from .vectors import cross, dot
 
 TILE, SLOTS = 32, 256
-SEARCHING, MEASURING = 4, 2  # warps
+BOXES = tl.constexpr(32)
+PAIRS = tl.constexpr(32)  # measured at once
+SEARCHING, MEASURING = 4, 1  # warps
 STEPS = tl.constexpr(float(1 << 32))  # of a newton
 TINY = tl.constexpr(1e-30)
 
@@ -115,11 +118,21 @@ def _search(points, low, high, tile_low, tile_high, faces, places, moves, pairs,
     lx, ly, lz = (tl.load(tile_low + own), tl.load(tile_low + tiles + own), tl.load(tile_low + 2 * tiles + own))
     hx, hy, hz = (tl.load(tile_high + own), tl.load(tile_high + tiles + own), tl.load(tile_high + 2 * tiles + own))
     total = 0
-    for other in range(own, tiles):
-        meets = (tl.load(tile_low + other) <= hx) & (tl.load(tile_high + other) >= lx)
-        meets &= (tl.load(tile_low + tiles + other) <= hy) & (tl.load(tile_high + tiles + other) >= ly)
-        meets &= (tl.load(tile_low + 2 * tiles + other) <= hz) & (tl.load(tile_high + 2 * tiles + other) >= lz)
-        if meets:
+    box = tl.arange(0, BOXES)
+    for first in range(own, tiles, BOXES):
+        k = first + box
+        last = k < tiles
+        meets = last & (tl.load(tile_low + k, mask=last, other=0.0) <= hx)
+        meets &= tl.load(tile_high + k, mask=last, other=0.0) >= lx
+        meets &= tl.load(tile_low + tiles + k, mask=last, other=0.0) <= hy
+        meets &= tl.load(tile_high + tiles + k, mask=last, other=0.0) >= ly
+        meets &= tl.load(tile_low + 2 * tiles + k, mask=last, other=0.0) <= hz
+        meets &= tl.load(tile_high + 2 * tiles + k, mask=last, other=0.0) >= lz
+        left = tl.sum(meets.to(tl.int64) << box, axis=0)  # a bit for each that meets
+        while left != 0:
+            lowest = left & -left
+            left ^= lowest
+            other = first + (tl.log2(lowest.to(tl.float32)) + 0.5).to(tl.int32)
             j = other * tile + tl.arange(0, tile)
             there = j < count
             near = (tl.load(low + j)[None, :] <= ihx[:, None]) & (tl.load(high + j)[None, :] >= ilx[:, None])
@@ -209,50 +222,53 @@ def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, 
         return
     points += frame * vertices * 3
     gradient += frame * vertices * 3
-    slot = tl.arange(0, slots)
-    counts = slot < total
-    name = tl.load(pairs + place * slots + slot, mask=counts, other=0)
-    low = tl.zeros((slots,), tl.int32)
-    high = low + allowed_count
-    for _halving in tl.static_range(halvings):
-        middle = (low + high) // 2
-        less = tl.load(allowed + middle, mask=low < high, other=0) < name
-        low, high = tl.where((low < high) & less, middle + 1, low), tl.where((low < high) & ~less, middle, high)
-    counts &= tl.load(allowed + low, mask=low < allowed_count, other=-1) != name
-    i, j = (name // count).to(tl.int32), (name % count).to(tl.int32)
-    ia, ib, ic = tl.load(faces + 3 * i), tl.load(faces + 3 * i + 1), tl.load(faces + 3 * i + 2)
-    ja, jb, jc = tl.load(faces + 3 * j), tl.load(faces + 3 * j + 1), tl.load(faces + 3 * j + 2)
-    hits = tl.zeros((slots,), tl.int32)
-    zero = tl.zeros((slots,), tl.float32)
-    sx, sy, sz, lx, ly, lz = zero, zero, zero, zero, zero, zero
-    for edge in range(6):
-        start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
-        inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
-        first = inside & (hits == 0)
-        sx, sy, sz = tl.where(first, rx, sx), tl.where(first, ry, sy), tl.where(first, rz, sz)
-        lx, ly, lz = tl.where(inside, rx, lx), tl.where(inside, ry, ly), tl.where(inside, rz, lz)
-        hits += inside.to(tl.int32)
-    counts &= hits == 2
-    gx, gy, gz = sx - lx, sy - ly, sz - lz
-    length = tl.sqrt(dot(gx, gy, gz, gx, gy, gz))
-    tl.store(lengths + place, tl.sum(tl.where(counts, length, 0.0), 0))
-    length = tl.maximum(length, TINY)
-    gx, gy, gz = gx / length, gy / length, gz / length
-    ends = tl.zeros((slots,), tl.int32)
-    for edge in range(6):
-        start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
-        inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
-        sign = tl.where(ends == 0, 1.0, -1.0)
-        fx, fy, fz = sign * gx, sign * gy, sign * gz
-        slope = dot(nx, ny, nz, ex, ey, ez)
-        least = steepest * tl.sqrt(dot(nx, ny, nz, nx, ny, nz) * dot(ex, ey, ez, ex, ey, ez)) + TINY
-        slope = tl.where(slope < 0, -1.0, 1.0) * tl.maximum(tl.abs(slope), least)
-        along = -dot(fx, fy, fz, ex, ey, ez) / slope
-        nx, ny, nz = along * nx, along * ny, along * nz
-        fx, fy, fz = fx + nx, fy + ny, fz + nz
-        _add(gradient, start, inside, (1 - t) * fx, (1 - t) * fy, (1 - t) * fz)
-        _add(gradient, end, inside, t * fx, t * fy, t * fz)
-        _add(gradient, fa, inside, -(1 - u - v) * nx, -(1 - u - v) * ny, -(1 - u - v) * nz)
-        _add(gradient, fb, inside, -u * nx, -u * ny, -u * nz)
-        _add(gradient, fc, inside, -v * nx, -v * ny, -v * nz)
-        ends += inside.to(tl.int32)
+    whole = 0.0
+    for begin in range(0, total, PAIRS):
+        slot = begin + tl.arange(0, PAIRS)
+        counts = slot < total
+        name = tl.load(pairs + place * slots + slot, mask=counts, other=0)
+        low = tl.zeros((PAIRS,), tl.int32)
+        high = low + allowed_count
+        for _halving in tl.static_range(halvings):
+            middle = (low + high) // 2
+            less = tl.load(allowed + middle, mask=low < high, other=0) < name
+            low, high = tl.where((low < high) & less, middle + 1, low), tl.where((low < high) & ~less, middle, high)
+        counts &= tl.load(allowed + low, mask=low < allowed_count, other=-1) != name
+        i, j = (name // count).to(tl.int32), (name % count).to(tl.int32)
+        ia, ib, ic = tl.load(faces + 3 * i), tl.load(faces + 3 * i + 1), tl.load(faces + 3 * i + 2)
+        ja, jb, jc = tl.load(faces + 3 * j), tl.load(faces + 3 * j + 1), tl.load(faces + 3 * j + 2)
+        hits = tl.zeros((PAIRS,), tl.int32)
+        zero = tl.zeros((PAIRS,), tl.float32)
+        sx, sy, sz, lx, ly, lz = zero, zero, zero, zero, zero, zero
+        for edge in range(6):
+            start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
+            inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
+            first = inside & (hits == 0)
+            sx, sy, sz = tl.where(first, rx, sx), tl.where(first, ry, sy), tl.where(first, rz, sz)
+            lx, ly, lz = tl.where(inside, rx, lx), tl.where(inside, ry, ly), tl.where(inside, rz, lz)
+            hits += inside.to(tl.int32)
+        counts &= hits == 2
+        gx, gy, gz = sx - lx, sy - ly, sz - lz
+        length = tl.sqrt(dot(gx, gy, gz, gx, gy, gz))
+        whole += tl.sum(tl.where(counts, length, 0.0), 0)
+        length = tl.maximum(length, TINY)
+        gx, gy, gz = gx / length, gy / length, gz / length
+        ends = tl.zeros((PAIRS,), tl.int32)
+        for edge in range(6):
+            start, end, fa, fb, fc = _chosen(edge, ia, ib, ic, ja, jb, jc)
+            inside, t, u, v, nx, ny, nz, rx, ry, rz, ex, ey, ez = _edge(points, start, end, fa, fb, fc, counts)
+            sign = tl.where(ends == 0, 1.0, -1.0)
+            fx, fy, fz = sign * gx, sign * gy, sign * gz
+            slope = dot(nx, ny, nz, ex, ey, ez)
+            least = steepest * tl.sqrt(dot(nx, ny, nz, nx, ny, nz) * dot(ex, ey, ez, ex, ey, ez)) + TINY
+            slope = tl.where(slope < 0, -1.0, 1.0) * tl.maximum(tl.abs(slope), least)
+            along = -dot(fx, fy, fz, ex, ey, ez) / slope
+            nx, ny, nz = along * nx, along * ny, along * nz
+            fx, fy, fz = fx + nx, fy + ny, fz + nz
+            _add(gradient, start, inside, (1 - t) * fx, (1 - t) * fy, (1 - t) * fz)
+            _add(gradient, end, inside, t * fx, t * fy, t * fz)
+            _add(gradient, fa, inside, -(1 - u - v) * nx, -(1 - u - v) * ny, -(1 - u - v) * nz)
+            _add(gradient, fb, inside, -u * nx, -u * ny, -u * nz)
+            _add(gradient, fc, inside, -v * nx, -v * ny, -v * nz)
+            ends += inside.to(tl.int32)
+    tl.store(lengths + place, whole)

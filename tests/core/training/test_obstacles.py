@@ -3,6 +3,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,8 @@ from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.windows import WindowSampler
 
 CPU, JOINTS, POINTS = torch.device("cpu"), np.arange(3), 7
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"  # on a CPU kernels run in Triton's interpreter
+KERNELS = pytest.mark.skipif(find_spec("triton") is None, reason="kernels need Triton")
 
 
 def one_box(turn: np.ndarray, centre, half, radius: float) -> Obstacles:
@@ -119,6 +122,30 @@ def test_of_several_the_nearest_counts() -> None:
     first = alone[0][0] <= alone[1][0]
     assert first.any() and not first.all()
     assert torch.equal(away, torch.where(first[:, None], alone[0][1], alone[1][1]))
+
+
+@KERNELS
+def test_kernels_find_what_their_references_find() -> None:
+    from ssilk_core.physics.kernels.boxes import box_clearance_kernel, nearer_planes_kernel, nearest_box_kernel
+
+    draw = torch.Generator().manual_seed(0)
+    turn, half = torch.linalg.qr(torch.randn(2, 37, 3, 3, generator=draw))[0], torch.rand(2, 37, 3, generator=draw)
+    half[1, ::2, 1:] = 0  # capsules
+    drawn = turn, torch.randn(2, 37, 3, generator=draw), half, 0.3 * torch.rand(2, 37, generator=draw)
+    obstacles, points = Obstacles(*drawn), 1.5 * torch.randn(21, 3, 37, generator=draw)
+    normal, offset = torch.nn.functional.normalize(torch.randn(21, 3, 37), dim=1), torch.randn(21, 37)
+    distance, away = obstacles.nearest(points)
+    assert (distance < 0).any() and (distance > 0).any()
+    nearer = distance < (normal * points).sum(1) - offset
+    assert nearer.any() and not nearer.all()
+    planes = obstacles.nearer_planes(points, normal, offset, 0.005)
+    on_device = [points.to(DEVICE), tuple(part.to(DEVICE) for part in obstacles.parts)]
+    found = [normal.to(DEVICE).clone(), offset.to(DEVICE).clone()]
+    nearer_planes_kernel(*on_device, *found, 0.005)
+    for one, other in zip((*nearest_box_kernel(*on_device), *found), (distance, away, *planes)):
+        torch.testing.assert_close(one.cpu(), other, atol=1e-5, rtol=1e-5)
+    least = box_clearance_kernel(*on_device).cpu()
+    torch.testing.assert_close(least, torch.stack([obstacles.distance(points, box).amin(0) for box in range(2)]))
 
 
 def test_the_body_stays_outside_and_the_share_without_has_nothing_near(scene, seeing, bank) -> None:
