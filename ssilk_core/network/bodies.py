@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A model for a family of bodies, as one for the body that it plays.
 
-P, S and D see a body by its coordinates (`scene.family`), beside what they see of the pose: as more inputs of their
-first layers. A body does not change while a shot plays, so that what these inputs add is constant. It is added to the
-biases of these layers when a model is put on a body, and the garment is laid where it lies there. What is left is a
-model for one body, which every player takes, at the cost of one. At the base, whose coordinates are zero, it is the
-model that the file holds, bit for bit.
+P, S and D see a body by its coordinates (`scene.family`), beside what they see of the pose. They add to the biases of
+first layers, which may see fabrics too. In the other hidden layers they also multiply the rows of the weights
+(feature-wise linear modulation; Perez et al., "FiLM", 2018). A body does not change while a shot plays, so that both
+are constant. They are put into weights and biases when a model is put on a body, and the garment is laid where it
+lies there. What is left is a model for one body, which every player takes, at the cost of one. At the base, whose
+coordinates are zero, it is the model that the file holds, bit for bit.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from ..errors import fail
 from ..scene.assets import Floats, Ints, Skeleton
 from ..scene.assets.arrays import assign, frozen
 from ..scene.family import BodyFamily, DressedFamily
-from .first_layers import biases_under, blank_columns, misfit
 
 SEEING = ("initialiser", "stepper", "output")  # networks that see the body, where a model has them
+LAYER = re.compile(rf"({'|'.join(SEEING)})\.\d+")
+Columns = Mapping[str, Floats]
 TENSORS = ("members", "rows", "joints", "points", "joint_moves", "point_moves", "taller")
 
 
@@ -33,18 +35,20 @@ class SeenBodies:
 
     Attributes:
         family: the bodies, and where the garment lies on them.
-        columns: weights of the coordinates in the first layer of each network that sees them, shape (H, K).
+        columns: weights of the coordinates in layers of the networks that see them, by the layer's name, shape
+            (2, H, K): of what is added to its H biases, and of what the rows of its weights are multiplied by
+            beyond one.
     """
 
     family: DressedFamily
-    columns: Mapping[str, Floats]
+    columns: Columns
 
     def __post_init__(self) -> None:
         found = {name: frozen(values, np.float32) for name, values in self.columns.items()}
         assign(self, columns=found)
         for name, values in found.items():
-            if name not in SEEING or values.ndim != 2 or values.shape[1] != self.family.bodies.size:
-                fail("body family", f"weights '{name}' of shape {values.shape}", "(H, K) is needed", "train again")
+            if not LAYER.fullmatch(name) or values.ndim != 3 or values.shape[::2] != (2, self.family.bodies.size):
+                fail("body family", f"weights '{name}' of shape {values.shape}", "(2, H, K) is needed", "train again")
 
     def tensors(self) -> dict[str, Any]:
         """Return the tensors of a file, by name."""
@@ -68,7 +72,14 @@ class SeenBodies:
             tensors["family.cloth_moves"],
             tensors["family.proxy_moves"],
         )
-        return cls(dressed, {name: tensors[f"family.{name}"] for name in SEEING if f"family.{name}" in tensors})
+        columns = {}
+        for name, values in tensors.items():
+            if (layer := name.removeprefix("family.")) != name:
+                if LAYER.fullmatch(layer):
+                    columns[layer] = values
+                elif layer in SEEING:  # as of files whose networks saw bodies in their first layers alone
+                    columns[f"{layer}.0"] = np.stack([values, np.zeros_like(values)])
+        return cls(dressed, columns)
 
     def need_fit(self, skeleton: Skeleton, vertices: int, proxies: int, parameters: Mapping[str, Floats]) -> None:
         """Raise `SsilkError` unless this belongs to a garment's skeleton, vertices, proxies and network."""
@@ -77,12 +88,18 @@ class SeenBodies:
         if found != (skeleton.joint_count, vertices, proxies):
             wanted = f"{skeleton.joint_count} joints, {vertices} vertices and {proxies} proxies are needed"
             fail("body family", f"{found[0]} joints, {found[1]} vertices and {found[2]} proxies", wanted)
-        if name := misfit(SEEING, self.columns, parameters):
+        if name := misfit(self.columns, parameters):
             fail("body family", f"weights '{name}' do not fit the network", "one row for each unit is needed")
 
-    def biases(self, parameters: Mapping[str, Floats], coordinates: Floats) -> dict[str, Floats]:
-        """Return the biases of the first layers on a body at coordinates (K,), by name."""
-        return biases_under(self.columns, parameters, coordinates)
+    def parameters(self, parameters: Mapping[str, Floats], coordinates: Floats) -> dict[str, Floats]:
+        """Return the weights and biases that differ on a body at coordinates (K,), by name."""
+        found = {}
+        for layer, (added, scales) in self.columns.items():
+            rows = 1 + scales @ coordinates
+            found[f"{layer}.weight"] = np.float32(rows[:, None] * parameters[f"{layer}.weight"])
+            if (bias := parameters.get(f"{layer}.bias")) is not None:
+                found[f"{layer}.bias"] = np.float32(bias + added @ coordinates)
+        return found
 
     def with_proxies(self, kept: Ints) -> SeenBodies:
         """Return this for a garment that keeps some of its proxies alone."""
@@ -93,33 +110,62 @@ class SeenBodies:
         return replace(self, family=self.family.stored())
 
 
-def unseen(parameters: Mapping[str, Floats], size: int) -> dict[str, Floats]:
-    """Return weights of K coordinates that count nothing, for the networks of a model of one body, by name."""
-    return blank_columns(SEEING, parameters, size)
+def misfit(columns: Columns, parameters: Mapping[str, Floats]) -> str | None:
+    """Return the first layer whose weights of coordinates do not fit its outputs; None where all fit."""
+    for layer, values in columns.items():
+        weight = parameters.get(f"{layer}.weight")
+        if weight is None or len(weight) != values.shape[1]:
+            return layer
+    return None
 
 
-COLUMNS = re.compile(r"(\w+)\.0\.parametrizations\.bias\.(original|0\.columns)")
+def _place(layer: str) -> int:
+    return int(layer.rpartition(".")[2])
+
+
+def completed(columns: Columns, parameters: Mapping[str, Floats], size: int) -> dict[str, Floats]:
+    """Return weights of K coordinates for all hidden layers of a model: those given, and others that count
+    nothing, by the layer's name."""
+    seeing = [name.removesuffix(".weight") for name in parameters if name.endswith(".weight")]
+    seeing = [layer for layer in seeing if LAYER.fullmatch(layer)]
+    last = {
+        max((layer for layer in seeing if layer.startswith(f"{name}.")), default="", key=_place) for name in SEEING
+    }
+    layers = {layer: len(parameters[f"{layer}.weight"]) for layer in seeing if layer not in last}
+    blank = {layer: np.zeros((2, outputs, size), np.float32) for layer, outputs in layers.items()}
+    return {**blank, **columns}
+
+
+PARAMETER = re.compile(r"(\w+\.\d+)\.parametrizations\.(bias|weight)\.(original|0\.columns)")
 
 
 def parted(values: Mapping[str, Floats]) -> tuple[dict[str, Floats], dict[str, Floats]]:
     """Return the parameters of a network that sees bodies (`model.bodies`) as those of one that sees none, and apart
     from them the weights of the coordinates."""
-    parameters, columns = {}, {}
+    parameters: dict[str, Floats] = {}
+    apart: dict[str, dict[str, Floats]] = {}
     for name, value in values.items():
-        found = COLUMNS.fullmatch(name)
+        found = PARAMETER.fullmatch(name)
         if found is None:
             parameters[name] = value
-        elif found[2] == "original":
-            parameters[f"{found[1]}.0.bias"] = value
+        elif found[3] == "original":
+            parameters[f"{found[1]}.{found[2]}"] = value
         else:
-            columns[found[1]] = value
+            apart.setdefault(found[1], {})[found[2]] = value
+    columns = {}
+    for layer, own in apart.items():
+        none = np.zeros_like(next(iter(own.values())))
+        columns[layer] = np.stack([own.get("bias", none), own.get("weight", none)])
     return parameters, columns
 
 
-def joined(parameters: Mapping[str, Floats], columns: Mapping[str, Floats]) -> dict[str, Floats]:
+def joined(parameters: Mapping[str, Floats], columns: Columns) -> dict[str, Floats]:
     """Return what `parted` takes apart."""
     found = dict(parameters)
-    for name, values in columns.items():
-        within = f"{name}.0.parametrizations.bias"
-        found[f"{within}.original"], found[f"{within}.0.columns"] = found.pop(f"{name}.0.bias"), values
+    for layer, both in columns.items():
+        for kind, values in zip(("bias", "weight"), both):
+            first = kind == "weight" and layer.endswith(".0")
+            if f"{layer}.{kind}" in found and not first:
+                within = f"{layer}.parametrizations.{kind}"
+                found[f"{within}.original"], found[f"{within}.0.columns"] = found.pop(f"{layer}.{kind}"), values
     return found

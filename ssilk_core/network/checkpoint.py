@@ -108,8 +108,7 @@ class ModelFile:
         if not coordinates.any():
             return self.on_base()
         scene = self.bodies.family.scene_at(self.scene, coordinates)
-        biases = self.bodies.biases(self.parameters, coordinates)
-        parameters = {**self.parameters, **biases}
+        parameters = {**self.parameters, **self.bodies.parameters(self.parameters, coordinates)}
         return replace(self, scene=scene, parameters=parameters, bodies=None)
 
     def on_base(self) -> ModelFile:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ..events import Message, Reporter, format_count, silent
 from ..network import fabrics as of_fabrics
-from ..network.bodies import joined, unseen
+from ..network.bodies import completed, joined
 from ..network.checkpoint import ModelFile, state_inputs
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
@@ -159,13 +159,13 @@ def build_parts(
     if job.base and job.whole:
         known = on_moved_garment(job.base.parameters, job.base.scene, scene, job.base.config)
         known = seeing_more(known, scene, job.base.config, job.model)
-        if job.family:
-            # To a model of one body coordinates count nothing yet.
-            own = job.base.bodies.columns if job.base.bodies else unseen(known, job.family.bodies.size)
-            known = joined(known, own)
         if job.fabrics:
             learned = job.base.fabrics.columns if job.base.fabrics else of_fabrics.unseen(job.base.parameters)
             known = of_fabrics.joined(known, learned, state_inputs(job.model))
+        if job.family:
+            # To a model of one body coordinates count nothing yet.
+            own = job.base.bodies.columns if job.base.bodies else {}
+            known = joined(known, completed(own, known, job.family.bodies.size))
         model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
     elif job.base:
         goes_on = _take_over(model, job.base)

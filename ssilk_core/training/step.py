@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..network.model.bodies import on_one_body
 from ..network.model.network import GarmentModel
 from ..physics import loops
 from .bodies import DrawnBodies
@@ -184,7 +185,12 @@ class Stepper:
         if self.bodies:
             self.bodies.draw(iteration)
         name = "static" if iteration < self.config.static_iterations else "dynamic"
-        body = self.static_step if name == "static" else self.dynamic_step
+        step = self.static_step if name == "static" else self.dynamic_step
+
+        def body() -> None:
+            with on_one_body(self.model):
+                step()
+
         if self.device.type == "cuda":
             self._replay(name, body)
         elif self._is_small and loops.available(self.device):
@@ -245,7 +251,7 @@ def _optimisers(model: GarmentModel, config: TrainConfig, device: torch.device) 
         elif name == "decoder.shapes":
             parts["shapes"].append(value)
         else:
-            # What a network sees of bodies adds to biases, and is learned as these are.
+            # What layers see of bodies is learned as biases are.
             parts["matrices" if value.ndim == 2 and not name.endswith(".columns") else "biases"].append(value)
     on_gpu = device.type == "cuda"
 

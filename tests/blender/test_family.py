@@ -57,7 +57,7 @@ for number, scale in enumerate(scales):
 family = BodyFamily.of(characters)
 dressed, _ = dressed_family(replace(file.scene, character=characters[0]), family, characters[1:])
 columns = {
-    name: rng.normal(0, 0.1, (len(file.parameters[f"{name}.0.bias"]), family.size))
+    f"{name}.0": rng.normal(0, 0.1, (2, len(file.parameters[f"{name}.0.bias"]), family.size))
     for name in SEEING if f"{name}.0.bias" in file.parameters
 }
 save_model(f"{folder}/family.safetensors", replace(file, bodies=SeenBodies(dressed, columns)))

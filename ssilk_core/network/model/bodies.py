@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
@@ -12,14 +15,26 @@ from ..bodies import SEEING
 
 
 class SeenBody(nn.Module):
-    """Adds to a layer's biases (H,) what a body at coordinates `place` (K,) adds; nothing at first."""
+    """What a layer of H outputs sees of a body at coordinates `place` (K,); nothing at first."""
 
     place: Tensor
 
-    def __init__(self, units: int, size: int) -> None:
+    def __init__(self, outputs: int, size: int) -> None:
         super().__init__()
-        self.columns = nn.Parameter(torch.zeros(units, size))
+        self.columns = nn.Parameter(torch.zeros(outputs, size))
         self.register_buffer("place", torch.zeros(size), persistent=False)
+
+
+class SeenByWeights(SeenBody):
+    """Multiplies the rows of a layer's weights (H, inputs)."""
+
+    def forward(self, weight: Tensor) -> Tensor:
+        """Return the weights on that body."""
+        return (1 + self.columns @ self.place)[:, None] * weight
+
+
+class SeenByBiases(SeenBody):
+    """Adds to a layer's biases (H,)."""
 
     def forward(self, bias: Tensor) -> Tensor:
         """Return the biases on that body."""
@@ -50,13 +65,24 @@ class WornCloth(nn.Module):
         )
 
 
-def see_bodies(networks: nn.Module, family: DressedFamily) -> list[SeenBody]:
-    """Let the networks of a model see bodies; return what each sees them by."""
-    found = []
+def see_bodies(networks: nn.Module, family: DressedFamily) -> None:
+    """Let all layers but the last ones of a model's networks see bodies: first ones by biases alone."""
     for name in SEEING:
-        network = getattr(networks, name)
-        if len(network):
-            seen = SeenBody(network[0].out_features, family.bodies.size)
-            parametrize.register_parametrization(network[0], "bias", seen)
-            found.append(seen)
-    return found
+        for place, layer in enumerate(list(getattr(networks, name))[:-1]):
+            if isinstance(layer, nn.Linear):
+                outputs, size = layer.out_features, family.bodies.size
+                if place > 0:
+                    parametrize.register_parametrization(layer, "weight", SeenByWeights(outputs, size))
+                if layer.bias is not None:
+                    parametrize.register_parametrization(layer, "bias", SeenByBiases(outputs, size))
+
+
+@contextmanager
+def on_one_body(networks: nn.Module) -> Iterator[None]:
+    """Compute weights and biases on the body that is worn once, for all uses within."""
+    with parametrize.cached():
+        for module in networks.modules():
+            if parametrize.is_parametrized(module):
+                for name in module.parametrizations:  # type: ignore[union-attr]
+                    getattr(module, name)  # with its gradient: the first use may have none
+        yield

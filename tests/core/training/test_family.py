@@ -11,6 +11,7 @@ import torch
 
 from ssilk_core.authoring.bodies.carry import dressed_family
 from ssilk_core.errors import SsilkError
+from ssilk_core.network.bodies import SeenBodies
 from ssilk_core.network.checkpoint import load_model, model_file, network, save_model
 from ssilk_core.network.descriptors import pose_features
 from ssilk_core.network.model.bodies import SeenBody
@@ -183,10 +184,26 @@ def test_a_stored_family_finds_its_members(model, members, tmp_path):
 
 def test_a_family_of_another_network_is_refused(model, tmp_path):
     file = model_file(model, Fabric("toy"), {})
-    columns = {name: values[:-1] for name, values in file.bodies.columns.items()}
+    columns = {name: values[:, :-1] for name, values in file.bodies.columns.items()}
     save_model(tmp_path / "odd.safetensors", replace(file, bodies=replace(file.bodies, columns=columns)))
     with pytest.raises(SsilkError, match="do not fit the network"):
         load_model(tmp_path / "odd.safetensors")
+
+
+def test_a_network_that_saw_bodies_in_its_first_layers_alone_plays_as_before(model):
+    file = model_file(model, Fabric("toy"), {})
+    columns, coordinates = file.bodies.columns, file.bodies.family.bodies.members[1]
+    first = {name: values[0] for name, values in columns.items() if name.endswith(".0")}
+    assert len(first) == 3 and all(values.any() for values in first.values())
+    tensors = file.bodies.tensors()
+    before = {name: value for name, value in tensors.items() if name.removeprefix("family.") not in columns}
+    before |= {f"family.{name.removesuffix('.0')}": values for name, values in first.items()}
+    read = SeenBodies.of(before, file.bodies.family.bodies.names, file.bodies.family.bodies.meshes)
+    found = replace(file, bodies=read).on_body(coordinates).parameters
+    for name, value in file.parameters.items():
+        layer = name.removesuffix(".bias")
+        added = first[layer] @ coordinates if layer in first else 0
+        np.testing.assert_allclose(found[name], value + added, atol=1e-6)
 
 
 def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_number(family):
