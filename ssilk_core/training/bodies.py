@@ -40,24 +40,30 @@ def random_body(family: BodyFamily, generator: np.random.Generator) -> Floats:
 
 
 class DrawnBodies:
-    """Draws the body of each step, by its number, and puts it on all that know it."""
+    """Draws the body of each step, by its number, and puts it on all that know it.
+
+    Attributes:
+        place: its coordinates, shape (K,); a captured graph reads them.
+    """
 
     def __init__(self, family: BodyFamily, wearers: Sequence[BodyWearer], seed: int, device: torch.device) -> None:
-        self.family, self.wearers, self.seed, self.device = family, wearers, seed, device
+        self.family, self.wearers, self.seed = family, wearers, seed
+        self.place = torch.zeros(family.size, device=device)
 
     def draw(self, iteration: int) -> None:
-        """Put on the body of an iteration, which a resumed run draws again."""
-        self.wear(random_body(self.family, np.random.default_rng([self.seed, iteration])))
+        """Draw the body of an iteration, which a resumed run draws again."""
+        drawn = random_body(self.family, np.random.default_rng([self.seed, iteration]))
+        self.place.copy_(torch.from_numpy(drawn))
 
     def take_off(self) -> None:
         """Put on the base."""
-        self.wear(np.zeros(self.family.size))
+        self.place.zero_()
+        self.put_on()
 
-    def wear(self, coordinates: Floats) -> None:
-        """Put on the body at coordinates (K,)."""
-        place = torch.as_tensor(coordinates, dtype=torch.float32, device=self.device)
+    def put_on(self) -> None:
+        """Put on the body that was drawn: part of the step, so that a captured graph does it too."""
         for wearer in self.wearers:
-            wearer.wear(place)
+            wearer.wear(self.place)
 
 
 class FamilyBody:

@@ -188,6 +188,8 @@ class Stepper:
         step = self.static_step if name == "static" else self.dynamic_step
 
         def body() -> None:
+            if self.bodies:
+                self.bodies.put_on()
             with on_one_body(self.model):
                 step()
 

@@ -221,7 +221,9 @@ def test_bodies_are_drawn_within_the_members_and_a_little_beyond_again_by_their_
             seen.append(place.clone())
 
     for number in (3, 4, 3):
-        DrawnBodies(bodies, [Seen()], 7, CPU).draw(number)
+        drawn = DrawnBodies(bodies, [Seen()], 7, CPU)
+        drawn.draw(number)
+        drawn.put_on()
     assert torch.equal(seen[0], seen[2]) and not torch.equal(seen[0], seen[1])
 
 
@@ -288,6 +290,7 @@ def test_the_average_that_is_validated_is_on_the_base_whatever_was_worn_before(m
         torch.testing.assert_close(found.decoder.rest, rest)
         assert not any(module.place.any() for module in found.modules() if isinstance(module, SeenBody))
     drawn.draw(1)
+    drawn.put_on()
     torch.testing.assert_close(stepper.ema_model.decoder.rest, rest)
     assert not torch.allclose(model.decoder.rest, rest)
 
