@@ -96,9 +96,9 @@ class SeenBodies:
         found = {}
         for layer, (added, scales) in self.columns.items():
             rows = 1 + scales @ coordinates
-            found[f"{layer}.weight"] = np.float32(rows[:, None] * parameters[f"{layer}.weight"])
+            found[f"{layer}.weight"] = (rows[:, None] * parameters[f"{layer}.weight"]).astype(np.float32)
             if (bias := parameters.get(f"{layer}.bias")) is not None:
-                found[f"{layer}.bias"] = np.float32(bias + added @ coordinates)
+                found[f"{layer}.bias"] = (bias + added @ coordinates).astype(np.float32)
         return found
 
     def with_proxies(self, kept: Ints) -> SeenBodies:

@@ -54,7 +54,7 @@ def box_clearance_kernel(points: Tensor, boxes: Boxes) -> Tensor:
     points = points.contiguous()
     frames, least = points.shape[2], torch.empty_like(boxes[3])
     grid = (len(least), triton.cdiv(frames, FRAMES))
-    _least[grid](points, _packed(boxes), least, len(points), frames, FRAMES, num_warps=1)
+    _box_clearance[grid](points, _packed(boxes), least, len(points), frames, FRAMES, num_warps=1)
     return least
 
 
@@ -67,7 +67,7 @@ def _packed(boxes: Boxes) -> Tensor:
 def _launch(points: Tensor, boxes: Boxes, distance: Tensor, away: Tensor, clearance: float, replaces: bool) -> None:
     count, _, frames = points.shape
     grid = (triton.cdiv(count, POINTS), triton.cdiv(frames, FRAMES))
-    _nearest[grid](points, _packed(boxes), distance, away, clearance, count, frames, len(boxes[3]), replaces, POINTS,
+    _nearest_box[grid](points, _packed(boxes), distance, away, clearance, count, frames, len(boxes[3]), replaces, POINTS,
                    FRAMES, num_warps=1)  # fmt: skip
 
 
@@ -94,7 +94,7 @@ def _signed(ox, oy, oz, box, frames, n, inside):
 
 
 @triton.jit
-def _nearest(points, boxes, distances, aways, clearance, count, frames, box_count: tl.constexpr,
+def _nearest_box(points, boxes, distances, aways, clearance, count, frames, box_count: tl.constexpr,
              replaces: tl.constexpr, run: tl.constexpr, block: tl.constexpr):  # fmt: skip
     first = tl.program_id(0).to(tl.int64) * run
     n = tl.program_id(1) * block + tl.arange(0, block)
@@ -134,7 +134,7 @@ def _nearest(points, boxes, distances, aways, clearance, count, frames, box_coun
 
 
 @triton.jit
-def _least(points, boxes, found, count, frames, block: tl.constexpr):
+def _box_clearance(points, boxes, found, count, frames, block: tl.constexpr):
     k = tl.program_id(0).to(tl.int64)
     n = tl.program_id(1) * block + tl.arange(0, block)
     inside = n < frames

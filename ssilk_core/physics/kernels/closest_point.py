@@ -49,7 +49,7 @@ def closest_point_kernel(
     normal, offset = x.new_empty(vertices, 3, frames), x.new_empty(vertices, frames)
     garment, body = by_frame(x, blocks), by_frame(points, patches)
     grid = (frames, triton.cdiv(len(blocks), RUN))
-    _search[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
+    _search_surface[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
                   len(patches), max_distance * max_distance, max_depth * max_depth, max_distance, deep_cosine,
                   surface_epsilon, blocks.shape[1], CHUNK, RUN,
                   num_warps=WARPS)  # fmt: skip
@@ -57,7 +57,7 @@ def closest_point_kernel(
 
 
 @triton.jit
-def _search(garment, garment_boxes, body, body_boxes, blocks, patches, index, points, normals, normal, offset,
+def _search_surface(garment, garment_boxes, body, body_boxes, blocks, patches, index, points, normals, normal, offset,
             frames, block_count, patch_count, max_square, deepest, max_distance, deep_cosine, surface_epsilon,
             block_v: tl.constexpr, chunk: tl.constexpr, run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)

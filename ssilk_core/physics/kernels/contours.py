@@ -49,13 +49,13 @@ def contours_kernel(
     around = low.unflatten(2, (tiles, TILE)).amin(3), high.unflatten(2, (tiles, TILE)).amax(3)
     pairs = torch.empty(frames, tiles, SLOTS, dtype=torch.int64, device=x.device)
     found = torch.empty(frames, tiles, dtype=torch.int32, device=x.device)
-    _search[(tiles, frames)](
+    _search_pairs[(tiles, frames)](
         points, low, high, *around, faces, places, moves, pairs, found, vertices, count, tiles, TILE, SLOTS,
         num_warps=SEARCHING,
     )  # fmt: skip
     lengths = torch.zeros(frames, tiles, device=x.device)
     gradient = torch.zeros(frames, vertices, 3, dtype=torch.int64, device=x.device)
-    _measure[(tiles, frames)](
+    _measure_contours[(tiles, frames)](
         points, faces, pairs, found, allowed, lengths, gradient, vertices, count, tiles, len(allowed),
         len(allowed).bit_length(), steepest, SLOTS, num_warps=MEASURING,
     )  # fmt: skip
@@ -98,7 +98,7 @@ def _crosses(points, a, b, c, ox, oy, oz, nx, ny, nz, others):
 
 
 @triton.jit
-def _search(points, low, high, tile_low, tile_high, faces, places, moves, pairs, found, vertices, count, tiles,
+def _search_pairs(points, low, high, tile_low, tile_high, faces, places, moves, pairs, found, vertices, count, tiles,
             tile: tl.constexpr, slots: tl.constexpr):  # fmt: skip
     own, frame = tl.program_id(0), tl.program_id(1).to(tl.int64)
     points += frame * vertices * 3
@@ -213,7 +213,7 @@ def _chosen(edge, ia, ib, ic, ja, jb, jc):
 
 
 @triton.jit
-def _measure(points, faces, pairs, found, allowed, lengths, gradient, vertices, count, tiles, allowed_count,
+def _measure_contours(points, faces, pairs, found, allowed, lengths, gradient, vertices, count, tiles, allowed_count,
              halvings: tl.constexpr, steepest, slots: tl.constexpr):  # fmt: skip
     own, frame = tl.program_id(0), tl.program_id(1).to(tl.int64)
     place = frame * tiles + own

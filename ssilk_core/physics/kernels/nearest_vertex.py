@@ -16,7 +16,7 @@ from torch import Tensor
 
 FRAMES = 32  # frames that a program of `_pack` transposes
 CHUNK = 64  # groups whose boxes are compared with a block's at once
-RUN = 4  # blocks that a program of `_search` processes in turn, so that boxes stay in its cache
+RUN = 4  # blocks that a program of `_search_vertices` processes in turn, so that boxes stay in its cache
 # Bounds the relative rounding error of a gap, so that rounding skips no group.
 SAFE = tl.constexpr(1 - 1e-5)
 
@@ -33,7 +33,7 @@ def nearest_vertex_kernel(x: Tensor, points: Tensor, blocks: Tensor, groups: Ten
     found = torch.empty(vertices, frames, dtype=torch.int32, device=x.device)
     garment, body = by_frame(x, blocks), by_frame(points, groups)
     grid = (frames, triton.cdiv(len(blocks), RUN))
-    _search[grid](*garment, *body, blocks, groups, found, frames, len(blocks), len(groups), blocks.shape[1],
+    _search_vertices[grid](*garment, *body, blocks, groups, found, frames, len(blocks), len(groups), blocks.shape[1],
                   groups.shape[1], CHUNK, RUN, num_warps=1)  # fmt: skip
     return found
 
@@ -65,7 +65,7 @@ def _pack(points, table, packed, boxes, frames, rows, size: tl.constexpr, block_
 
 
 @triton.jit
-def _search(garment, garment_boxes, body, body_boxes, blocks, groups, found, frames, block_count, group_count,
+def _search_vertices(garment, garment_boxes, body, body_boxes, blocks, groups, found, frames, block_count, group_count,
             block_v: tl.constexpr, block_b: tl.constexpr, chunk: tl.constexpr, run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)
     first = tl.program_id(1) * run
