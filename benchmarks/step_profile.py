@@ -3,7 +3,7 @@
 
     python benchmarks/step_profile.py --garment cape --stage demo_body.usdc --motions FOLDER --index FILE
 
-The training goes on from the model that ships, with its settings, but no extra motions: these cost setup, and no step.
+The training goes on from the model that ships, with its settings, but no extra motions, which cost setup and no step.
 Steps are captured graphs. Their time is that of many; then a few are traced, whose kernels are told by name.
 """
 

@@ -67,8 +67,8 @@ def _packed(boxes: Boxes) -> Tensor:
 def _launch(points: Tensor, boxes: Boxes, distance: Tensor, away: Tensor, clearance: float, replaces: bool) -> None:
     count, _, frames = points.shape
     grid = (triton.cdiv(count, POINTS), triton.cdiv(frames, FRAMES))
-    _nearest_box[grid](points, _packed(boxes), distance, away, clearance, count, frames, len(boxes[3]), replaces, POINTS,
-                   FRAMES, num_warps=1)  # fmt: skip
+    _nearest_box[grid](points, _packed(boxes), distance, away, clearance, count, frames, len(boxes[3]), replaces,
+                       POINTS, FRAMES, num_warps=1)  # fmt: skip
 
 
 @triton.jit

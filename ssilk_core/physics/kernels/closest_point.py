@@ -49,10 +49,10 @@ def closest_point_kernel(
     normal, offset = x.new_empty(vertices, 3, frames), x.new_empty(vertices, frames)
     garment, body = by_frame(x, blocks), by_frame(points, patches)
     grid = (frames, triton.cdiv(len(blocks), RUN))
-    _search_surface[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames, len(blocks),
-                  len(patches), max_distance * max_distance, max_depth * max_depth, max_distance, deep_cosine,
-                  surface_epsilon, blocks.shape[1], CHUNK, RUN,
-                  num_warps=WARPS)  # fmt: skip
+    _search_surface[grid](*garment, *body, blocks, patches, index, points, normals, normal, offset, frames,
+                          len(blocks), len(patches), max_distance * max_distance, max_depth * max_depth,
+                          max_distance, deep_cosine, surface_epsilon, blocks.shape[1], CHUNK, RUN,
+                          num_warps=WARPS)  # fmt: skip
     return normal, offset
 
 

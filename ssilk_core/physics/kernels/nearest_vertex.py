@@ -65,8 +65,9 @@ def _pack(points, table, packed, boxes, frames, rows, size: tl.constexpr, block_
 
 
 @triton.jit
-def _search_vertices(garment, garment_boxes, body, body_boxes, blocks, groups, found, frames, block_count, group_count,
-            block_v: tl.constexpr, block_b: tl.constexpr, chunk: tl.constexpr, run: tl.constexpr):  # fmt: skip
+def _search_vertices(garment, garment_boxes, body, body_boxes, blocks, groups, found, frames, block_count,
+                     group_count, block_v: tl.constexpr, block_b: tl.constexpr, chunk: tl.constexpr,
+                     run: tl.constexpr):  # fmt: skip
     frame = tl.program_id(0).to(tl.int64)
     first = tl.program_id(1) * run
     garment += frame * 3 * block_count * block_v
