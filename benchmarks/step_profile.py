@@ -87,7 +87,9 @@ def main() -> None:
     parser.add_argument("--motions", type=Path, required=True, metavar="FOLDER")
     parser.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--threads", type=int, default=1, help="processor threads (default 1)")
     options = parser.parse_args()
+    torch.set_num_threads(options.threads)
     began = time.perf_counter()
     with TemporaryDirectory() as folder:
         run = TrainingRun(job_of(options, Path(folder) / "model.safetensors"), TextReporter())
@@ -98,7 +100,7 @@ def main() -> None:
     shares: dict[str, float] = {}
     for name, each in kernels.items():
         shares[kind_of(name)] = shares.get(kind_of(name), 0.0) + each
-    print(provenance(options))
+    print("\n".join(f"{name}: {value}" for name, value in provenance(options).items()))
     print(f"first steps after {setup:.0f} s; a step {times[0]:.2f} to {times[-1]:.2f} ms, {launches:.0f} launches")
     rows = sorted(shares.items(), key=lambda row: -row[1])
     print(table(["kernel", "ms"], [[name, f"{value:.2f}"] for name, value in rows if value >= LEAST]))

@@ -40,17 +40,8 @@ def orthogonalised(matrices: Tensor) -> Tensor:
     return x.mT if is_tall else x
 
 
-def _together(matrices: list[Tensor]) -> list[list[int]]:
-    """Return which matrices are orthogonalised at once: all on a GPU, which would wait for each launch, and those of
-    one shape elsewhere."""
-    alike: dict[torch.Size, list[int]] = {}
-    for place, matrix in enumerate(matrices):
-        alike.setdefault(torch.Size() if matrix.is_cuda else matrix.shape, []).append(place)
-    return [*alike.values()]
-
-
 class Muon(torch.optim.Optimizer):
-    """Steps of matrices along their orthogonalised momentum.
+    """Steps of matrices along their orthogonalised momentum; those of one shape are taken together.
 
     Attributes:
         found_inf: one where the next step is to be skipped, else zero, as PyTorch's fused optimisers have it.
@@ -71,26 +62,16 @@ class Muon(torch.optim.Optimizer):
         Before that W shrinks to (1 - rate * decay) W.
         """
         for group in self.param_groups:
-            matrices = [matrix for matrix in group["params"] if matrix.grad is not None]
-            rate = group["lr"] if self.found_inf is None else group["lr"] * (1 - self.found_inf)
-            kept = 1 - rate * group["weight_decay"]
-            for matrix, direction in zip(matrices, self._directions([self._ahead(matrix) for matrix in matrices])):
-                length = rate * STEP_SIZE * max(matrix.shape) ** 0.5
-                matrix.mul_(kept).sub_(length * direction)
-
-    @staticmethod
-    def _directions(matrices: list[Tensor]) -> list[Tensor]:
-        """Return the orthogonalised matrices; on a GPU all at once, as rows and columns of zeros change nothing."""
-        wide = [matrix.mT if matrix.shape[0] > matrix.shape[1] else matrix for matrix in matrices]
-        found: dict[int, Tensor] = {}
-        for places in _together(wide):
-            rows, columns = (max(wide[place].shape[axis] for place in places) for axis in (0, 1))
-            batch = wide[places[0]].new_zeros(len(places), rows, columns)
-            for own, place in zip(batch, places):
-                own[: len(wide[place]), : wide[place].shape[1]] = wide[place]
-            found |= zip(places, orthogonalised(batch))
-        cut = [found[place][: len(each), : each.shape[1]] for place, each in enumerate(wide)]
-        return [each.mT if matrix.shape[0] > matrix.shape[1] else each for matrix, each in zip(matrices, cut)]
+            alike: dict[torch.Size, list[Tensor]] = {}
+            for matrix in group["params"]:
+                if matrix.grad is not None:
+                    alike.setdefault(matrix.shape, []).append(matrix)
+            for shape, matrices in alike.items():
+                rate = group["lr"] if self.found_inf is None else group["lr"] * (1 - self.found_inf)
+                kept, length = 1 - rate * group["weight_decay"], rate * STEP_SIZE * max(shape) ** 0.5
+                directions = orthogonalised(torch.stack([self._ahead(matrix) for matrix in matrices]))
+                for matrix, direction in zip(matrices, directions):
+                    matrix.mul_(kept).sub_(length * direction)
 
     def _ahead(self, matrix: Tensor) -> Tensor:
         """Update a matrix's momentum; return what the next one would be with the same gradient (Nesterov)."""

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from .vectors import cross, dot
 
-TILE, SLOTS = 32, 256
+TILE, SLOTS = 16, 128
 BOXES = tl.constexpr(32)
 PAIRS = tl.constexpr(32)  # measured at once
-SEARCHING, MEASURING = 4, 1  # warps
+WARPS = 1
 STEPS = tl.constexpr(float(1 << 32))  # of a newton
 TINY = tl.constexpr(1e-30)
 
@@ -51,13 +51,13 @@ def contours_kernel(
     found = torch.empty(frames, tiles, dtype=torch.int32, device=x.device)
     _search_pairs[(tiles, frames)](
         points, low, high, *around, faces, places, moves, pairs, found, vertices, count, tiles, TILE, SLOTS,
-        num_warps=SEARCHING,
+        num_warps=WARPS,
     )  # fmt: skip
     lengths = torch.zeros(frames, tiles, device=x.device)
     gradient = torch.zeros(frames, vertices, 3, dtype=torch.int64, device=x.device)
     _measure_contours[(tiles, frames)](
         points, faces, pairs, found, allowed, lengths, gradient, vertices, count, tiles, len(allowed),
-        len(allowed).bit_length(), steepest, SLOTS, num_warps=MEASURING,
+        len(allowed).bit_length(), steepest, SLOTS, num_warps=WARPS,
     )  # fmt: skip
     return lengths.sum(1), (gradient.permute(1, 2, 0).double() / STEPS.value).to(x.dtype)
 

@@ -124,12 +124,9 @@ def test_what_the_search_for_contours_takes_is_counted_where_cloth_is_loose(scen
     from ssilk_core.physics.kernels import contours as kernel
 
     frames, held, mesh = 32, [], scene.garment.mesh
-    monkeypatch.setattr(
-        kernel, "_search_pairs", {(len(mesh.faces) // 32 + 1, 8): lambda *given, **_: held.extend(given)}
-    )
-    monkeypatch.setattr(
-        kernel, "_measure_contours", {(len(mesh.faces) // 32 + 1, 8): lambda *given, **_: held.extend(given)}
-    )
+    grid = (-(-len(mesh.faces) // kernel.TILE), 8)
+    for name in ("_search_pairs", "_measure_contours"):
+        monkeypatch.setattr(kernel, name, {grid: lambda *given, **_: held.extend(given)})
     faces = torch.tensor(mesh.faces)
     x = torch.tensor(mesh.points, dtype=torch.float32)[:, :, None].repeat(1, 1, frames)[..., ::4]
     kernel.contours_kernel(x, faces, faces, faces[:, 0], faces[:1, 0], 0.2)
