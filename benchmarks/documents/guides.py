@@ -102,10 +102,11 @@ def bodies() -> str:
         rows.append([
             name.replace("_", " "), percent(found["beyond"], 0), fixed(found["LBS"]["total"], 2),
             ", ".join(fixed(each["total"], 3) for each in models),
+            fixed(found["simulator"]["total"], 3) if "simulator" in found else "",
             ", ".join(fixed(each["steps"]["energy"], 1, 1e-3) for each in models),
             ", ".join(percent(each["mean"], 3) for each in skin),
             ", ".join(percent(each["worst"], 2) for each in skin),
         ])  # fmt: skip
-    header = ("body", "beyond [%]", "LBS [J]", "energy [J]", "steps miss [mJ]", "skin that shows [%]",
+    header = ("body", "beyond [%]", "LBS [J]", "energy [J]", "simulator [J]", "steps miss [mJ]", "skin that shows [%]",
               "in the worst frame [%]")  # fmt: skip
     return table(header, rows)
