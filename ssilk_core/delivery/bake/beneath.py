@@ -55,8 +55,9 @@ class GarmentsBeneath:
         for path, shot in zip(self.files.values(), self._shots):
             if shot.sample_times(samples) != self.times:
                 fail(str(path), "other frames than the garments beside it", "all are of one range", "bake it again")
+            own = len(shot.garment_points(self.times[0]))
             faces.append(next(mesh.faces for mesh in shot.meshes if mesh.is_garment) + count)
-            count += len(shot.garment_points(self.times[0]))
+            count += own
         self.faces: Ints = np.concatenate(faces)
 
     def need_frames(self, count: int) -> None:

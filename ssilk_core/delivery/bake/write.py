@@ -78,7 +78,8 @@ def bake(
     rollout.tell(report)
     if rollout.request.meets_beneath:
         over: Any = rollout.provenance.get("trained_over", {})
-        if missing := left_out(over, (beneath or {}).values()):
+        met = beneath or {}
+        if len(met) < len(over) and (missing := left_out(over, met.values())):
             where = f"{place}: {path.stem}" if place else str(path)
             tell_left_out(where, missing, rollout.request.made, report)
     rollout = certified(refined(solved(rollout, report), report, beneath=beneath), report, beneath)
