@@ -37,6 +37,7 @@ from typing import Any
 
 from ..delivery import bake as library
 from ..delivery.bake.naming import prim_name
+from ..delivery.bake.record import ANIMATION
 from ..delivery.targets import GLB
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
@@ -109,7 +110,8 @@ def _beneath(options: argparse.Namespace, count: int) -> dict[str, Path]:
     for path in options.over:
         if not path.is_file() or path.suffix == GLB:
             fail(str(path), "no file of USD", "--over names shots of garments beneath, each in a file of USD")
-        if (other := named.setdefault(prim_name(path.stem), path)) != path:
+        name = path.parent.name if path.name == ANIMATION else path.stem  # as in folders of layers
+        if (other := named.setdefault(prim_name(name), path)) != path:
             fail("--over", f"{other} and {path}", "each garment beneath has a name of its own", "rename one of them")
         need_not_input(options.output, path)
     return named

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 from pathlib import Path
@@ -111,52 +110,30 @@ def test_an_outfit_is_trained_in_order_each_over_those_beneath_and_baked(
     assert bpy.ops.ssilk.hide_covered_outfit() == {"FINISHED"}
     pillar = bpy.data.objects["Pillar"]
     assert {each.name for each in pillar.modifiers} <= {"Armature", "SSILK Under Skirt", "SSILK Under Coat"}
-    baked_over_what_is_shown_beneath(bpy, coat, skirt, tmp_path, ssilk_python, capfd)
+    baked_over_what_is_shown_beneath(bpy, coat, skirt, tmp_path, capfd)
 
 
-def baked_over_what_is_shown_beneath(bpy, coat, skirt, folder, python, capfd) -> None:
-    """Certified in *Bake Outfit*, and as Hero by itself: a cache has what Blender shows of the skirt."""
+def baked_over_what_is_shown_beneath(bpy, coat, skirt, folder, capfd) -> None:
+    """Solved for and certified over a cache with what Blender shows of the skirt, which the shot names."""
+    from ssilk_usd.reading.facts import read_provenance
+    from ssilk_usd.shots.play import Shot
+
     from blender_addon.operators.baking import BENEATH, inputs_folder
     from blender_addon.playback.models import model_of
 
     frames, usd = range(1, 3), folder / "coat.usdc"
     bpy.context.scene.frame_end, coat.ssilk.certify = frames[-1], True
+    activate(bpy, coat)
     capfd.readouterr()
-    assert bpy.ops.ssilk.bake_outfit() == {"FINISHED"}
+    assert bpy.ops.ssilk.bake(quality="hero", pre_roll=0, to_usd=True, filepath=str(usd)) == {"FINISHED"}
     assert "of 2 frames intersect themselves or Skirt" in capfd.readouterr().out
     met = inputs_folder(coat, model_of(coat)) / BENEATH / "Skirt.usdc"
-    np.testing.assert_allclose(
-        read_points(python, met, folder), shown(bpy, skirt, frames)[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5
-    )
-    coat.ssilk.certify = False
-    activate(bpy, coat)
-    assert bpy.ops.ssilk.bake(quality="hero", pre_roll=0, to_usd=True, filepath=str(usd)) == {"FINISHED"}
-    said = json.loads(in_python(python, SAID, usd))
-    assert (folder / said["over"]["Skirt"]).resolve() == met and said["over_sha256"]["Skirt"] == sha256(met)
-
-
-def in_python(python: str, code: str, *words: object) -> str:
-    return subprocess.run([python, "-c", code, *map(str, words)], check=True, capture_output=True, text=True).stdout
-
-
-SAID = """
-import json, sys
-from pathlib import Path
-from ssilk_core.delivery.bake.opened import provenance_of
-print(json.dumps(provenance_of(Path(sys.argv[1]))["refined"]))
-"""
-POINTS = """
-import sys
-import numpy as np
-from ssilk_usd.shots.play import Shot
-shot = Shot(sys.argv[1])
-np.save(sys.argv[2], [shot.garment_points(time) for time in shot.frame_times])
-"""
-
-
-def read_points(python: str, file: Path, folder: Path) -> np.ndarray:
-    in_python(python, POINTS, file, folder / "points.npy")
-    return np.load(folder / "points.npy")
+    cache = Shot(met)
+    inner = np.array([cache.garment_points(time) for time in cache.frame_times])
+    np.testing.assert_allclose(inner, shown(bpy, skirt, frames)[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    for made in ("refined", "certificate"):
+        said = read_provenance(usd)[made]
+        assert (folder / said["over"]["Skirt"]).resolve() == met and said["over_sha256"]["Skirt"] == sha256(met)
 
 
 def test_one_garment_alone_is_trained_over_what_is_there(ready, skirt, coat, tmp_path, capfd):

@@ -331,7 +331,12 @@ def test_what_was_refined_over_cloth_that_is_another_now_is_told(copy, capsys):
     farm = f"farm coat.safetensors --stage rigged.usda --motion walk.usda {few} -o layers --bundle job"
     assert main(shlex.split(farm)) == 0  # a job without the skirt does not take what is over it
     assert main(shlex.split("task job/job.json -o layers --check")) == 3
+    over = f"coat.safetensors --over layers/shots/walk/skirt/anim.usdc {few}"
+    assert not told(baked(capsys, over, "over.usdc"))
+    said = read_provenance("over.usdc")["refined"]
+    assert said["over"] == {"skirt": "layers/shots/walk/skirt/anim.usdc"} and "skirt" in said["over_sha256"]
     assert gone in warned(capsys, "remove layers walk/skirt")
+    assert "over.usdc: it was refined over 'skirt', which is not at" in warned(capsys, "verify over.usdc")
     bake = f"bake coat.safetensors --stage rigged.usda --motion walk.usda {few} -o coat.usdc"
     assert f"coat.usdc: it was {without}" in warned(capsys, bake)
 
@@ -460,6 +465,12 @@ def test_garments_that_nobody_trained_over_others_are_counted_by_what_they_cover
          "-o x.glb", "several motions or characters"),
         ("bake skirt.safetensors skirt.safetensors --stage rigged.usda --motion walk.usda --target glb -o x.glb",
          "two garments named 'skirt'"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --over shot.usda -o x.usdc",
+         "nothing that moves the garment off them"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --refine 1 --over x.usdc -o x.usdc",
+         "x.usdc: no file of USD"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --refine 1 --over shot.usda -o x",
+         "leave --over out"),
         ("bake skirt.safetensors coat.safetensors --stage rigged.usda --motion walk.usda --target glb "
          "--hide-covered -o x.glb", "name a folder, whose shots hide what any garment covers"),
     ],
