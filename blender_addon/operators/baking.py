@@ -24,7 +24,6 @@ from ssilk_core.scene.assets import PINNED, TIGHT, Collider
 from ..arrays.joints import Joints, joint_order
 from ..arrays.renamed import TrainedJoints, known_as
 from ..errors import SetupError
-from ..motions.beneath import ShownBeneath
 from ..motions.colliders import MetColliders, left_out, unseen
 from ..motions.freedom import freedom, is_held
 from ..motions.held import HeldBones
@@ -38,6 +37,7 @@ from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.beneath import ShownBeneath
 from ..playback.bodies import corrected, reshaped
 from ..playback.fabrics import played_options
 from ..playback.family import BodyModel, on_its_body

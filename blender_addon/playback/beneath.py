@@ -13,24 +13,25 @@ from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 
 from ..errors import SetupError
-from ..playback.models import model_of
+from ..motions.keys import has_keys
+from ..motions.simulated import sample_vertices
 from ..scene.garment import beneath
 from ..scene.gather import read_mesh
 from ..scene.meshes import rest_points
 from ..scene.objects import found_again, scene_rate
-from .keys import has_keys
-from .simulated import sample_vertices
+from .models import model_of
 
 
 class ShownBeneath:
-    """The garments that one is worn over and that were baked, over some frames.
+    """The garments beneath one that are visible and were baked, over some frames.
 
     Attributes:
         files: point caches of them once `write` is done, by the names of their objects.
     """
 
     def __init__(self, garment: bpy.types.Object, frames: range) -> None:
-        inner = [each for each in beneath(garment) if has_keys(each) and model_of(each).exists()]
+        shown = [each for each in beneath(garment) if each.visible_get()]  # Blender does not evaluate others
+        inner = [each for each in shown if has_keys(each) and model_of(each).exists()]
         self._inner, self._frames = [(each.session_uid, each.name) for each in inner], frames
         self.files: dict[str, Path] = {}
 
