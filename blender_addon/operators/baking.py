@@ -37,6 +37,7 @@ from ..outside.wording import recall, reworded, with_bones
 from ..outside.work import Work
 from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
+from ..playback.beneath import ShownBeneath
 from ..playback.bodies import corrected, reshaped
 from ..playback.fabrics import played_options
 from ..playback.family import BodyModel, on_its_body
@@ -81,6 +82,7 @@ INPUTS, MOTION, SHOT = "bake", "motion.usdc", "shot.usdc"  # folder of a bake's 
 SHAPED = "shaped.usdc"  # the character with shape keys that change
 START = "start.usdc"  # the cloth that a bake goes on from
 RIDDEN = "ridden.usdc"  # the character with what rides on the garment
+BENEATH = "beneath"  # folder of the garments that it is put over
 
 
 class TimelineOperator(tasks.OutsideOperator):
@@ -233,6 +235,7 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         self.inputs = inputs_folder(garment, self.model)
         self.words = {f"{self.inputs.name}/{MOTION}": "the timeline"}
         self.meets, self.left_out = False, ""
+        self.over = ShownBeneath(garment, self.take.frames) if solves or garment.ssilk.certify else None
         closing = self.closing() if self.to_timeline else None
         return Work(
             f"Baking '{garment.name}'", self.commands, parent=bpy.app.tempdir, steps=self.steps(), closing=closing,
@@ -322,6 +325,8 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         write_motion(self.work.folder / MOTION, motion, skeleton, world)
         if self.go_on:
             yield from self.write_start()
+        if self.over:
+            yield from self.over.write(self.inputs / BENEATH)
         garment, _ = self.pair.objects()
         free, hold = freedom(garment, self.take.frames), garment.ssilk.hold
         if hold > 1 or (free < 1).any() or self.held.parts:
@@ -383,12 +388,16 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
         if self.go_on:
             self.words[f"{inputs.name}/{START}"] = "the previous bake"
             loop = ["--start-cloth", str(inputs / START)]
-        rate = ["--fps", repr(scene_rate())] if self.to_timeline else []  # a level may have fewer frames
+        beneath = self.over.files if self.over else {}
+        self.words |= {f"{inputs.name}/{BENEATH}/{path.name}": f"'{name}'" for name, path in beneath.items()}
+        over = ["--over", *map(str, beneath.values())] if beneath else []
+        # A level may have fewer frames.
+        rate = ["--fps", repr(scene_rate())] if self.to_timeline or over else []
         return [
             [
                 self.python, "-m", "ssilk_core", "bake", str(self.model), "--stage", str(stage),
                 "--motion", str(inputs / MOTION), "-o", str(self.shot),
-                *loop, *level, *rate, *collider, *certify, *self.in_fabric, "--json",
+                *loop, *level, *rate, *collider, *certify, *over, *self.in_fabric, "--json",
             ]
         ]  # fmt: skip
 

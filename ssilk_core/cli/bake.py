@@ -20,7 +20,8 @@ the simulator. A refined shot gets blendshapes of its own, as many as it takes t
 replace the model's, in a folder of layers they come on top, in the shot's own layer. --refined-output points writes
 time-sampled points instead, bound to no skeleton; in a folder of layers, they are the variant "points" of
 "deformation", beside the network's joints. In a folder of layers or a glb, a garment that was trained over others of
-the shot is refined after these, and kept off them; they stay as they are.
+the shot is refined after these, and kept off them; they stay as they are. --over does so for one garment in one file,
+over shots that are there.
 
 --certify moves the frames in which triangles of the garment intersect, or covered skin shows, as little as it takes
 until none does in the written file, and says which frames have no free position. It adds blendshapes for these frames
@@ -35,8 +36,13 @@ from pathlib import Path
 from typing import Any
 
 from ..delivery import bake as library
+from ..delivery.bake.naming import prim_name
+from ..delivery.bake.record import ANIMATION
+from ..delivery.targets import GLB
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
+from ..files import need_not_input
+from ..quality.levels import quality_named
 from .options import add_bake, add_level, is_folder, layer_options, requests_of
 
 
@@ -45,12 +51,16 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     add_bake(verb)
     verb.add_argument("-o", "--output", type=Path, required=True,
                       help="shot to write (.usdc, .usd, .usda, .usdz or .glb), or a folder of layers")  # fmt: skip
+    verb.add_argument("--over", type=Path, nargs="+", default=[], metavar="SHOT",
+                      help="shots of garments beneath, over which one garment is refined and certified into one file "
+                           "(default: in a folder or glb, those of the shot that it was trained over)")  # fmt: skip
     add_level(verb, "2MB for the shot", plays=True)
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
     """Bake and verify."""
     requests = requests_of(options)
+    beneath = _beneath(options, len(requests))
     if is_folder(options.output):
         if options.quality or options.budget:
             fail(
@@ -75,5 +85,33 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if len(requests) > 1:
         library.bake_outfit(requests, options.output, **common)
     else:
-        library.bake(requests[0], options.output, **common)
+        library.bake(requests[0], options.output, beneath=beneath, **common)
     return EXIT_OK
+
+
+def _beneath(options: argparse.Namespace, count: int) -> dict[str, Path]:
+    """Return the shots that a garment is refined and certified over, by their names; `count` is of all that is baked.
+
+    Raises:
+        SsilkError: one is not there, two have one name, or nothing is to be done over them.
+    """
+    if not options.over:
+        return {}
+    if count > 1 or is_folder(options.output):
+        found, allowed = (
+            "several garments, or a folder",
+            "each is put over those of its shot that it was trained over",
+        )
+        fail("--over", found, allowed, "leave --over out")
+    if not (options.refine or options.certify or (options.quality and quality_named(options.quality).refine)):
+        found, allowed = "nothing that moves the garment off them", "cloth is refined or certified over cloth"
+        fail("--over", found, allowed, "add --refine N, --quality hero or --certify")
+    named = dict[str, Path]()
+    for path in options.over:
+        if not path.is_file() or path.suffix == GLB:
+            fail(str(path), "no file of USD", "--over names shots of garments beneath, each in a file of USD")
+        name = path.parent.name if path.name == ANIMATION else path.stem  # as in folders of layers
+        if (other := named.setdefault(prim_name(name), path)) != path:
+            fail("--over", f"{other} and {path}", "each garment beneath has a name of its own", "rename one of them")
+        need_not_input(options.output, path)
+    return named

@@ -117,7 +117,7 @@ def _shot(
     from ssilk_usd.writing.body_faces import open_with_full_bodies
 
     from ..delivery.bake.met import props_of
-    from ..delivery.bake.outfit import stated_over
+    from ..delivery.bake.outfit import changed_since, stated_over
     from ..delivery.bake.stated import stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
@@ -143,6 +143,10 @@ def _shot(
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     if isinstance(certificate := said.get("certificate"), Mapping):
         sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))
+    if changed := changed_since(path):
+        for text in changed:
+            report(Message(text, "warning"))
+        sections.insert(1, Section("Garments beneath", "".join(f"<p>{escape(text)}.</p>" for text in changed)))
     return [*sections, Section("Provenance", facts({**said, **records}))]
 
 

@@ -70,7 +70,9 @@ def test_the_order_is_that_of_the_panel_and_is_changed_there(bpy, skirt, coat):
         bpy.ops.ssilk.move_layer(garment="Scarf", where="INNER")
 
 
-def test_an_outfit_is_trained_in_order_each_over_those_beneath_and_baked(ready, skirt, coat, tmp_path, ssilk_python):
+def test_an_outfit_is_trained_in_order_each_over_those_beneath_and_baked(
+    ready, skirt, coat, tmp_path, ssilk_python, capfd
+):
     from blender_addon.motions.keys import has_keys
     from blender_addon.operators.training import needs_training
     from blender_addon.playback.models import job_of, model_of
@@ -108,6 +110,30 @@ def test_an_outfit_is_trained_in_order_each_over_those_beneath_and_baked(ready, 
     assert bpy.ops.ssilk.hide_covered_outfit() == {"FINISHED"}
     pillar = bpy.data.objects["Pillar"]
     assert {each.name for each in pillar.modifiers} <= {"Armature", "SSILK Under Skirt", "SSILK Under Coat"}
+    baked_over_what_is_shown_beneath(bpy, coat, skirt, tmp_path, capfd)
+
+
+def baked_over_what_is_shown_beneath(bpy, coat, skirt, folder, capfd) -> None:
+    """Solved for and certified over a cache with what Blender shows of the skirt, which the shot names."""
+    from ssilk_usd.reading.facts import read_provenance
+    from ssilk_usd.shots.play import Shot
+
+    from blender_addon.operators.baking import BENEATH, inputs_folder
+    from blender_addon.playback.models import model_of
+
+    frames, usd = range(1, 3), folder / "coat.usdc"
+    bpy.context.scene.frame_end, coat.ssilk.certify = frames[-1], True
+    activate(bpy, coat)
+    capfd.readouterr()
+    assert bpy.ops.ssilk.bake(quality="hero", pre_roll=0, to_usd=True, filepath=str(usd)) == {"FINISHED"}
+    assert "of 2 frames intersect themselves or Skirt" in capfd.readouterr().out
+    met = inputs_folder(coat, model_of(coat)) / BENEATH / "Skirt.usdc"
+    cache = Shot(met)
+    inner = np.array([cache.garment_points(time) for time in cache.frame_times])
+    np.testing.assert_allclose(inner, shown(bpy, skirt, frames)[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    for made in ("refined", "certificate"):
+        said = read_provenance(usd)[made]
+        assert (folder / said["over"]["Skirt"]).resolve() == met and said["over_sha256"]["Skirt"] == sha256(met)
 
 
 def test_one_garment_alone_is_trained_over_what_is_there(ready, skirt, coat, tmp_path, capfd):

@@ -304,6 +304,51 @@ def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(c
         assert len(np.unique(intersections_between(coat, faces, skirt, faces)[:, 0])) < 0.05 * len(faces), frame
 
 
+def test_what_was_refined_over_cloth_that_is_another_now_is_told(copy, capsys):
+    """By later bakes into the folder, by remove, verify and report; and it is baked again, also by a farm."""
+    coat, few = "layers/shots/walk/coat/anim.usdc", "--refine 1 --range 4-5"
+    (text,) = told(baked(capsys, f"coat.safetensors {few}", "layers"))
+    without = "trained over skirt, which is not baked beneath it here, and is refined without"
+    assert f"walk/coat: it was {without}" in text
+    assert not told(baked(capsys, f"skirt.safetensors coat.safetensors {few}", "layers"))
+    said = read_provenance(coat)["refined"]
+    assert said["over_sha256"] == {"skirt": sha256(Path("layers/shots/walk/skirt/anim.usdc"))}
+    before = "'coat' was refined over 'skirt' as that was before; bake it again"
+    (text,) = told(baked(capsys, "skirt.safetensors --range 4-5", "layers"))
+    assert text.endswith(f"shots/walk: {before}")
+    assert before in warned(capsys, "report layers/shots/walk/shot.usda -o page.html")
+    assert f"<p>{before}.</p>" in Path("page.html").read_text().replace("&#x27;", "'")
+    changed = f"{coat}: it was refined over 'skirt' as that was before; bake it again"
+    for words in "verify layers/shots/walk/shot.usda", f"report {coat} -o page.html":
+        assert changed in warned(capsys, words)
+    gone = "'coat' was refined over 'skirt', which is not in this shot any more; bake it again"
+    record = Path("layers/shots/walk/skirt/bake.json")
+    record.rename("kept.json")  # its layer is there yet, and no part of the shot
+    baked(capsys, f"coat.safetensors {few}", "layers")
+    assert "over" not in read_provenance(coat)["refined"]
+    Path("kept.json").rename(record)
+    baked(capsys, f"coat.safetensors {few}", "layers")
+    farm = f"farm coat.safetensors --stage rigged.usda --motion walk.usda {few} -o layers --bundle job"
+    assert main(shlex.split(farm)) == 0  # a job without the skirt does not take what is over it
+    assert main(shlex.split("task job/job.json -o layers --check")) == 3
+    over = f"coat.safetensors --over layers/shots/walk/skirt/anim.usdc {few}"
+    assert not told(baked(capsys, over, "over.usdc"))
+    said = read_provenance("over.usdc")["refined"]
+    assert said["over"] == {"skirt": "layers/shots/walk/skirt/anim.usdc"} and "skirt" in said["over_sha256"]
+    assert gone in warned(capsys, "remove layers walk/skirt")
+    assert "over.usdc: it was refined over 'skirt', which is not at" in warned(capsys, "verify over.usdc")
+    bake = f"bake coat.safetensors --stage rigged.usda --motion walk.usda {few} -o coat.usdc"
+    assert f"coat.usdc: it was {without}" in warned(capsys, bake)
+
+
+def warned(capsys: pytest.CaptureFixture[str], words: str) -> str:
+    """What a command told on the way to its end, whatever that is."""
+    capsys.readouterr()
+    assert main(shlex.split(words)) in (0, 3)
+    found = capsys.readouterr()
+    return found.out + found.err
+
+
 def test_a_damaged_record_of_inner_cloth_is_told_by_an_outer_certificate(toy, copy, capsys):
     both = "skirt.safetensors coat.safetensors"
     baked(capsys, f"{both} --certify", "certified")
@@ -420,6 +465,12 @@ def test_garments_that_nobody_trained_over_others_are_counted_by_what_they_cover
          "-o x.glb", "several motions or characters"),
         ("bake skirt.safetensors skirt.safetensors --stage rigged.usda --motion walk.usda --target glb -o x.glb",
          "two garments named 'skirt'"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --over shot.usda -o x.usdc",
+         "nothing that moves the garment off them"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --refine 1 --over x.usdc -o x.usdc",
+         "x.usdc: no file of USD"),
+        ("bake skirt.safetensors --stage rigged.usda --motion walk.usda --refine 1 --over shot.usda -o x",
+         "leave --over out"),
         ("bake skirt.safetensors coat.safetensors --stage rigged.usda --motion walk.usda --target glb "
          "--hide-covered -o x.glb", "name a folder, whose shots hide what any garment covers"),
     ],

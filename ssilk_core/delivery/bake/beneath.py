@@ -4,17 +4,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...errors import VerificationError, fail
+from ...events import Message, Reporter
+from ...files import sha256
 from ...scene.assets import Floats, Ints, Mesh, Motion, Scene, SkinWeights
 from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
 from ..gltf.play import GlbShot
+from ..targets import GLB
 from .opened import open_shot, provenance_of
 
 if TYPE_CHECKING:
@@ -22,7 +25,8 @@ if TYPE_CHECKING:
 
     from ...physics.collision.inner_cloth import InnerSurface
 
-OVER = "over"  # what a shot says of the files of garments beneath, under this name
+# What a shot says of the files of garments beneath, and of what they held, under these names.
+OVER, OVER_HASHES = "over", "over_sha256"
 THICKNESS = "thickness"  # [m] of the cloth of a glb that others lie over; stages of USD say it of each garment
 
 
@@ -31,6 +35,7 @@ class GarmentsBeneath:
 
     Attributes:
         files: their paths, by their names.
+        hashes: SHA-256 of each file before it was read; a glb is a part of the one that all are joined into.
         times: time codes of the frames.
         faces: triangles of all, of W vertices together, shape (G, 3).
 
@@ -43,14 +48,16 @@ class GarmentsBeneath:
 
     def __init__(self, files: Mapping[str, Path], samples: int) -> None:
         self.files = dict(files)
+        self.hashes = {name: sha256(path) for name, path in self.files.items() if path.suffix != GLB}
         self._shots: list[Shot | GlbShot] = [open_shot(path) for path in self.files.values()]
         self.times = self._shots[0].sample_times(samples)
         faces, count = list[Ints](), 0
         for path, shot in zip(self.files.values(), self._shots):
             if shot.sample_times(samples) != self.times:
                 fail(str(path), "other frames than the garments beside it", "all are of one range", "bake it again")
+            own = len(shot.garment_points(self.times[0]))
             faces.append(next(mesh.faces for mesh in shot.meshes if mesh.is_garment) + count)
-            count += len(shot.garment_points(self.times[0]))
+            count += own
         self.faces: Ints = np.concatenate(faces)
 
     def need_frames(self, count: int) -> None:
@@ -88,29 +95,67 @@ class GarmentsBeneath:
         for frame in matrices:
             yield [skin_points(points, skin, frame[None])[0] for points, skin in zip(first, skins)]
 
-    def named(self, folder: Path) -> dict[str, str]:
-        """Return the files relative to a folder, with forward slashes, by their names."""
-        return {name: Path(os.path.relpath(path, folder)).as_posix() for name, path in self.files.items()}
+    def to_metadata(self, folder: Path) -> dict[str, object]:
+        """Return what a shot in a folder says of them: their files from there, with forward slashes, and hashes."""
+        named = {name: Path(os.path.relpath(path, folder)).as_posix() for name, path in self.files.items()}
+        return {OVER: named, **({OVER_HASHES: self.hashes} if self.hashes else {})}
 
 
-def beneath_said(said: object, path: Path, samples: int, made: str) -> GarmentsBeneath | None:
+def beneath_said(
+    said: Mapping[str, Any], path: Path, samples: int, made: str, report: Reporter
+) -> GarmentsBeneath | None:
     """Return the garments that a file says it was made over, in their own files; None where it names none.
 
+    It is warned of those that hold something else than then.
+
     Args:
-        said: what it says under `OVER`.
+        said: what `GarmentsBeneath.to_metadata` returned, among other facts.
         path: of the file.
         made: how it was made, such as "certified".
 
     Raises:
         VerificationError: one is not there.
     """
-    if not (isinstance(said, Mapping) and said):
-        return None
-    files = {str(name): path.parent / str(place) for name, place in said.items()}
+    files = _files_said(said, path)
     for name, file in files.items():
         if not file.is_file():
             raise VerificationError(f"{path}: it was {made} over '{name}', which is not at {file}; bake both again.")
-    return GarmentsBeneath(files, samples)
+    for text in changed_beneath(said, path, made):
+        report(Message(text, "warning"))
+    return GarmentsBeneath(files, samples) if files else None
+
+
+def changed_beneath(said: Mapping[str, Any], path: Path, made: str) -> list[str]:
+    """Return in words which garments beneath are not what a file was made over; arguments as of `beneath_said`."""
+    hashes, found = said.get(OVER_HASHES) or {}, []
+    for name, file in _files_said(said, path).items():
+        if not file.is_file():
+            found.append(f"{path}: it was {made} over '{name}', which is not at {file}; bake both again")
+        elif name in hashes and sha256(file) != hashes[name]:
+            found.append(f"{path}: it was {made} over '{name}' as that was before; bake it again")
+    return found
+
+
+def _files_said(said: Mapping[str, Any], path: Path) -> dict[str, Path]:
+    return {str(name): path.parent / str(place) for name, place in (said.get(OVER) or {}).items()}
+
+
+def left_out(over: Mapping[str, str], beneath: Iterable[Path]) -> list[str]:
+    """Return which models, whose SHA-256 are by name, are not those of files of garments beneath."""
+    there = {provenance_of(path).get("model_sha256") for path in beneath}
+    return [name for name, digest in over.items() if digest not in there]
+
+
+def tell_left_out(where: str, missing: Sequence[str], made: str, report: Reporter) -> None:
+    """Warn of a garment that is refined or certified without some of those that its model was trained over.
+
+    Args:
+        where: the garment, in words.
+        missing: names of the models that it was trained over and does not meet.
+        made: how it is made, such as "refined".
+    """
+    text = f"it was trained over {', '.join(missing)}, which is not baked beneath it here, and is {made} without"
+    report(Message(f"{where}: {text}; bake what lies beneath first, into the same folder or glb", "warning"))
 
 
 def _surface(path: Path, shot: Shot | GlbShot) -> InnerSurface:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from ...files import FileHashes, need_folder, remove_unfinished_in, replacing, s
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
+from .beneath import tell_left_out
 from .certificate.certified import certified, proven
 from .certificate.requirements import need_certifier
 from .counted import state_rollout_counts
@@ -154,20 +155,20 @@ class LayerFolder:
         return self.is_written(task, found)
 
     def is_written(self, task: BakeTask, contents: InputHashes) -> bool:
-        """Return whether a task is done with inputs that hold this, and its files are as they were written."""
-        return self._done(task, contents) is not None
+        """Return whether a task is done with inputs that hold this, over the garments that it names alone, and its
+        files are as they were written."""
+        return self._done(task, contents, task.over) is not None
 
-    def _done(self, task: BakeTask, contents: InputHashes) -> TaskRecord | None:
-        """Return the record of a task that is done, with an asset that says of itself what the task asks for."""
+    def _done(self, task: BakeTask, contents: InputHashes, over: Collection[str]) -> TaskRecord | None:
+        """Return the record of a task that is done, with an asset that says of itself what the task asks for.
+
+        Args:
+            over: names of the garments that it is to be refined or certified over.
+        """
         if not (has_possible_names(task) and says(self.path, task) and self.layout(task).info.is_file()):
             return None
         record = current_record(self._home(task), task_key(task, contents), self._files.sha256)
-        met = {self._met_path(task, name) for name in task.over}
-        return record if record is not None and met <= record.files.keys() else None
-
-    def _met_path(self, task: BakeTask, garment: str) -> str:
-        """Return the layer of another garment of a task's shot, as the record of the task names it."""
-        return os.path.relpath(self.layout(replace(task, garment=garment)).animation, self._home(task))
+        return record if record is not None and record.beneath.keys() == set(over) else None
 
     def need_names(self, tasks: Iterable[BakeTask], *, complete: bool = True) -> None:
         """Raise `SsilkError` where a name differs from one in the folder by case alone, or was used for another
@@ -211,12 +212,13 @@ class LayerFolder:
         beneath = self._beneath(task, report) if task.request.meets_beneath and (together or task.over) else {}
         if missing := [name for name in task.over if name not in beneath]:
             found = f"{', '.join(missing)} beneath it is not finished in this shot"
-            allowed = f"an outer garment is {_made(task)} over inner ones as their files have them"
+            allowed = f"an outer garment is {task.request.made} over inner ones as their files have them"
             fail(f"{self.path}: {task.name}", found, allowed, "bake what lies beneath first, and this again")
         if not together:
             beneath = {name: path for name, path in beneath.items() if name in task.over}
         met = {os.path.relpath(path, home): sha256(path) for path in beneath.values()}
-        if not again and (record := self._done(task, wanted)) and met.items() <= record.files.items():
+        record = None if again else self._done(task, wanted, beneath)
+        if record is not None and met.items() <= record.files.items():
             return replace(record.result, current=True)
         need_levels(self.path, [task], complete=False)
         self._need_inputs([task])
@@ -246,25 +248,29 @@ class LayerFolder:
     def _beneath(self, task: BakeTask, report: Reporter) -> dict[str, Path]:
         """Return the layers of garments that a task's was trained over, finished on the same character, by name.
 
-        Where some of these are missing, and the record of a garment of the shot is damaged, it is warned of.
+        Where some of these are missing it is warned of, and of a damaged record that may be of one of them.
         """
-        over, request = self.garment(task).over_models.values(), task.request
+        over, request = self.garment(task).over_models, task.request
         wearer = portable(request.motion, self.path), request.root
         there = finished(self.path, task.shot) if over else {}
         found = {
             name: self.layout(replace(task, garment=name)).animation
             for name, record in whole(there).items()
-            if name != task.garment and record.wearer == wearer and record.inputs["model"].sha256 in over
+            if name != task.garment and record.wearer == wearer and record.inputs["model"].sha256 in over.values()
         }
         damaged = [name for name, record in there.items() if not record and name != task.garment]
-        if damaged and len(found) < len(set(over)):
+        known = {record.inputs["model"].sha256 for name, record in whole(there).items() if name in found}
+        missing = [name for name, digest in over.items() if digest not in known]
+        if missing and not damaged and not task.over:
+            tell_left_out(task.name, missing, request.made, report)
+        elif missing:
             records = ", ".join(str(self._home(replace(task, garment=name)) / RECORD) for name in damaged)
             text = f"{records} is damaged, and nothing tells whether '{task.garment}' was trained over that garment"
-            todo = f"it is {_made(task)} without; bake what is damaged again with --replace, then this"
+            todo = f"it is {task.request.made} without; bake what is damaged again with --replace, then this"
             report(Message(f"{task.name}: {text}; {todo}", "warning"))
         for name in found:
             if self.layout(replace(task, garment=name)).points.is_file() and _is_refined_points(there[name]):
-                text = f"the refined '{name}' is in its points, and this is {_made(task)} over its joints"
+                text = f"the refined '{name}' is in its points, and this is {task.request.made} over its joints"
                 report(Message(f"{task.name}: {text}; leave --refined-output out of both", "warning"))
         return found
 
@@ -323,11 +329,6 @@ class LayerFolder:
         paths = (path for each in layouts for path in (each.asset, each.stage, each.animation))
         for folder in dict.fromkeys(path.parent for path in paths):
             remove_unfinished_in(folder)
-
-
-def _made(task: BakeTask) -> str:
-    """Return what a task does with a garment over others."""
-    return "certified" if task.request.certify else "refined"
 
 
 def _is_refined_points(record: TaskRecord | None) -> bool:

@@ -11,7 +11,6 @@ from pathlib import Path
 from ...errors import fail
 from ...files import relative_path, sha256, split_body, split_location
 from ...scene.assets import ShotWorld
-from .beneath import OVER
 from .opened import provenance_of
 from .record import RECORD
 from .request import AT, BakeRequest, split_start
@@ -43,7 +42,7 @@ def shot_metadata(rollout: BakeRollout, output: Path, part: Path | None = None) 
 
 
 def _refined(refinement: Refinement, folder: Path) -> dict[str, object]:
-    over = {OVER: refinement.beneath.named(folder)} if refinement.beneath else {}
+    over = refinement.beneath.to_metadata(folder) if refinement.beneath else {}
     return {REFINED: {**refinement.summary.to_metadata(), **over}}
 
 

@@ -23,14 +23,15 @@ from ...scene.mesh.joined import joined
 from ..gltf.outfit import GARMENTS, garments_in, join_glbs, write_alone
 from ..gltf.play import GlbShot
 from ..targets import GLB
-from .beneath import THICKNESS
+from .beneath import THICKNESS, changed_beneath
 from .bodies import WornModel, worn
+from .certificate.summary import CERTIFICATE
 from .layered import depth, over_others, tell_layers, trained_over
 from .opened import add_provenance, provenance_of
-from .origin import read_origin
+from .origin import REFINED, read_origin
 from .request import BakeRequest
 from .result import BakeResult, Verification
-from .shots import finished, is_stage, place_of
+from .shots import changed_in, finished, is_stage, place_of
 from .stated_layers import all_stated
 from .task import garment_name
 from .verification import verify
@@ -138,6 +139,19 @@ def stated_over(shot: Path) -> list[LayerFigures]:
         SsilkError: it cannot be read.
     """
     return all_stated(shot, finished(*place_of(shot))) if shot.suffix != GLB and is_stage(shot) else []
+
+
+def changed_since(shot: Path) -> list[str]:
+    """Return in words which garments of a shot were refined or certified over others than lie beneath them now.
+
+    Raises:
+        SsilkError: it cannot be read.
+    """
+    if is_stage(shot):
+        return list(changed_in(finished(*place_of(shot))))
+    said, made = provenance_of(shot), {REFINED: "refined", CERTIFICATE: "certified"}
+    parts = {word: facts for name, word in made.items() if isinstance(facts := said.get(name), Mapping)}
+    return [text for word, facts in parts.items() for text in changed_beneath(facts, shot, word)]
 
 
 def holds_several(shot: Path) -> bool:

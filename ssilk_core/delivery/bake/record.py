@@ -20,6 +20,7 @@ from .result import BakeResult
 from .task import OF_ASSET, BakeTask
 
 RECORD = "bake.json"
+ANIMATION = "anim.usdc"  # of a garment's layers, by its path in their record
 OF_FEW = ("sunk", "entered", "certificate", "loop")  # what records of shots without it do not name
 
 
@@ -37,7 +38,8 @@ class TaskRecord:
 
     Attributes:
         key: of everything that its files depend on (see `task_key`).
-        files: SHA-256 of each file that it wrote, by path relative to the record's folder.
+        files: SHA-256 of each file that it wrote, and of the layers `beneath`, by path relative to the record's
+            folder.
         result: of its bake.
         inputs: what was in each of the request's `INPUTS`, and where it was.
         root: SkelRoot of the character, where one was named.
@@ -57,6 +59,16 @@ class TaskRecord:
     def wearer(self) -> tuple[str, str | None]:
         """The character that wears the garment in its shot: its motion and its SkelRoot."""
         return self.inputs["motion"].path, self.root
+
+    @property
+    def beneath(self) -> dict[str, str]:
+        """SHA-256 of the layers that it was refined or certified over, by the names of their garments."""
+        beside = {Path(name): digest for name, digest in self.files.items()}
+        return {
+            path.parts[1]: digest
+            for path, digest in beside.items()
+            if len(path.parts) == 3 and (path.parts[0], path.name) == ("..", ANIMATION)
+        }
 
 
 def task_key(task: BakeTask, contents: InputHashes) -> str:

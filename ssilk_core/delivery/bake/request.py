@@ -183,6 +183,11 @@ class BakeRequest:
         return self.certify or self.refine != 0
 
     @property
+    def made(self) -> str:
+        """How it is made over garments beneath, in a word."""
+        return "certified" if self.certify else "refined"
+
+    @property
     def writes_points(self) -> bool:
         """Whether the garment is refined and written as points instead of joints."""
         return self.refine != 0 and self.refined_output == "points"

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Container, Hashable, Mapping, Sequence
+from collections.abc import Collection, Container, Hashable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from ...errors import fail
 from ...events import Message, Reporter, silent
 from .names_used import forget_use
-from .record import RECORD, TaskRecord, read_record
+from .record import ANIMATION, RECORD, TaskRecord, read_record
 from .stated_layers import current_facts
 
 if TYPE_CHECKING:
@@ -30,7 +30,8 @@ def write_shot_stage(
     replaced: Collection[str] = (),
     facts: Mapping[str, object] | None = None,
 ) -> None:
-    """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read.
+    """Write the stage of a shot from the garments that are on disk now; warn of others that cannot be read, and of
+    those that were refined or certified over what is not beneath them any more.
 
     Args:
         needed: garments that have to be in it.
@@ -79,6 +80,8 @@ def write_shot_stage(
         text = f"{', '.join(behind)} follow another motion than {', '.join(replaced)}, with a body of their own"
         todo = "bake them again with this motion and --replace, or take them out with 'ssilk remove'"
         report(Message(f"{folder / 'shots' / shot}: {text}; {todo}", "warning"))
+    for text in changed_in(found):
+        report(Message(f"{folder / 'shots' / shot}: {text}", "warning"))
     for name, other in written.bodies.items():
         if name in written.uncovered:
             text = f"{shot}/{name}: the body comes with '{other}'; faces that this one covers are not hidden"
@@ -106,6 +109,21 @@ def _behind(found: Mapping[str, TaskRecord | None], replaced: Collection[str]) -
         )
 
     return [name for name, record in found.items() if name not in replaced and record and is_behind(record)]
+
+
+def changed_in(found: Mapping[str, TaskRecord | None]) -> Iterator[str]:
+    """Yield in words which garments were refined or certified over others than lie beneath them now.
+
+    Args:
+        found: records of a shot's garments, by name. What one damaged holds is not known.
+    """
+    for name, record in found.items():
+        for inner, digest in (record.beneath if record else {}).items():
+            made = "certified" if record and record.result.certificate else "refined"
+            if inner not in found:
+                yield f"'{name}' was {made} over '{inner}', which is not in this shot any more; bake it again"
+            elif (other := found[inner]) and other.files.get(ANIMATION) != digest:
+                yield f"'{name}' was {made} over '{inner}' as that was before; bake it again"
 
 
 def is_stage(path: Path) -> bool:

@@ -10,9 +10,8 @@ from typing import Any
 
 from ...physics.intersections.figures import LAYERS, LayerFigures
 from ...scene.plain import from_plain
-from .record import TaskRecord
+from .record import ANIMATION, TaskRecord
 
-ANIMATION = "anim.usdc"  # of a garment's layers, by its path in their record
 COUNTED_IN = "counted_in"  # SHA-256 of the outer and of the inner garment's layer
 
 Records = Mapping[str, TaskRecord | None]

@@ -19,7 +19,7 @@ from ...scene.assets import Floats
 from ...scene.cycles import LEAST_FRAMES
 from ..gltf.play import GlbShot
 from ..targets import GLB
-from .beneath import OVER, GarmentsBeneath, beneath_said
+from .beneath import GarmentsBeneath, beneath_said
 from .certificate.verified import verify_certificate
 from .load import load_rollout
 from .looped import seam
@@ -153,17 +153,19 @@ def _verify_points(
 
     samples = rollout.request.samples_per_frame
     times = shot.sample_times(samples)
+    solve_again = rollout.request.refine and rollout.refinement is None
+    below = _refined_over(path, samples, report) if solve_again else None
     if rollout.request.latent_iterations and rollout.latents is None:
         return _verify_extent(shot, times, path, rollout, report, "solved in latents")
-    if rollout.request.refine and rollout.refinement is None:
+    if solve_again:
         if rollout.request.feedback:
             return _verify_extent(shot, times, path, rollout, report, "refined with feedback")
         if rollout.direction is not None and not shot.is_skinned:  # held points have any energy
             return _verify_extent(shot, times, path, rollout, report, "refined, and held for a while")
         if not shot.is_skinned:
-            return verify_energies(rollout, map(shot.garment_points, times), _refined_over(path, samples), report)
+            return verify_energies(rollout, map(shot.garment_points, times), below, report)
         if not rollout.request.writes_points:
-            again = refined_points(rollout, report, _refined_over(path, samples))
+            again = refined_points(rollout, report, below)
             fitted = _with_moved(shot, times, again, moved)
             return compare_trajectories(shot, fitted, samples_per_frame=samples)
     expected = rollout.vertices(report) if shot.is_skinned else rollout.points(report)
@@ -180,10 +182,10 @@ def _verify_points(
     return Verification(frames=len(times), largest_error_m=found.worst, allowed_error_m=found.bound)
 
 
-def _refined_over(path: Path, samples: int) -> GarmentsBeneath | None:
+def _refined_over(path: Path, samples: int, report: Reporter) -> GarmentsBeneath | None:
     """Return the garments that a file says it was refined over; raise `VerificationError` where one is not there."""
     said = provenance_of(path).get(REFINED)
-    return beneath_said(said.get(OVER), path, samples, "refined") if isinstance(said, Mapping) else None
+    return beneath_said(said, path, samples, "refined", report) if isinstance(said, Mapping) else None
 
 
 def _with_moved(

@@ -14,6 +14,7 @@ from ...files import need_not_input, need_writable, replacing, split_location
 from ...scene.kinematics import lbs_deformer, lbs_poses
 from ...scene.riders import RiderJoints
 from ..targets import GLB
+from .beneath import left_out, tell_left_out
 from .certificate.certified import certified, proven
 from .certificate.requirements import need_certifier
 from .counted import state_rollout_counts
@@ -75,6 +76,12 @@ def bake(
         need_joints(rollout.riders)
     report(Started("bake", rollout.motion.frame_count, {"output": str(path)}))
     rollout.tell(report)
+    if rollout.request.meets_beneath:
+        over: Any = rollout.provenance.get("trained_over", {})
+        met = beneath or {}
+        if len(met) < len(over) and (missing := left_out(over, met.values())):
+            where = f"{place}: {path.stem}" if place else str(path)
+            tell_left_out(where, missing, rollout.request.made, report)
     rollout = certified(refined(solved(rollout, report), report, beneath=beneath), report, beneath)
     if path.suffix == GLB:
         warn_of_sets(rollout.deformer, Path(place or path), report)

@@ -13,6 +13,7 @@ from ssilk_core.files import replacing
 from ssilk_core.scene.assets import Character, Floats, Garment, Ints, Mesh, Motion, ProxyRig, ShotWorld, Skeleton
 
 from ..names import FREE, GARMENT, HOLD
+from ..opening.garment_api import GarmentRecord, apply_garment_api
 from ..units import StageUnits
 from .author import bind_skin, define_mesh, define_skeleton, keep_lbs_skin, mark_garment, prim_names
 from .export import new_stage, save
@@ -69,18 +70,29 @@ def write_garment(path: str | Path, mesh: Mesh) -> None:
         save(stage.GetRootLayer(), path)
 
 
-def write_cache(path: str | Path, mesh: Mesh, points: Sequence[Floats], fps: float, start: int) -> None:
+def write_cache(
+    path: str | Path,
+    mesh: Mesh,
+    points: Sequence[Floats],
+    fps: float,
+    start: int,
+    record: GarmentRecord | None = None,
+) -> None:
     """Write a mesh that has its points at each frame, in metres and y up, one time code per frame.
 
     Args:
         points: of each frame in the world [m], shape (V, 3).
         fps: frames per second [1/s].
         start: time code of the first frame.
+        record: how the model of the mesh was made, where it is marked as a garment.
     """
     with replacing(path) as temporary:
         stage = new_stage(temporary, CORE_UNITS)
         prim = define_mesh(stage, _root_path(mesh.path), mesh, CORE_UNITS)
         stage.SetDefaultPrim(prim.GetPrim())
+        if record is not None:
+            prim.GetPrim().CreateAttribute(GARMENT, Sdf.ValueTypeNames.Bool).Set(True)
+            apply_garment_api(prim.GetPrim(), record)
         stage.SetTimeCodesPerSecond(fps)
         stage.SetFramesPerSecond(fps)
         stage.SetStartTimeCode(start)

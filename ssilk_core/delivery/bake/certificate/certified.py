@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ....events import Countdown, Message, Reporter, silent
-from ..beneath import OVER, GarmentsBeneath
+from ..beneath import GarmentsBeneath
 from ..opened import add_provenance, open_shot
 from ..rollout import BakeRollout
 from .blendshapes import with_shapes
@@ -87,7 +87,7 @@ def proven(rollout: BakeRollout, path: Path, report: Reporter = silent) -> BakeR
         return with_shapes(work, certificate.poses_before)
     summary = summary_of(work, found, shot.sample_times(samples))
     certificate.summary = summary
-    over = {OVER: work.beneath.named(path.parent)} if work.beneath else {}
+    over = work.beneath.to_metadata(path.parent) if work.beneath else {}
     add_provenance(path, {CERTIFICATE: {**summary.to_metadata(), **over}})
     if summary.left:
         report(Message(f"{rollout.request.motion}: {summary.unfree}", "warning"))

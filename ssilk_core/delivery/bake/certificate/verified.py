@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ....errors import VerificationError
 from ....events import Reporter, silent
-from ..beneath import OVER, beneath_said
+from ..beneath import beneath_said
 from ..opened import open_shot, provenance_of
 from ..result import certified_frames
 from ..rollout import BakeRollout
@@ -46,7 +46,7 @@ def verify_certificate(rollout: BakeRollout, path: Path, report: Reporter = sile
         raise VerificationError(f"{path}: it was baked with --certify, but has no certificate; bake it again.")
     moved, left = (frames_said(said.get(name, ())) for name in ("moved frames", "frames left"))
     shot, samples = open_shot(path), rollout.request.samples_per_frame
-    beneath = beneath_said(said.get(OVER), path, samples, "certified")
+    beneath = beneath_said(said, path, samples, "certified", report)
     certifier = Certifier(rollout.deformer.scene, beneath.faces if beneath else None)
     times, intersecting, showing = shot.sample_times(samples), 0, 0
     for frame, faults in faults_in(shot, certifier, rollout, beneath, report):
