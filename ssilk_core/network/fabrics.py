@@ -20,7 +20,6 @@ from ..errors import fail
 from ..scene.assets import Floats
 from ..scene.assets.arrays import assign, frozen
 from ..scene.fabric_range import FACTORS, FabricRange
-from .first_layers import biases_under, blank_columns, misfit
 
 SEEING = ("initialiser", "stepper")  # networks that see the fabric, where a model has them
 
@@ -71,18 +70,26 @@ class SeenFabrics:
 
     def need_fit(self, parameters: Mapping[str, Floats]) -> None:
         """Raise `SsilkError` unless this belongs to a network."""
-        if name := misfit(SEEING, self.columns, parameters):
-            found = f"weights '{name}' do not fit the network"
-            fail("range of fabrics", found, "one row for each unit is needed", "train again")
+        for name in SEEING:
+            bias, own = parameters.get(f"{name}.0.bias"), self.columns.get(name)
+            if (None if bias is None else len(bias)) != (None if own is None else len(own)):
+                found = f"weights '{name}' do not fit the network"
+                fail("range of fabrics", found, "one row for each unit is needed", "train again")
 
     def biases(self, parameters: Mapping[str, Floats], features: Floats) -> dict[str, Floats]:
         """Return the biases of the first layers under features (5,), by name."""
-        return biases_under(self.columns, parameters, features)
+        return {
+            f"{name}.0.bias": (parameters[f"{name}.0.bias"] + values @ features).astype(np.float32)
+            for name, values in self.columns.items()
+        }
 
 
 def unseen(parameters: Mapping[str, Floats]) -> dict[str, Floats]:
     """Return weights that count nothing, for the networks of a model of one fabric, by name."""
-    return blank_columns(SEEING, parameters, len(FACTORS))
+    biases = {name: parameters.get(f"{name}.0.bias") for name in SEEING}
+    return {
+        name: np.zeros((len(bias), len(FACTORS)), np.float32) for name, bias in biases.items() if bias is not None
+    }
 
 
 def parted(values: Mapping[str, Floats], states: int) -> tuple[dict[str, Floats], dict[str, Floats]]:
