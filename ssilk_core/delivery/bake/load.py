@@ -26,7 +26,7 @@ from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
-from .direction import Direction, held_parts, held_proxies
+from .direction import Direction, held_parts, held_proxies, need_moving, stated_at
 from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, shapes_of, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -227,14 +227,7 @@ class LoadedGarment:
 
     @cached_property
     def _places(self) -> tuple[str, ...]:
-        """Paths at which stages may direct the garment: that in the character's stage, and that of its training."""
-        from ssilk_usd.opening.stage import open_stage
-        from ssilk_usd.writing.look import look_source
-
-        mesh, stage = self.deformer.scene.garment.mesh, open_stage(self.request.stage)
-        there, trained = look_source(mesh, stage, self.request.root), split_location(mesh.path)[1]
-        found = [*([str(there.prim.GetPath())] if there else []), *([trained] if trained else [])]
-        return tuple(dict.fromkeys(found))  # a model may know its garment by a name alone
+        return stated_at(self.deformer.scene.garment.mesh, self.request.stage, self.request.root)
 
     def _loops(self, request: BakeRequest, motion: Motion) -> bool:
         """Return whether a shot is to be a loop; skinning alone repeats by itself."""
@@ -311,9 +304,7 @@ class LoadedGarment:
         if said.parts:
             parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole, moves)
         hold = request.hold or said.hold
-        if hold > 1 and request.refine:
-            found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
-            fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
+        need_moving(request, hold)
         if read.loop is not None:
             looped = self._directed_in_loop(request, read, read.loop, said, parts)
             return looped and replace(looped, hand_moves=moves)
