@@ -320,7 +320,8 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
 
 def test_a_model_of_one_body_still_refuses_others(world, capsys):
     assert run("bake model.safetensors --motion clip.usda --stage taller.usda -o out.usda") == 2
-    assert "a model bakes on the character it was trained with" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "a model bakes on the character it was trained with" in told and "on both bodies with --family" in told
 
 
 def test_evaluate_takes_a_member(world):
@@ -855,6 +856,14 @@ def test_a_body_that_shapes_cannot_make_is_told_at_submission(shapes, capsys):
     assert told in capsys.readouterr().err
     assert run(farm) == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_model_of_one_body_is_told_of_shapes_that_leave_joints_in_place(shapes, capsys):
+    bake = "bake model.safetensors --motion clip.usda --range 0-2 -o out.usda --stage shapes.usda"
+    told = "its shapes leave the joints in place, and the model was trained without them"
+    assert run(f"{bake}:slight=1") == 0 and told in capsys.readouterr().err
+    assert run(bake) == 0 and "its shapes" not in capsys.readouterr().err
+    assert run(f"{bake}:taller=1") == 2 and "on both bodies with --family" in capsys.readouterr().err
 
 
 def test_an_evaluation_has_bodies_by_shapes_under_their_names(shapes):
