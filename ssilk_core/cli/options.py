@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -38,7 +38,7 @@ from ..scene.shape_weights import body_name, body_of
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
-    from ..scene.assets import Character, Garment, Motion, ProxyRig, Scene, SurfaceMaterial
+    from ..scene.assets import Character, Garment, Mesh, Motion, ProxyRig, Scene, SurfaceMaterial
 
 
 LIST, MODEL = ".toml", ".safetensors"  # suffixes of a list of garments, and of a trained one
@@ -579,6 +579,18 @@ def load_scene(
 
     character, garment, rig = read(options, report)
     return prepare_scene(character, garment, rig, rig_options=rigging, report=report)
+
+
+def laid(options: argparse.Namespace, garment: Mesh) -> Callable[[], Mesh] | None:
+    """Return what reads a garment where riders of its stage lie on it; None where that is on the body that it is on.
+
+    A body that weights of the stage's shapes make has the garment from elsewhere, and riders from the stage.
+    """
+    from ssilk_usd.reading.scene import read_scene
+
+    file, shapes = split_body(str(options.stage))
+    name = (split_location(garment.path)[1] or garment.path).rpartition("/")[2]
+    return (lambda: read_scene(file, root=options.root, garment=name)[1].mesh) if shapes else None
 
 
 def bodies(stages: Sequence[Path]) -> dict[str, Path]:

@@ -833,6 +833,23 @@ def test_what_rides_on_a_garment_goes_along_to_a_body_by_shapes(shapes, soft):
     np.testing.assert_allclose(np.linalg.norm(mesh.points - there, axis=1).max(), 0.01, atol=4e-3)
 
 
+def test_what_rides_on_a_garment_goes_along_in_simulations_of_a_body_by_shapes(shapes, capsys):
+    """The copy that `rig --onto` writes has it where the stage has, which is told."""
+    own = load_model("model.safetensors").scene.garment.mesh
+    face = int(np.linalg.norm(own.points[own.faces].mean(axis=1) - own.points.mean(axis=0), axis=1).argmax())
+    points, foot = disc_on(own, face, np.full(3, 1 / 3), 0.01)
+    home = Usd.Stage.Open("shapes.usda")
+    add_rider(home, "/Hero/Button", points)
+    home.Save()
+    assert run("rig shapes.usda --onto heavier=1 -o heavy.usda") == 0
+    assert "heavy.usda: /Hero/Button lies as on the stage's own body" in capsys.readouterr().err
+    simulate = "simulate shapes.usda:heavier=1 --garment heavy.usda --motion clip.usda --range 0-0 -o simulated.usda"
+    assert run(simulate) == 0
+    there = shown("simulated.usda", 0)
+    button, cloth = there["Button"].mean(axis=0), there["Skirt"][own.faces[face]].mean(axis=0)
+    assert np.linalg.norm(button - cloth) < 0.01 and np.linalg.norm(cloth - foot) > 0.02
+
+
 def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):
     bodies = "--stage shapes.usda --stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
     assert run(f"farm family.safetensors --motion clip.usda {bodies} --bundle job") == 0
