@@ -86,9 +86,10 @@ class LoadedGarment:
         told: what was found about the body and riders, to be reported.
         body: which body it lies on (`bodies.WornModel.body`).
         first: the skeleton of the first body of the model's family; None where it lies on no other one of that.
-        taller: height of the hub over the ground, relative to that body's, of a body that weights of the stage's
-            shapes make; None for others.
-        moves: likewise how far each of its proxies is from where that body has it, along its parent's axes [m], (3,).
+        hub_ratio: height of the hub over the ground, relative to that body's, of another body that weights of the
+            stage's shapes make; None where motions are played as they are.
+        moves: of such a body how far each of its proxies is from where the first has it, along its parent's axes [m],
+            (3,).
     """
 
     request: BakeRequest
@@ -106,7 +107,7 @@ class LoadedGarment:
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
-    taller: float | None = None
+    hub_ratio: float | None = None
     moves: Mapping[str, Floats] = field(default_factory=dict)
     played: GarmentRecord | None = None
 
@@ -220,10 +221,10 @@ class LoadedGarment:
     def _between_own_bones(self, motion: Motion) -> tuple[Motion, tuple[Event, ...]]:
         """Return a motion of the first body as a body moves that shapes of its stage make: no shot has its bones."""
         skeleton, first = self.deformer.scene.character.skeleton, self.first
-        if self.taller is None or first is None or has_bones(motion, skeleton) or not has_bones(motion, first):
+        if self.hub_ratio is None or first is None or has_bones(motion, skeleton) or not has_bones(motion, first):
             return motion, ()
         text = "its joints are as far apart as those of the stage's own body, and are played between this one's bones"
-        return motion_on(motion, first, skeleton, self.taller), (Message(f"{motion.path}: {text}"),)
+        return motion_on(motion, first, skeleton, self.hub_ratio), (Message(f"{motion.path}: {text}"),)
 
     @cached_property
     def _places(self) -> tuple[str, ...]:
@@ -370,6 +371,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     file, in_words = in_fabric(own, request.model, request.fabric, request.material, request.feedback)
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
+    by_shapes = bool(shapes_of(request.stage) and on.member)
     return LoadedGarment(
         request=request,
         file=file,
@@ -391,17 +393,16 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         told=(*told, *in_words),
         body=on.body,
         first=first.scene.character.skeleton if on.member else None,
-        taller=_taller(first, on) if shapes_of(request.stage) else None,
-        moves=_moves(first.scene, scene) if shapes_of(request.stage) and on.member else {},
+        hub_ratio=_hub_ratio(first, on.member) if on.member and by_shapes else None,
+        moves=_moves(first.scene, scene) if by_shapes else {},
     )
 
 
-def _taller(file: ModelFile, on: WornModel) -> float | None:
+def _hub_ratio(file: ModelFile, member: tuple[float, ...]) -> float:
     """Return how much higher than the first body's the hub of another member is, in parts of it."""
-    if not (on.member and file.bodies):
-        return None
+    assert file.bodies is not None
     bodies = file.bodies.family.bodies
-    return bodies.height_ratio(np.array(on.member[: bodies.size]))
+    return bodies.height_ratio(np.array(member[: bodies.size]))
 
 
 def _moves(base: Scene, other: Scene) -> dict[str, Floats]:
