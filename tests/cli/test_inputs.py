@@ -8,6 +8,7 @@ import subprocess
 import sys
 
 import pytest
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.cli import main
 from ssilk_core.cli.inputs import CHARACTER, MODEL, MOTIONS, need_input
@@ -46,6 +47,25 @@ def test_a_shape_without_a_weight_is_told(tmp_path):
     need_input(f"{tmp_path}/hero.usda:tall=1", CHARACTER)
     said = refusal(f"{tmp_path}/hero.usda:tall", CHARACTER)
     assert "'tall' is neither weights of shapes nor the path of a prim; a body of a stage is named as" in said
+
+
+def test_a_shape_that_is_named_like_a_file_is_suggested_with_its_weight(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    stage = Usd.Stage.CreateNew("hero.usda")
+    UsdSkel.Root.Define(stage, "/Hero")
+    binding = UsdSkel.BindingAPI.Apply(UsdGeom.Mesh.Define(stage, "/Hero/Body").GetPrim())
+    shape = UsdSkel.BlendShape.Define(stage, "/Hero/Body/Tall")
+    binding.CreateBlendShapesAttr(["tall"])
+    binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath()])
+    stage.Save()
+    for words, says in (
+        ("inspect hero.usda --onto tall", "tall: there is no such file;"),
+        ("train hero.usda --motions . -o cape.safetensors --family tal", "tal: there is no such file;"),
+    ):
+        assert main(words.split()) == 2
+        told = capsys.readouterr().err
+        assert says in told and told.rstrip().endswith("did you mean 'tall=1'?")
+    assert "weights of shapes without their stage; a body of a stage is named as" in refusal("tall=1", CHARACTER)
 
 
 def test_nothing_heavy_is_loaded_to_say_so(tmp_path, monkeypatch):
