@@ -26,7 +26,7 @@ from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..files import need_not_input, need_writable, split_body, split_location
+from ..files import is_same_file, need_not_input, need_writable, split_body, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
@@ -507,7 +507,8 @@ def read_member(options: argparse.Namespace, location: str, report: Reporter, ro
     from ssilk_usd.reading.character import read_character
 
     file, prim = wardrobe(options)
-    own = split_body(location)[0] == split_body(str(options.stage))[0] == str(file)
+    stage = split_body(str(options.stage))[0]
+    own = is_same_file(split_body(location)[0], stage) and is_same_file(file, stage)
     root, garment = root or options.root, prim if own else None
     return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
 

@@ -714,6 +714,22 @@ def shapes(world) -> Path:
     return world
 
 
+@pytest.mark.parametrize("path", ["plain.usda", "link.usda"])
+def test_a_stage_is_the_same_however_its_path_is_written(world, capsys, path):
+    """Its garment, which is not marked as one, is none of the body by shapes."""
+    stage = Usd.Stage.Open("rigged.usda")
+    skirt = stage.GetPrimAtPath("/Hero/Skirt")
+    for said in skirt.GetAuthoredProperties():
+        if "ssilk:" in said.GetName():
+            skirt.RemoveProperty(said.GetName())
+    points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get(), dtype=float)
+    add_shape(stage, "heavier", heavier(points) - points)
+    stage.GetRootLayer().Export("plain.usda")
+    Path("link.usda").symlink_to("plain.usda")
+    code, found = findings(capsys, f"inspect plain.usda --garment Skirt --family {path}:heavier=1")
+    assert "no-family" not in found and found["family"]["count"] == 2, (code, found)
+
+
 def test_inspect_tells_bodies_by_shapes_with_their_millimetres(shapes, capsys):
     code, found = findings(capsys, "inspect shapes.usda --family taller=1 heavier=0.5,taller=0.2")
     assert code == 0 and found["family"]["count"] == 3
