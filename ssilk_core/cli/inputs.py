@@ -65,7 +65,7 @@ def need_inputs(options: argparse.Namespace) -> None:
 
 
 def _shape_meant(named: str, stage: Path) -> str:
-    """Return a question that suggests weights of a stage's shape for a name that is none of a file; "" without one."""
+    """Return a question that suggests weights of a stage's shape in place of a file that is not there; or ""."""
     if Path(named).suffix or Path(named).exists() or not Path(split_body(str(stage))[0]).is_file():
         return ""
     from ssilk_usd.opening.shaped import body_parameters

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..delivery.bake import BakeRequest, naming
 from ..delivery.bake.request import (
@@ -112,6 +112,12 @@ def add_known_fabric(verb: argparse.ArgumentParser) -> None:
         f"of the training's fabric; factors are {', '.join(FACTORS)}. A bake with --feedback or --quality hero takes "
         "friction=0.4 of any model",
     )
+
+
+def asked_known_fabric(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the options of `add_known_fabric` say by their names, without those that say nothing."""
+    asked = {"fabric": options.fabric, "material": options.material}
+    return {name: value for name, value in asked.items() if value}
 
 
 def add_world(verb: argparse.ArgumentParser, of: str) -> None:
