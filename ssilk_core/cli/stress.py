@@ -97,8 +97,7 @@ def _subject(options: argparse.Namespace, stage: Path, report: Reporter) -> Stre
     from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
 
-    from ..delivery.bake import worn
-    from ..delivery.bake.fabrics import in_fabric
+    from ..delivery.bake import in_fabric, worn
     from ..network.checkpoint import load_model
     from ..quality.evaluation.bodies import base_of
     from ..quality.stress.subject import FULL, QUICK, StressSubject

@@ -121,8 +121,7 @@ class Bench:
     def __init__(self, options: argparse.Namespace, report: Reporter) -> None:
         from ssilk_usd.opening.stage import open_stage
 
-        from ..delivery.bake import worn
-        from ..delivery.bake.fabrics import in_fabric
+        from ..delivery.bake import in_fabric, worn
         from ..devices import select_device
         from ..network.checkpoint import load_model
         from ..quality.evaluation.takes import takes_of, within
