@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import did_you_mean, fail
 from ..files import split_body, split_location
-from ..scene.shape_weights import ALLOWED, is_shapes
+from ..scene.shape_weights import ALLOWED, is_shapes, need_weights
 
 
 @dataclass(frozen=True)
@@ -86,9 +86,7 @@ def need_input(named: str, kind: Kind, meant: str = "") -> None:
     path = Path(split_body(split_location(named)[0])[0])
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
-    file, colon, rest = named.rpartition(":")
-    if colon and Path(file).is_file():
-        fail(named, f"'{rest}' is neither weights of shapes nor the path of a prim", ALLOWED)
+    need_weights(named)
     if is_shapes(named):
         fail(named, "weights of shapes without their stage", ALLOWED)
     found, near = f"there is no such {kind.name}", meant

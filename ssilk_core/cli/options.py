@@ -34,7 +34,7 @@ from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 from ..scene.posed_alike import shaped_as_in_stage
-from ..scene.shape_weights import body_name, body_of
+from ..scene.shape_weights import body_name, body_of, parse_shapes, shapes_text
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
@@ -525,12 +525,15 @@ def members(options: argparse.Namespace) -> list[str]:
     Without a word, --family means the ends of the ranges of all shapes that the stage marks as body parameters.
 
     Raises:
-        SsilkError: it marks none.
+        SsilkError: it marks none, or a body is named twice.
     """
     if options.family is None:
         return []
     if options.family:
-        return [body_of(str(member), str(options.stage)) for member in options.family]
+        named = [_as_compared(body_of(str(member), str(options.stage))) for member in options.family]
+        if twice := next((each for each in named if named.count(each) > 1), None):
+            fail(f"--family {twice}", "a body that is named twice", "each is named once", "leave one out")
+        return named
     from ssilk_usd.opening.shaped import body_parameters
     from ssilk_usd.opening.stage import open_stage
 
@@ -541,6 +544,12 @@ def members(options: argparse.Namespace) -> list[str]:
         fail(file, "it marks no body parameters with ssilk:weightRange", there,
              "name the bodies, such as --family tall=1 heavy=1")  # fmt: skip
     return [f"{file}:{name}={weight:.9g}" for name, of in marked.items() for weight in (of.low, of.high) if weight]
+
+
+def _as_compared(body: str) -> str:
+    """Return where a body is with its weights of shapes as they are compared."""
+    file, shapes = split_body(body)
+    return f"{file}:{shapes_text(parse_shapes(body, shapes))}" if shapes else body
 
 
 def tell_shapes(
