@@ -185,6 +185,12 @@ def need_folder(target: str | Path) -> None:
             return
 
 
+def is_same_file(path: str | Path, other: str | Path) -> bool:
+    """Return whether two paths lead to one file, however they are written; links are followed."""
+    path, other = Path(path), Path(other)
+    return path == other or (path.exists() and other.exists() and path.samefile(other))
+
+
 def need_not_input(target: str | Path, *inputs: Path | str | None) -> None:
     """Raise `SsilkError` if `target` is one of the `inputs`, which are never overwritten."""
     target = Path(target)

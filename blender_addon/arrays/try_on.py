@@ -16,6 +16,11 @@ KNOTS = (LEAST, 0.5, 1.0, MOST)  # shares at which it is carried; at 0 it is as 
 LISTED = 3  # joints that are missing
 TURNED = 5.0  # degrees between bodies up to which none is turned: their shapes differ
 STANDS_ELSEWHERE = 0.05  # [m] likewise for their places
+ADOPTED = "if they are proxies of an imported garment, Adopt Rig recognises them"
+MEMBERS = (
+    "Members have the same joints, and body meshes with the same points and faces; export it from the same base mesh "
+    "and rig."
+)
 
 
 def knot_values(share: float) -> tuple[float, ...]:
@@ -42,12 +47,18 @@ def member_points(base: Character, other: Character) -> list[np.ndarray]:
         except SetupError as error:
             told.append(str(error))
     if told:
-        raise SetupError(
-            f"'{other.path}' is no member of the family: {'; '.join(told)}. Members have the same joints, and body "
-            "meshes with the same points and faces; export it from the same base mesh and rig."
-        )
+        todo = MEMBERS
+        if len(told) == 1 and missing and not _moves_bodies(base, [own.index(name) for name in missing]):
+            todo = (
+                f"They move no body: if they are proxies of an imported garment, Adopt Rig recognises them. {MEMBERS}"
+            )
+        raise SetupError(f"'{other.path}' is no member of the family: {'; '.join(told)}. {todo}")
     placed = _placed(np.concatenate(matched), base.merged_body().mesh.points)
     return np.split(placed, np.cumsum([len(points) for points in matched])[:-1])
+
+
+def _moves_bodies(character: Character, joints: list[int]) -> bool:
+    return any(np.isin(each.skin.indices[each.skin.weights > 0], joints).any() for each in character.bodies)
 
 
 def _match(body: Body, other: Character) -> Body:

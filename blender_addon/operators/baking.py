@@ -39,7 +39,7 @@ from ..playback import playing
 from ..playback.bake import animated, apply_bake, need_bakeable, need_movable, remove_bake
 from ..playback.beneath import ShownBeneath
 from ..playback.bodies import corrected, reshaped
-from ..playback.fabrics import played_options
+from ..playback.fabrics import friction_options, played_options
 from ..playback.family import BodyModel, on_its_body
 from ..playback.followed import SampledKeys, followed_bodies
 from ..playback.models import (
@@ -203,7 +203,12 @@ class BakeGarment(TimelineOperator, bpy.types.Operator):
             raise SetupError("A solver moves each frame: set Hold Frames to 1, or choose another quality.")
         if solves and garment.ssilk.loop:
             raise SetupError("A solver does not come back to its start: switch Loop off, or choose another quality.")
+        rough = friction_options(garment)
+        if rough and not (solves and QUALITIES[self.quality].feedback):
+            self.report({"WARNING"}, "Friction is left out: bakes as Hero know it.")
+            rough = []
         joints = self.known_joints(garment, armature)
+        self.in_fabric += rough
         self.need_start(garment)
         need_bakeable(garment, armature, joints)
         need_tracks(animated(garment, armature))

@@ -130,6 +130,7 @@ class PlayedFabricPanel(PlayableGarmentPanel, bpy.types.Panel):
         column.active = fabrics_of(garment) is not None
         for name in ("preset", *FACTORS):
             column.prop(garment.ssilk.played, name)
+        layout.prop(garment.ssilk.played, "friction")
         if line := fabric_line(garment):
             draw_text(layout, line, icon="INFO")
 

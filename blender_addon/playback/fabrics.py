@@ -24,6 +24,12 @@ def played_options(garment: bpy.types.Object) -> list[str]:
     return [word for factor in factors for word in ("--material", factor)]
 
 
+def friction_options(garment: bpy.types.Object) -> list[str]:
+    """Return the option by which `ssilk bake` takes the friction that is chosen for a garment."""
+    chosen = garment.ssilk.played.friction
+    return ["--material", f"friction={chosen:.7g}"] if chosen else []
+
+
 def in_fabric(file: ModelFile, factors: np.ndarray) -> ModelFile:
     """Return a model in a fabric of its range; as it is where it knows none."""
     return file.on_fabric(fabric_with(file.fabric, factors)) if file.fabrics else file

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fabric that a garment plays and bakes in, as factors of its model's own, which knows a range of them."""
+"""The fabric that a garment plays and bakes in, as factors of its model's own, which knows a range; its friction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bpy.props import EnumProperty, FloatProperty
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.fabric_range import FACTORS, factors_of
-from ssilk_core.scene.fabrics import FABRICS
+from ssilk_core.scene.fabrics import FABRICS, MOST_FRICTION
 
 from .fabric import CHOICES
 from .training import SHOTS
@@ -63,7 +63,7 @@ def _factor(name: str):  # type: ignore[no-untyped-def]
 
 
 class PlayedFabric(bpy.types.PropertyGroup):
-    """Factors of the fabric that a model was trained with."""
+    """Factors of the fabric that a model was trained with, and friction, which solvers alone know."""
 
     preset: EnumProperty(
         name="Preset",
@@ -77,6 +77,14 @@ class PlayedFabric(bpy.types.PropertyGroup):
     bending: _factor("bending")
     density: _factor("density")
     drag: _factor("drag")
+    friction: FloatProperty(
+        name="Friction",
+        description="Coulomb's coefficient of the cloth, 0.2 to 1 on skin; bakes as Hero know it",
+        min=0.0,
+        max=MOST_FRICTION,
+        precision=2,
+        override=SHOTS,
+    )
 
 
 CLASSES = (PlayedFabric,)

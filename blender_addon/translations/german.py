@@ -392,6 +392,10 @@ WORDS = {
     "How much stiffer folds are than in its training": "Wie viel steifer Falten sind als in seinem Training",
     "How much heavier the cloth is than in its training": "Wie viel schwerer der Stoff ist als in seinem Training",
     "How much more the air holds it than in its training": "Wie viel mehr die Luft ihn hält als in seinem Training",
+    "Friction": "Reibung",
+    "Coulomb's coefficient of the cloth, 0.2 to 1 on skin; bakes as Hero know it": (
+        "Coulombscher Reibungsbeiwert des Stoffs, auf Haut 0,2 bis 1; gilt, wenn als Hauptfigur gebacken wird"
+    ),
     "Range of Fabrics": "Viele Stoffe",
     "Train for soft and stiff, light and heavy cloth at once, as all presets are, so that the fabric can be chosen "
     "while the garment is played": (

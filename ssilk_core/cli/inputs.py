@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..errors import did_you_mean, fail
 from ..files import split_body, split_location
-from ..scene.shape_weights import ALLOWED, is_shapes
+from ..scene.shape_weights import ALLOWED, is_shapes, need_weights
 
 
 @dataclass(frozen=True)
@@ -58,29 +58,45 @@ def need_inputs(options: argparse.Namespace) -> None:
                 continue
             kind = SHOT if kind is MOTIONS else kind
         for each in values:
-            if not (name in OF_STAGE and is_shapes(str(each))):
-                need_input(str(each), kind)
+            if name in OF_STAGE and is_shapes(str(each)):
+                continue
+            meant = _shape_meant(str(each), options.stage) if name in OF_STAGE else ""
+            need_input(str(each), kind, meant)
 
 
-def need_input(named: str, kind: Kind) -> None:
+def _shape_meant(named: str, stage: Path) -> str:
+    """Return a question that suggests weights of a stage's shape in place of a file that is not there; or ""."""
+    if Path(named).suffix or Path(named).exists() or not Path(split_body(str(stage))[0]).is_file():
+        return ""
+    from ssilk_usd.opening.shaped import body_parameters
+    from ssilk_usd.opening.stage import open_stage
+
+    shapes = body_parameters(open_stage(stage))
+    return did_you_mean(f"{named}=1", (f"{name}={min(each.high, 1) or each.low:g}" for name, each in shapes.items()))
+
+
+def need_input(named: str, kind: Kind, meant: str = "") -> None:
     """Raise `SsilkError` where there is no such input. It may be FILE:/PRIM.
 
     Names that USD resolves in its own way, such as a file in a package, are left to it.
+
+    Args:
+        meant: a question that suggests what else than a file may be meant.
     """
     path = Path(split_body(split_location(named)[0])[0])
     if "[" in named or "://" in named or path.is_file() or (kind.folder and path.is_dir()):
         return
-    file, colon, rest = named.rpartition(":")
-    if colon and Path(file).is_file():
-        fail(named, f"'{rest}' is neither weights of shapes nor the path of a prim", ALLOWED)
-    found, near = f"there is no such {kind.name}", ""
+    need_weights(named)
+    if is_shapes(named):
+        fail(named, "weights of shapes without their stage", ALLOWED)
+    found, near = f"there is no such {kind.name}", meant
     if path.is_symlink():
         found = "a link that leads to no file"
     elif path.is_dir():
         found = f"a folder, and no {kind.name}"
     elif path.exists():
         found = f"{_special(path)}, and no {kind.name}"
-    elif path.parent.is_dir():
+    elif path.parent.is_dir() and not meant:
         near = did_you_mean(path.name, (each.name for each in path.parent.iterdir() if each.suffix == path.suffix))
     fail(named, found, kind.needed, near)
 

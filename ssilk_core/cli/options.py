@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..delivery.bake import BakeRequest, naming
 from ..delivery.bake.request import (
@@ -26,7 +26,7 @@ from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
 from ..events import Message, Reporter
-from ..files import need_not_input, need_writable, split_body, split_location
+from ..files import is_same_file, need_not_input, need_writable, split_body, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
 from ..scene.assets.reshaped import reshaped
@@ -34,11 +34,11 @@ from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 from ..scene.posed_alike import shaped_as_in_stage
-from ..scene.shape_weights import body_name, body_of
+from ..scene.shape_weights import body_name, body_of, parse_shapes, shapes_text
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
-    from ..scene.assets import Character, Garment, Motion, ProxyRig, Scene, SurfaceMaterial
+    from ..scene.assets import Character, Garment, Mesh, Motion, ProxyRig, Scene, SurfaceMaterial
 
 
 LIST, MODEL = ".toml", ".safetensors"  # suffixes of a list of garments, and of a trained one
@@ -112,6 +112,12 @@ def add_known_fabric(verb: argparse.ArgumentParser) -> None:
         f"of the training's fabric; factors are {', '.join(FACTORS)}. A bake with --feedback or --quality hero takes "
         "friction=0.4 of any model",
     )
+
+
+def asked_known_fabric(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what the options of `add_known_fabric` say by their names, without those that say nothing."""
+    asked = {"fabric": options.fabric, "material": options.material}
+    return {name: value for name, value in asked.items() if value}
 
 
 def add_world(verb: argparse.ArgumentParser, of: str) -> None:
@@ -507,7 +513,8 @@ def read_member(options: argparse.Namespace, location: str, report: Reporter, ro
     from ssilk_usd.reading.character import read_character
 
     file, prim = wardrobe(options)
-    own = split_body(location)[0] == split_body(str(options.stage))[0] == str(file)
+    stage = split_body(str(options.stage))[0]
+    own = is_same_file(split_body(location)[0], stage) and is_same_file(file, stage)
     root, garment = root or options.root, prim if own else None
     return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
 
@@ -518,12 +525,15 @@ def members(options: argparse.Namespace) -> list[str]:
     Without a word, --family means the ends of the ranges of all shapes that the stage marks as body parameters.
 
     Raises:
-        SsilkError: it marks none.
+        SsilkError: it marks none, or a body is named twice.
     """
     if options.family is None:
         return []
     if options.family:
-        return [body_of(str(member), str(options.stage)) for member in options.family]
+        named = [_as_compared(body_of(str(member), str(options.stage))) for member in options.family]
+        if twice := next((each for each in named if named.count(each) > 1), None):
+            fail(f"--family {twice}", "a body that is named twice", "each is named once", "leave one out")
+        return named
     from ssilk_usd.opening.shaped import body_parameters
     from ssilk_usd.opening.stage import open_stage
 
@@ -534,6 +544,12 @@ def members(options: argparse.Namespace) -> list[str]:
         fail(file, "it marks no body parameters with ssilk:weightRange", there,
              "name the bodies, such as --family tall=1 heavy=1")  # fmt: skip
     return [f"{file}:{name}={weight:.9g}" for name, of in marked.items() for weight in (of.low, of.high) if weight]
+
+
+def _as_compared(body: str) -> str:
+    """Return where a body is with its weights of shapes as they are compared."""
+    file, shapes = split_body(body)
+    return f"{file}:{shapes_text(parse_shapes(body, shapes))}" if shapes else body
 
 
 def tell_shapes(
@@ -579,6 +595,18 @@ def load_scene(
 
     character, garment, rig = read(options, report)
     return prepare_scene(character, garment, rig, rig_options=rigging, report=report)
+
+
+def laid(options: argparse.Namespace, garment: Mesh) -> Callable[[], Mesh] | None:
+    """Return what reads a garment where riders of its stage lie on it; None where that is on the body that it is on.
+
+    A body that weights of the stage's shapes make has the garment from elsewhere, and riders from the stage.
+    """
+    from ssilk_usd.reading.scene import read_scene
+
+    file, shapes = split_body(str(options.stage))
+    name = (split_location(garment.path)[1] or garment.path).rpartition("/")[2]
+    return (lambda: read_scene(file, root=options.root, garment=name)[1].mesh) if shapes else None
 
 
 def bodies(stages: Sequence[Path]) -> dict[str, Path]:

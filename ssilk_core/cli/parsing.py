@@ -11,6 +11,7 @@ from typing import Any, NoReturn
 
 from ..errors import did_you_mean, fail, fail_unknown
 
+LIKE = 0.8  # likeness from which on an option may be another one misspelt: all begin with dashes
 NUMBERS = re.compile(r"^-(\d|\.\d)[\d.,eE+-]*$")
 
 
@@ -36,7 +37,7 @@ class Parser(argparse.ArgumentParser):
                 break  # what follows is no option, or belongs to the verb's own parser
             name = word.partition("=")[0]
             if re.fullmatch(r"--?[A-Za-z][\w-]*", name) and not {name, name[:2]} & known.keys():
-                fail(self.prog, f"no such option '{name}'", self._help(), did_you_mean(name, known))
+                fail(self.prog, f"no such option '{name}'", self._help(), did_you_mean(name, known, LIKE))
         return super().parse_known_args(words, namespace)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:

@@ -20,10 +20,11 @@ from ..authoring.setup.classes import USUAL
 from ..authoring.setup.rig import RigOptions
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
+from ..files import split_body, split_location
 from . import options as shared
 
 if TYPE_CHECKING:
-    from ..scene.assets import Character, Garment, Scene
+    from ..scene.assets import Character, Garment, Mesh, Scene
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -96,6 +97,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     left_out = write_rigged_stage(source, scene, options.output, moved=moved, stands_for=stands_for)
     if left_out:
         report(Message(f"{options.output}: {left_out}", "warning"))
+    if onto and split_body(onto)[1]:
+        _tell_riders(options.output, scene.garment.mesh, report)
     counts = np.bincount(scene.classes, minlength=3)
     report(
         Result(
@@ -109,6 +112,17 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         )
     )
     return EXIT_OK
+
+
+def _tell_riders(output: Path, garment: Mesh, report: Reporter) -> None:
+    """Warn of what rides on a garment that was put on a body by shapes: it lies as on the stage's own body."""
+    from ssilk_usd.reading.riders import read_riders
+
+    riders = read_riders(output, split_location(garment.path)[1] or garment.path)
+    if riders:
+        names = ", ".join(split_location(rider.path)[1] or rider.name for rider in riders)
+        text = f"{names} lies as on the stage's own body; move it to the garment, which it rides on"
+        report(Message(f"{output}: {text}", "warning"))
 
 
 def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Scene:

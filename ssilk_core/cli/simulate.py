@@ -275,9 +275,9 @@ class _Caches:
 
         self.stack, self.options, self.shots, self.scene, self.played = stack, options, shots, scene, played
         self.worlds = worlds
-        stage = open_stage(options.stage)
+        stage, mesh = open_stage(options.stage), scene.garment.mesh
         self.units = StageUnits.of(stage)
-        self.riders = riders_of(stage, scene.garment.mesh, options.root, report)
+        self.riders = riders_of(stage, mesh, options.root, report, shared.laid(options, mesh))
         if self.riders and options.points:
             report(
                 Message(f"{options.stage}: --points writes the garment alone, without what rides on it", "warning")

@@ -86,7 +86,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         options.output,
         units=StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis),
         origin=cache_origin(options.cache, points.mesh, options.output),
-        riders=riders_of(stage, mesh, options.root, report),
+        riders=riders_of(stage, mesh, options.root, report, shared.laid(options, mesh)),
         met=_met(str(where), options, deformer, motion, report),
         hidden=read_hidden(where, motion, root=options.root),
         include_body=not options.no_body,

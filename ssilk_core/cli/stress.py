@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from .options import BODIES, bodies, check_output
+from .options import BODIES, add_known_fabric, asked_known_fabric, bodies, check_output
 
 if TYPE_CHECKING:
     from ..quality.kept_rows import KeptRows
@@ -36,6 +36,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         metavar="SHOT[:/PRIM]",
         help="USD file with the motion that cases change (default: joints that sway)",
     )
+    add_known_fabric(verb)
     verb.add_argument(
         "--quick", action="store_true", help="a tenth of the frames and smaller trials: minutes instead of an hour"
     )
@@ -96,7 +97,7 @@ def _subject(options: argparse.Namespace, stage: Path, report: Reporter) -> Stre
     from ssilk_usd.opening.stage import open_stage
     from ssilk_usd.reading.motion import read_motion
 
-    from ..delivery.bake import worn
+    from ..delivery.bake import in_fabric, worn
     from ..network.checkpoint import load_model
     from ..quality.evaluation.bodies import base_of
     from ..quality.stress.subject import FULL, QUICK, StressSubject
@@ -106,14 +107,15 @@ def _subject(options: argparse.Namespace, stage: Path, report: Reporter) -> Stre
     on = worn(whole, open_stage(stage), options.root)
     if whole.bodies and on.body is None:
         report(Message(f"{on.scene.character.path}: the first body of the model's family"))
-    for event in on.told:
+    file, in_words = in_fabric(on.file, str(options.model), options.fabric, options.material)
+    for event in (*on.told, *in_words):
         report(event)
     skeleton, base = on.scene.character.skeleton, base_of(whole, on.member)
     clip = read_motion(str(options.motion), skeleton) if options.motion else None
     if clip and base and has_bones(clip, base[0]) and not has_bones(clip, skeleton):
         clip = motion_on(clip, base[0], skeleton, base[1])
         report(Message(f"{options.motion}: it has the bones of the model's first body, and is played on this one's"))
-    return StressSubject(on.file, on.scene, clip, QUICK if options.quick else FULL)
+    return StressSubject(file, on.scene, clip, QUICK if options.quick else FULL)
 
 
 def _kept(options: argparse.Namespace) -> KeptRows[CaseOutcome]:
@@ -129,7 +131,7 @@ def _kept(options: argparse.Namespace) -> KeptRows[CaseOutcome]:
         inputs = measured_inputs(
             models=[options.model], stage=options.stage[0], clips=clips, device="cpu", others=others
         )
-        inputs |= {"root": options.root, "quick": options.quick}
+        inputs |= {"root": options.root, "quick": options.quick, **asked_known_fabric(options)}
     return KeptRows(
         path=options.output,
         verb="stress",

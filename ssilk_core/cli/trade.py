@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import platform
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,6 +44,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models on one skeleton")
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
+    shared.add_known_fabric(verb)
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER",
                       help="motion files; models are measured on --clips and reduced to fit the others")  # fmt: skip
     verb.add_argument(
@@ -120,7 +121,7 @@ class Bench:
     def __init__(self, options: argparse.Namespace, report: Reporter) -> None:
         from ssilk_usd.opening.stage import open_stage
 
-        from ..delivery.bake import worn
+        from ..delivery.bake import in_fabric, worn
         from ..devices import select_device
         from ..network.checkpoint import load_model
         from ..quality.evaluation.takes import takes_of, within
@@ -133,6 +134,10 @@ class Bench:
                 self.files[path] = on.file
                 for event in on.told:
                     report(event)
+            own, in_words = in_fabric(self.files[path], str(path), options.fabric, options.material)
+            self.files[path] = own
+            for event in in_words:
+                report(event)
         first = next(iter(self.files.values()))
         names = [path.stem for path in self.files]
         if len(set(names)) != len(names):
@@ -168,6 +173,7 @@ class Bench:
             "frames": self.frames,
             "processor": platform.processor() or platform.machine(),
             "root": self.options.root,
+            **shared.asked_known_fabric(self.options),
         }
 
     def _check(self, path: Path, file: ModelFile, first: ModelFile) -> None:
@@ -215,12 +221,14 @@ class Bench:
         from ..delivery.bake import BakeRequest, load_rollout, shot_bytes, stored_bytes, with_model
 
         motion, stage = str(next(iter(self.paths.values()))), str(self.options.stage)
+        request = BakeRequest(
+            model=str(path), stage=stage, motion=motion, range="all", root=self.options.root,
+            fabric=self.options.fabric, material=tuple(self.options.material),
+        )  # fmt: skip
 
         @lru_cache(4)
         def rollout(fps: float) -> BakeRollout:
-            return load_rollout(
-                BakeRequest(model=str(path), stage=stage, motion=motion, range="all", fps=fps, root=self.options.root)
-            )
+            return load_rollout(replace(request, fps=fps))
 
         def weigh(file: ModelFile, fps: float, stored: StoredTake | None) -> ShotBytes:
             if stored is not None:

@@ -148,7 +148,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         job = training_job(options, device, report)
         trained = train(job, report, stop, group)
     share, shown = lower_by(trained.score, trained.lbs), trained.score.shown_skin
-    missed, worst = trained.score.step_errors, worst_body(trained.score)
+    missed, worst = trained.score.step_errors, worst_body(trained.score.of_each(_first_of(job), trained.lbs))
     worse = is_worse(trained.score, trained.lbs)
     if worse:
         report(worse_message(str(options.output), trained.score, trained.lbs))
@@ -188,6 +188,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 def _worst_of(job: TrainJob) -> str:
     """Return what the worst of several is one of, in words."""
     return " or ".join([*(["worst body"] if job.family else []), *(["worst fabric"] if job.fabrics else [])])
+
+
+def _first_of(job: TrainJob) -> str:
+    """Return what the first of several is called, on which and of which most is measured."""
+    return job.family.bodies.names[0] if job.family else "the garment's own fabric"
 
 
 def _compared(total: float, lbs: float) -> str:

@@ -38,7 +38,7 @@ from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
 from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
 from ..files import need_writable, sha256, split_body
-from ..scene.shape_weights import is_shapes
+from ..scene.shape_weights import is_shapes, need_weights
 from ..training.wardrobe.listing import WardrobeEntry, read_list, write_list
 from ..training.wardrobe.panel import ProgressTable, table
 from ..training.wardrobe.queue import CommandTask, End, Queue, Slot
@@ -180,14 +180,27 @@ def _request(
         options = parser.parse_args(["train", *entry.words, "-o", f"{entry.name}.safetensors"])
         train.configured(options)
         files = _inputs(options, path.parent)
+        for file in files:
+            need_weights(str(file))
+            if not file.is_file():
+                fail(str(file), "there is no file", "paths are relative to the folder of the list")
+        _need_shapes(options, path.parent)
     except SsilkError as error:
         raise SsilkError(f"{where}: {error}") from error
-    for file in files:
-        if not file.is_file():
-            fail(where, f"there is no file {file}", "paths are relative to the folder of the list")
     words = entry.words if options.preset else [*entry.words, "--preset", default_preset(device)]
     over = [(f"over {name}", inner[name]) for name in entry.over]
     return request_key(words, [*((file.name, sha256(file)) for file in files), *over])
+
+
+def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
+    """Raise `SsilkError` where a stage has not the shapes that make a body of a training, or marks none."""
+    from ssilk_usd.opening.stage import open_stage
+
+    stage, named = folder / options.stage, options.family
+    family = named and [each if is_shapes(str(each)) else folder / each for each in named]
+    for body in (str(stage), *shared.members(argparse.Namespace(stage=stage, family=family))):
+        if split_body(body)[1]:
+            open_stage(body)
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from .assets import PLATE_THICKNESS, Mesh, SurfaceMaterial
 
 STRETCH_MODELS = ("stvk", "baraff_witkin")
 CONTACT_MODELS = ("surface", "vertex")
+MOST_FRICTION = 2.0  # of rubber on rubber; cloth on skin has some 0.2 to 1
 PLATE_POISSON = 0.3  # of a stage that says none: the fallback of USD's proposal
 
 
@@ -39,8 +40,8 @@ class Fabric:
             millimetre.
         drag: air drag per area and velocity [kg/(m2 s)], relative to air that moves with the character's root.
             The default stops light cloth from swinging within about half a second. Zero is the paper's vacuum.
-        friction: Coulomb's coefficient, of cloth on the body, on floors and props, and on cloth. The simulator knows
-            it, and refinement that looks back: networks are trained without.
+        friction: Coulomb's coefficient, of cloth on the body, on floors and props, and on cloth, at most
+            `MOST_FRICTION`. The simulator knows it, and refinement that looks back: networks are trained without.
     """
 
     name: str
@@ -81,6 +82,9 @@ class Fabric:
                 fail(f"fabric '{self.name}'", f"{item.name} = {value}", "it must be finite and not negative")
         if not self.density > 0:
             fail(f"fabric '{self.name}'", "a density of zero", "it must be positive")
+        if self.friction > MOST_FRICTION:
+            allowed = f"Coulomb's coefficient of cloth is some 0.2 to 1, and {MOST_FRICTION:g} at most"
+            fail(f"fabric '{self.name}'", f"friction = {self.friction:g}", allowed)
 
     @property
     def contact_distance(self) -> float:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from math import isfinite
 from pathlib import Path
 
@@ -10,6 +11,14 @@ from ..errors import fail
 from ..files import USD_NAMES, split_body, split_location
 
 ALLOWED = "a body of a stage is named as STAGE:SHAPE=WEIGHT,..., such as hero.usd:tall=1,heavy=0.5"
+
+
+def need_weights(location: str) -> None:
+    """Raise `SsilkError` where a location is a file that is there, a colon, and no weights of shapes."""
+    named = re.fullmatch(rf"(.*?(?:{'|'.join(map(re.escape, USD_NAMES))})):(.+)", location, flags=re.DOTALL)
+    if named and Path(named[1]).is_file():
+        apart = "its SkelRoot is named apart, as in MODEL:/ROOT or by --root" if "/" in named[2] else ""
+        fail(location, f"'{named[2]}' is no shape with a weight", ALLOWED, apart)
 
 
 def is_shapes(text: str) -> bool:

@@ -114,6 +114,16 @@ class Score:
         """Mean of the totals on all bodies and of all fabrics [J], by which the best model is chosen."""
         return (self.total + sum(body.total for body in self.bodies)) / (1 + len(self.bodies))
 
+    def of_each(self, first: str, lbs: Score) -> tuple[BodyScore, ...]:
+        """Return the scores on all bodies and of all fabrics, the first included; none where it is the only one.
+
+        Args:
+            first: what it is called.
+            lbs: the scores of linear blend skinning.
+        """
+        own = BodyScore(first, self.total, lbs.total, self.collisions)
+        return (own, *self.bodies) if self.bodies else ()
+
 
 @dataclass(frozen=True, eq=False)
 class ValidatedBody:

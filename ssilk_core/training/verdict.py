@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
@@ -45,9 +45,9 @@ def is_worse(score: Score, lbs: Score) -> bool:
     return lower_by(score, lbs) < -WORSE
 
 
-def worst_body(score: Score) -> BodyScore | None:
-    """Return the body of a family, its first left out, on which least is won over linear blend skinning."""
-    return min(score.bodies, key=lambda body: share_below(body.total, body.lbs), default=None)
+def worst_body(bodies: Sequence[BodyScore]) -> BodyScore | None:
+    """Return the body of a family, or the fabric, on which least is won over linear blend skinning; None of none."""
+    return min(bodies, key=lambda body: share_below(body.total, body.lbs), default=None)
 
 
 def worse_bodies(model: str, score: Score) -> Iterator[Message]:

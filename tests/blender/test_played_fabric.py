@@ -96,7 +96,7 @@ def test_keys_show_the_fabric_that_is_played(ready, ranged):
 def test_the_panel_says_what_the_network_does_not_know(ready, trained, ranged):
     from blender_addon.panels.playback import PlayedFabricPanel
 
-    names = ["preset", "stretch", "shear", "bending", "density", "drag"]
+    names = ["preset", "stretch", "shear", "bending", "density", "drag", "friction"]
     assert drawn(PlayedFabricPanel, ready.context) == names
     ranged.ssilk.played.drag = 9.0
     line = " ".join(drawn(PlayedFabricPanel, ready.context)[len(names) :])
@@ -121,3 +121,22 @@ def test_trainings_are_for_a_range_where_that_is_chosen(ready, skirt):
     command = train_command(skirt, "/Skirt", ["walk.usdc"], [])
     at = command.index("--fabrics")
     assert command[at + 1 : at + 7] == ["4", "silk", "cotton", "denim", "wool", "leather"]
+
+
+@pytest.mark.parametrize(("quality", "taken"), [("hero", ["--material", "friction=0.4"]), ("film", [])])
+def test_friction_is_taken_by_bakes_that_know_it_and_else_told(ready, trained, monkeypatch, capfd, quality, taken):
+    from blender_addon.errors import SetupError
+    from blender_addon.operators.baking import BakeGarment
+
+    asked = []
+
+    def commands(bake, folder):
+        asked.append(bake.in_fabric)
+        raise SetupError("Nothing is baked here.")
+
+    monkeypatch.setattr(BakeGarment, "commands", commands)
+    trained.ssilk.played.friction = 0.4
+    with pytest.raises(RuntimeError, match="Nothing is baked here"):
+        ready.ops.ssilk.bake(quality=quality)
+    assert asked == [taken]
+    assert ("Friction is left out" in capfd.readouterr().out) == (not taken)

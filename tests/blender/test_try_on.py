@@ -83,6 +83,15 @@ def test_what_is_no_member_is_named(other, told):
         member_points(character(), other)
 
 
+def test_joints_that_move_no_body_may_be_proxies_to_adopt():
+    with pytest.raises(SetupError, match=r"1 joint missing \(b\)\. .* Adopt Rig recognises them\. Members have"):
+        member_points(character(), character(joints=("a",)))
+    weights = np.tile([0.5, 0.5], (len(CUBE), 1))
+    bent = replace(character().bodies[0], skin=SkinWeights.from_dense("/Character/Body", weights))
+    with pytest.raises(SetupError, match=r"1 joint missing \(b\)\. Members have the same joints"):
+        member_points(replace(character(), bodies=(bent,)), character(joints=("a",)))
+
+
 def test_two_meshes_that_fit_are_told_by_their_names():
     other = character(TALL)
     twin = replace(other.bodies[0], mesh=replace(other.bodies[0].mesh, path="/Character/Twin", points=CUBE + 5))

@@ -6,11 +6,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from argparse import Namespace
+from pathlib import Path
 
 import pytest
+from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.cli import main
 from ssilk_core.cli.inputs import CHARACTER, MODEL, MOTIONS, need_input
+from ssilk_core.cli.options import members
 from ssilk_core.errors import SsilkError
 
 
@@ -44,8 +48,36 @@ def test_a_mistyped_name_is_told_with_the_file_that_it_resembles(tmp_path):
 def test_a_shape_without_a_weight_is_told(tmp_path):
     (tmp_path / "hero.usda").touch()
     need_input(f"{tmp_path}/hero.usda:tall=1", CHARACTER)
-    said = refusal(f"{tmp_path}/hero.usda:tall", CHARACTER)
-    assert "'tall' is neither weights of shapes nor the path of a prim; a body of a stage is named as" in said
+    for named in ("tall", "tall:1"):
+        said = refusal(f"{tmp_path}/hero.usda:{named}", CHARACTER)
+        assert f"'{named}' is no shape with a weight; a body of a stage is named as STAGE:SHAPE=WEIGHT" in said
+
+
+def test_a_shape_that_is_named_like_a_file_is_suggested_with_its_weight(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    stage = Usd.Stage.CreateNew("hero.usda")
+    UsdSkel.Root.Define(stage, "/Hero")
+    binding = UsdSkel.BindingAPI.Apply(UsdGeom.Mesh.Define(stage, "/Hero/Body").GetPrim())
+    shape = UsdSkel.BlendShape.Define(stage, "/Hero/Body/Tall")
+    binding.CreateBlendShapesAttr(["tall"])
+    binding.CreateBlendShapeTargetsRel().SetTargets([shape.GetPath()])
+    stage.Save()
+    for words, says in (
+        ("inspect hero.usda --onto tall", "tall: there is no such file;"),
+        ("train hero.usda --motions . -o cape.safetensors --family tal", "tal: there is no such file;"),
+    ):
+        assert main(words.split()) == 2
+        told = capsys.readouterr().err
+        assert says in told and told.rstrip().endswith("did you mean 'tall=1'?")
+    assert "weights of shapes without their stage; a body of a stage is named as" in refusal("tall=1", CHARACTER)
+
+
+def test_a_body_is_named_once_however_its_weights_are_written():
+    options = Namespace(stage=Path("hero.usda"), family=[Path("tall=1,heavy=0.5"), Path("heavy=1")])
+    assert members(options) == ["hero.usda:heavy=0.5,tall=1", "hero.usda:heavy=1"]
+    options.family.append(Path("hero.usda:heavy=1.0"))
+    with pytest.raises(SsilkError, match=r"--family hero\.usda:heavy=1: a body that is named twice"):
+        members(options)
 
 
 def test_nothing_heavy_is_loaded_to_say_so(tmp_path, monkeypatch):

@@ -79,3 +79,8 @@ def test_python_gets_the_same_suggestions():
     with pytest.raises(SsilkError, match=r"^--material name=lace: 'name' is a label, not a setting; it is one of "):
         apply_overrides(FABRICS["wool"], ["name=lace"], "--material")
     assert preset_named("draft") is PRESETS["draft"] and fabric_named("wool") is FABRICS["wool"]
+
+
+def test_an_option_that_another_verb_has_is_not_taken_for_one_that_looks_like_it(capsys):
+    said = told(capsys, f"{BAKE.replace('bake', 'farm', 1)} --quality hero")
+    assert "no such option '--quality'" in said and "did you mean" not in said

@@ -7,7 +7,12 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
+from ssilk_usd.opening.shaped import body_parameters
+from ssilk_usd.opening.stage import open_stage
+from ssilk_usd.reading.character import read_character
+from ssilk_usd.stages import demo_body_path
 
 from benchmarks.helpers.paper_schemes import PAPER_SCHEMES
 from ssilk_core.cli.main import parser
@@ -89,3 +94,16 @@ def test_commands_are_those_of_the_command_line():
     assert ours
     for words in ours:
         parser().parse_args(words[1:])
+
+
+def test_the_bodies_by_shapes_of_the_recipe_are_the_demos(tmp_path, monkeypatch):
+    """The lines of docs/pipeline.md as they stand: each shape in full gives the points of that body's own stage."""
+    (recipe,) = re.findall(r"```python\n([^`]*demo_body_path[^`]*)```", (ROOT / "docs/pipeline.md").read_text())
+    monkeypatch.chdir(tmp_path)
+    exec(recipe, {})
+    assert {name for name, each in body_parameters(open_stage("hero.usda")).items() if each.is_marked} == {
+        "tall", "heavy"
+    }  # fmt: skip
+    for name in ("tall", "heavy"):
+        shaped, own = map(read_character, (f"hero.usda:{name}=1", str(demo_body_path(name))))
+        np.testing.assert_allclose(shaped.bodies[0].mesh.points, own.bodies[0].mesh.points, atol=1e-6)

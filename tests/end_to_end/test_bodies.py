@@ -320,7 +320,8 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
 
 def test_a_model_of_one_body_still_refuses_others(world, capsys):
     assert run("bake model.safetensors --motion clip.usda --stage taller.usda -o out.usda") == 2
-    assert "a model bakes on the character it was trained with" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "a model bakes on the character it was trained with" in told and "on both bodies with --family" in told
 
 
 def test_evaluate_takes_a_member(world):
@@ -713,6 +714,22 @@ def shapes(world) -> Path:
     return world
 
 
+@pytest.mark.parametrize("path", ["plain.usda", "link.usda"])
+def test_a_stage_is_the_same_however_its_path_is_written(world, capsys, path):
+    """Its garment, which is not marked as one, is none of the body by shapes."""
+    stage = Usd.Stage.Open("rigged.usda")
+    skirt = stage.GetPrimAtPath("/Hero/Skirt")
+    for said in skirt.GetAuthoredProperties():
+        if "ssilk:" in said.GetName():
+            skirt.RemoveProperty(said.GetName())
+    points = np.array(UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Body")).GetPointsAttr().Get(), dtype=float)
+    add_shape(stage, "heavier", heavier(points) - points)
+    stage.GetRootLayer().Export("plain.usda")
+    Path("link.usda").symlink_to("plain.usda")
+    code, found = findings(capsys, f"inspect plain.usda --garment Skirt --family {path}:heavier=1")
+    assert "no-family" not in found and found["family"]["count"] == 2, (code, found)
+
+
 def test_inspect_tells_bodies_by_shapes_with_their_millimetres(shapes, capsys):
     code, found = findings(capsys, "inspect shapes.usda --family taller=1 heavier=0.5,taller=0.2")
     assert code == 0 and found["family"]["count"] == 3
@@ -832,6 +849,23 @@ def test_what_rides_on_a_garment_goes_along_to_a_body_by_shapes(shapes, soft):
     np.testing.assert_allclose(np.linalg.norm(mesh.points - there, axis=1).max(), 0.01, atol=4e-3)
 
 
+def test_what_rides_on_a_garment_goes_along_in_simulations_of_a_body_by_shapes(shapes, capsys):
+    """The copy that `rig --onto` writes has it where the stage has, which is told."""
+    own = load_model("model.safetensors").scene.garment.mesh
+    face = int(np.linalg.norm(own.points[own.faces].mean(axis=1) - own.points.mean(axis=0), axis=1).argmax())
+    points, foot = disc_on(own, face, np.full(3, 1 / 3), 0.01)
+    home = Usd.Stage.Open("shapes.usda")
+    add_rider(home, "/Hero/Button", points)
+    home.Save()
+    assert run("rig shapes.usda --onto heavier=1 -o heavy.usda") == 0
+    assert "heavy.usda: /Hero/Button lies as on the stage's own body" in capsys.readouterr().err
+    simulate = "simulate shapes.usda:heavier=1 --garment heavy.usda --motion clip.usda --range 0-0 -o simulated.usda"
+    assert run(simulate) == 0
+    there = shown("simulated.usda", 0)
+    button, cloth = there["Button"].mean(axis=0), there["Skirt"][own.faces[face]].mean(axis=0)
+    assert np.linalg.norm(button - cloth) < 0.01 and np.linalg.norm(cloth - foot) > 0.02
+
+
 def test_a_job_has_bodies_by_shapes_under_their_names(shapes, capsys):
     bodies = "--stage shapes.usda --stage shapes.usda:heavier=1 --stage shapes.usda:heavier=0.5,taller=0.2"
     assert run(f"farm family.safetensors --motion clip.usda {bodies} --bundle job") == 0
@@ -855,6 +889,14 @@ def test_a_body_that_shapes_cannot_make_is_told_at_submission(shapes, capsys):
     assert told in capsys.readouterr().err
     assert run(farm) == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_model_of_one_body_is_told_of_shapes_that_leave_joints_in_place(shapes, capsys):
+    bake = "bake model.safetensors --motion clip.usda --range 0-2 -o out.usda --stage shapes.usda"
+    told = "its shapes leave the joints in place, and the model was trained without them"
+    assert run(f"{bake}:slight=1") == 0 and told in capsys.readouterr().err
+    assert run(bake) == 0 and "its shapes" not in capsys.readouterr().err
+    assert run(f"{bake}:taller=1") == 2 and "on both bodies with --family" in capsys.readouterr().err
 
 
 def test_an_evaluation_has_bodies_by_shapes_under_their_names(shapes):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,10 @@ from pxr import Usd
 from ssilk_usd.opening.garment_api import read_garment_record
 
 from ssilk_core.cli import main
+from ssilk_core.cli.main import parser
+from ssilk_core.cli.trade import Bench
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE
+from ssilk_core.events import silent
 from ssilk_core.network.checkpoint import load_model, save_model
 from ssilk_core.network.fabrics import SeenFabrics
 from ssilk_core.network.runtime import Player
@@ -210,6 +214,8 @@ def test_a_model_of_one_fabric_refuses_others_in_every_command(copy, capsys):
         f"bake {base} --motion sway.usda -o layers --material bending=2x",
         f"evaluate {base} --motions . --fabric silk --no-probes --clips sway",
         "export model.safetensors -o model.onnx --fabric silk",
+        f"stress {base} --fabric silk",
+        f"trade {base} --motions . --fabric silk",
         f"farm {base} --motion sway.usda --fabric silk --bundle job",
     ):
         assert run(words) == 2
@@ -217,6 +223,21 @@ def test_a_model_of_one_fabric_refuses_others_in_every_command(copy, capsys):
         assert "it was trained for one fabric" in said and "--start-from MODEL --fabrics" in said
     assert not Path("shot.usdc").exists() and not Path("model.onnx").exists()
     assert not Path("job").exists()
+
+
+def test_stress_and_trade_measure_the_fabric_that_is_asked_for(copy):
+    stress, found = "stress ranged.safetensors --stage rigged.usda --quick -o cases.json", {}
+    for fabric in ("silk", "leather"):
+        assert run(stress, "--fabric", fabric, "--only", "rate: 60") == 0
+        found[fabric] = json.loads(Path("cases.json").read_text())["outcomes"]
+    assert [len(each) for each in found.values()] == [1, 1] and found["silk"] != found["leather"]
+    Path("clips").mkdir()
+    shutil.copy("sway.usda", "clips")
+    words = "trade ranged.safetensors --stage rigged.usda --motions clips --fabric silk --material drag=2x"
+    bench = Bench(parser().parse_args(words.split()), silent)
+    (file,) = bench.files.values()
+    assert (file.fabric.name, file.fabrics) == ("silk", None)
+    assert file.fabric.drag == 2 * load_model("ranged.safetensors").fabric.drag
 
 
 def test_beyond_the_range_is_told(copy, capsys):

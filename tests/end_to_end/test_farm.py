@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from pxr import Sdf
+from pxr import Sdf, Usd
 from ssilk_usd.reading import visibility as read_visibility
 from ssilk_usd.shots import layers_animation, layers_asset
 
@@ -110,6 +110,24 @@ def test_a_job_that_no_worker_could_do_is_refused_and_nothing_is_written(farm, c
     assert Path("notes.txt").read_text() == "mine" and not Path("new").exists()
     assert run(f"{base} --motion gone.usda a.usda --bundle new") == 0
     assert "gone.usda: there is no such file" in capsys.readouterr().err
+
+
+def test_what_every_task_would_refuse_is_refused_when_a_job_is_submitted(farm, capsys):
+    """Colliders that are none, poses that stages hold, and a body of another character; one shot of two is kept."""
+    held = Usd.Stage.Open("a.usda")
+    held.OverridePrim("/Hero/Skirt").CreateAttribute("ssilk:hold", Sdf.ValueTypeNames.Int).Set(2)
+    held.Save()
+    Path("other.usda").write_text(Path("rigged.usda").read_text().replace("Spine", "Chest"))
+    base = "farm model.safetensors --bundle new --stage"
+    for words, says in (
+        ("rigged.usda --motion b.usda --collider Flor", "--collider Flor: "),
+        ("rigged.usda --motion a.usda --refine 2", "a.usda: poses that are held for 2 frames, and --refine"),
+        ("other.usda --motion b.usda", "of the model's joints are missing"),
+    ):
+        assert run(f"{base} {words}") == 2
+        assert says in capsys.readouterr().err and not Path("new").exists()
+    assert run(f"{base} rigged.usda --motion a.usda b.usda --refine 2") == 0
+    assert capsys.readouterr().err.count("a.usda: poses that are held for 2 frames") == 1
 
 
 def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):

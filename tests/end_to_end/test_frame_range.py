@@ -118,6 +118,14 @@ def test_shots_of_a_list_have_ranges_of_their_own(world):
     assert [(layer.startTimeCode, layer.endTimeCode) for layer in layers] == [(0, 4), (5, 9), (8, 13)]
 
 
+@pytest.mark.parametrize("span", ["9", "9-3", "a-b"])
+def test_a_bad_range_of_a_list_is_told_with_its_shot(world, capsys, span):
+    Path("shots.json").write_text(json.dumps({"a": "walk.usda", "b": {"motion": "walk.usda", "range": span}}))
+    assert bake("--shots shots.json -o out") == 2
+    told = capsys.readouterr().err
+    assert f"shots.json: the shot 'b' has '{span}' for a range" in told and "such as 1001-1100" in told
+
+
 def at_sixty(toy, first: float, last: float) -> None:
     toy.write_clip(Path("walk.usda"), frames=120, fps=60)
     says(first, last)

@@ -584,7 +584,7 @@ MODELS = [
     Case(
         "model on a character of other axes",
         BAKE,
-        ("rigged.usda", "'Hips/Spine' is bound at another rotation", "trained with"),
+        ("rigged.usda", "'Hips/Spine' is bound at another rotation", "trained with", "rig --onto"),
         edited("rigged.usda", turned_bind),
     ),
 ]

@@ -195,6 +195,7 @@ def test_samples_within_frames_are_refined_too(there):
         (["--feedback"], "--feedback: no --refine"),
         (["--refine", "2", "--material", "friction=0.4"], "--material friction=0.4: networks know no friction"),
         (["--quality", "hero", "--material", "friction=-1"], "friction = -1"),
+        (["--quality", "hero", "--material", "friction=40"], "friction = 40; Coulomb's coefficient of cloth is some"),
         (["--quality", "hero", "--material", "bending=2x"], "for a model of one fabric"),
     ],
 )

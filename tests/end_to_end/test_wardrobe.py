@@ -155,6 +155,9 @@ BAD = {
     "value": ("[cape]\nset = { batch = 0 }", "table 'cape': setting 'batch': 0; it must lie between 1 and"),
     "file": ('[cape]\nmotions = "none.usda"', "there is no such file or folder; motions are"),
     "body": ('[cape]\nfamily = ["none.usda"]', "there is no file"),
+    "shape": ('[cape]\nfamily = ["tall=1"]', "table 'cape': rigged.usda:tall=1: its bodies have no blendshapes"),
+    "no shape": ('[cape]\nfamily = ["rigged.usda:tall"]', "'tall' is no shape with a weight"),
+    "no marks": ("[cape]\nfamily = true", "table 'cape': rigged.usda: it marks no body parameters"),
     "one body": ("[cape]\ngraded = true", "table 'cape': --graded: no --family"),
     "garment": ('[cape]\ngarment = "none.usda:/Cape"', "there is no file"),
 }

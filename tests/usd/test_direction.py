@@ -151,6 +151,26 @@ def test_a_prim_with_a_misspelt_name_is_told_until_the_garment_itself_is_directe
     assert not read(shot, home).unheard and len(read(shot, home, "Two").unheard) == 1
 
 
+@pytest.mark.parametrize(("path", "kind"), [
+    ("/Crowd/One/Rig", "Skeleton"), ("/Crowd/One/Walk", "SkelAnimation"), ("/Crowd", "prim above the garment"),
+])  # fmt: skip
+def test_what_poses_or_holds_the_garment_directs_nothing_and_is_told(shot, home, path, kind):
+    key(shot, path, {20.0: 0.0})
+    key(shot, "/Crowd/One/Cape", {20.0: 0.0})
+    (told,) = read(shot, home).unheard
+    assert f"shot.usda:{path}: ssilk:free directs nothing on a {kind}; it is an attribute of the garment" in told
+
+
+def test_a_primvar_that_would_direct_the_garment_is_refused(shot, home):
+    cape = shot.GetPrimAtPath("/Crowd/One/Cape")
+    UsdGeom.PrimvarsAPI(cape).CreatePrimvar("ssilk:class", Sdf.ValueTypeNames.IntArray)  # a garment has that one
+    read(shot, home)
+    UsdGeom.PrimvarsAPI(cape).CreatePrimvar("ssilk:free:left", Sdf.ValueTypeNames.Float).Set(0.0)
+    shot.GetRootLayer().Save()
+    with pytest.raises(SsilkError, match=r"an attribute primvars:ssilk:free:left; .* did you mean 'ssilk:free:left'"):
+        read(shot, home)
+
+
 def test_a_value_that_is_refused_is_the_one_that_was_keyed(shot, home):
     key(shot, "/Crowd/One/Cape", {20.0: 0.5, 23.0: np.nan, 28.0: 1.0})  # between the frames at 22 and 24
     with pytest.raises(SsilkError, match="ssilk:free is nan at time code 23;"):

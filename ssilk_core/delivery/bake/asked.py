@@ -5,19 +5,27 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 
+import numpy as np
+
 from ...errors import SsilkError
 from ...events import Event, Message, Reporter
-from ...files import split_body
+from ...files import split_location
 from ...network.checkpoint import load_model
+from ...scene.assets import Motion, Scene
+from .bodies import worn
+from .direction import need_moving, stated_at
 from .fabrics import in_fabric
+from .looped import need_alone
 from .request import BakeRequest
 from .task import BakeTask
+from .world import asked_world
 
 
 def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
-    """Warn of fabrics that models have not or were not trained for, and of what stages and motions have not.
+    """Warn of tasks that will fail, as far as that can be known without reading poses, each fault once.
 
-    That is blendshapes that make a body, and ranges.
+    That is fabrics that models have not or were not trained for, characters that they do not dress, ranges that
+    motions have not, colliders that are none, and what stages say of a garment that options do not go with.
 
     Args:
         readable: inputs that can be read: tasks with others fail for that.
@@ -25,51 +33,94 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     Raises:
         SsilkError: no task is left.
     """
-    lost = {task.name for task in tasks if any(path not in readable for path in task.request.inputs.values())}
-    tasks, count = [task for task in tasks if task.name not in lost], len(tasks)
-    for asked, found in ((_fabric, _in_fabric), (_body, _of_shapes), (_range, _in_range)):
-        groups: dict[tuple[str, ...], list[BakeTask]] = {}
-        for task in tasks:
-            if key := asked(task.request):
-                groups.setdefault(key, []).append(task)
+    left = [task for task in tasks if all(path in readable for path in task.request.inputs.values())]
+    told, known = set[str](), _Known()
+    for asked, found in ((_fabric, _in_fabric), (_body, known.of_body), (_range, _in_range), (_shot, known.of_shot)):
+        groups: dict[tuple[object, ...], list[BakeTask]] = {}
+        for task in left:
+            groups.setdefault(asked(task.request), []).append(task)
         for alike in groups.values():
             try:
-                for event in found(alike[0].request):
-                    report(event)
+                events = found(alike[0].request)
             except SsilkError as error:
-                lost |= {task.name for task in alike}
-                if len(lost) == count:
+                lost = {task.name for task in alike}
+                left = [task for task in left if task.name not in lost]
+                if not left:
                     raise
-                report(Message(str(error), "warning"))
+                events = (Message(str(error), "warning"),)
+            for event in events:
+                if str(event) not in told:
+                    told.add(str(event))
+                    report(event)
 
 
-def _fabric(request: BakeRequest) -> tuple[str, ...]:
-    asked = [request.fabric] if request.fabric else []
-    rubs = ["feedback"] if request.feedback else []
-    return (request.model, *rubs, *asked, *request.material) if asked or request.material else ()
+class _Known:
+    """Garments on their characters, each read once for all shots."""
+
+    def __init__(self) -> None:
+        self._scenes: dict[tuple[object, ...], Scene] = {}
+
+    def of_body(self, request: BakeRequest) -> tuple[Event, ...]:
+        from ssilk_usd.opening.stage import open_stage
+
+        on = worn(load_model(request.model), open_stage(request.stage), request.root)
+        self._scenes[_body(request)] = on.scene
+        return on.told
+
+    def of_shot(self, request: BakeRequest) -> tuple[Event, ...]:
+        from ssilk_usd.reading.direction import read_direction, read_loop
+        from ssilk_usd.reading.world import find_world
+
+        scene, motion = self._scenes[_body(request)], _frames(request)
+        mesh, shot = scene.garment.mesh, (request.motion, request.stage)
+        asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
+        find_world(*shot, scene.character, motion, asked, garment=split_location(mesh.path)[1])
+        if request.lbs:
+            return ()
+        places = stated_at(mesh, request.stage, request.root)
+        said = read_direction(*shot, places, motion, scene.rig.joint_names)
+        need_moving(request, request.hold or said.hold)
+        if request.loop or read_loop(*shot, places, motion):
+            need_alone(request)
+        return tuple(Message(text, "warning") for text in said.unheard)
+
+
+def _frames(request: BakeRequest) -> Motion:
+    """Return the frames of a request's shot, in which nothing is posed."""
+    from ssilk_usd.opening.stage import location, open_stage
+    from ssilk_usd.reading.frame_range import read_frame_range
+    from ssilk_usd.reading.motion import find_animation
+
+    found = read_frame_range(request.motion, request.time_range, root=request.root)
+    count, fps, start = (found.count + 1, found.fps, found.first / found.step) if found else (1, 1.0, 0.0)
+    file, prim = split_location(request.motion)
+    shot = open_stage(file)  # prims live as long as it
+    path = location(find_animation(shot, prim, request.root)[0])
+    return Motion(path, fps, np.ones((count, 1, 4)), np.zeros((count, 1, 3)), start)
+
+
+def _fabric(request: BakeRequest) -> tuple[object, ...]:
+    return request.model, request.feedback, request.fabric, request.material
 
 
 def _in_fabric(request: BakeRequest) -> tuple[Event, ...]:
+    if not (request.fabric or request.material):
+        return ()
     return in_fabric(load_model(request.model), request.model, request.fabric, request.material, request.feedback)[1]
 
 
-def _body(request: BakeRequest) -> tuple[str, ...]:
-    return (request.stage,) if split_body(request.stage)[1] else ()
+def _body(request: BakeRequest) -> tuple[object, ...]:
+    return request.model, request.stage, request.root
 
 
-def _of_shapes(request: BakeRequest) -> tuple[Event, ...]:
-    from ssilk_usd.opening.stage import open_stage
-
-    open_stage(request.stage)  # refuses shapes that it has not, and weights beyond their ranges
-    return ()
-
-
-def _range(request: BakeRequest) -> tuple[str, ...]:
-    return (request.motion, request.root or "", request.range) if request.range else ()
+def _range(request: BakeRequest) -> tuple[object, ...]:
+    return request.motion, request.root, request.range
 
 
 def _in_range(request: BakeRequest) -> tuple[Event, ...]:
-    from ssilk_usd.reading.frame_range import read_frame_range
-
-    read_frame_range(request.motion, request.time_range, root=request.root)
+    _frames(request)
     return ()
+
+
+def _shot(request: BakeRequest) -> tuple[object, ...]:
+    return *_body(request), *_range(request)

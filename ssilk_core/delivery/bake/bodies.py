@@ -16,7 +16,7 @@ from ...network.checkpoint import ModelFile
 from ...scene.assets import Character, Motion, Scene, Skeleton
 from ...scene.family import BodyFamily, BodyPlace, has_bones, names_of
 from ...scene.posed_alike import turned
-from .character import BIND_TOLERANCE, TODO, in_order_of
+from .character import BIND_TOLERANCE, TODO, in_order_of, other_shapes
 from .onto import put_onto
 
 if TYPE_CHECKING:
@@ -100,7 +100,8 @@ def worn_by(file: ModelFile, character: Character, known: Character) -> WornMode
     """
     base = file.scene.character.skeleton
     if file.bodies is None:
-        return WornModel(file, replace(file.scene, character=in_order_of(base, character)))
+        told = other_shapes(base, character)
+        return WornModel(file, replace(file.scene, character=in_order_of(base, character)), told)
     own, bodies = in_order_of(base, character, moved=True), file.bodies.family.bodies
     place = bodies.place_of(own if known is character else in_order_of(base, known, moved=True))
     _need_like(bodies, place, character.path)

@@ -8,6 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...errors import fail
+from ...events import Event, Message
+from ...files import split_body, split_location
 from ...scene.assets import Character, Ints, Skeleton, SkinWeights
 from ...scene.family import with_joints
 
@@ -15,6 +17,7 @@ BIND_TOLERANCE = 1e-3  # [m] between positions, and between the entries of rotat
 ALLOWED, TODO = "a model bakes on the character it was trained with", "train on this character"
 BOTH = f"{TODO}, or on both bodies with --family"
 ONTO = f"{TODO}, or put the garment onto its joints by 'ssilk rig --onto' with a map of joints"
+OTHER_SHAPES = "train with them by --family, or take the body of the training"
 
 
 def in_order_of(trained: Skeleton, character: Character, *, moved: bool = False) -> Character:
@@ -42,6 +45,15 @@ def in_order_of(trained: Skeleton, character: Character, *, moved: bool = False)
     )
     skeleton = replace(trained, placement=character.skeleton.placement)
     return replace(character, skeleton=skeleton, bodies=bodies, stand_ins=stand_ins)
+
+
+def other_shapes(trained: Skeleton, character: Character) -> tuple[Event, ...]:
+    """Return a warning where a body by shapes has the joints of a model for one body, which was trained on others."""
+    own, there = (split_body(split_location(path)[0])[1] for path in (trained.path, character.path))
+    if own == there or not there:
+        return ()
+    text = "its shapes leave the joints in place, and the model was trained without them: it does not see them"
+    return (Message(f"{character.path}: {text}; {OTHER_SHAPES}", "warning"),)
 
 
 def _places(found: Skeleton, trained: Skeleton) -> Ints:
@@ -86,5 +98,5 @@ def _need_same_binds(found: Skeleton, trained: Skeleton, order: Ints) -> None:
             found.path,
             f"joint '{names[joint]}' is bound at another rotation than the model has it",
             ALLOWED,
-            BOTH,
+            ONTO,
         )

@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import fail
-from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Motion, Scene, Skeleton
+from ...files import split_location
+from ...scene.assets import Deformer, Floats, GarmentPose, Ints, Mesh, Motion, Scene, Skeleton
 from ...scene.held import HeldGarment
 from ...scene.held_parts import HeldParts, PartShapes, placed_apart, shares_of_group
 from ...scene.kinematics import split_at_cuts
@@ -93,6 +94,24 @@ class Direction:
     def shown(self, made: Ints) -> NDArray[np.intp]:
         """Return which of the poses that are made at samples (K,) each sample shows, shape (S,)."""
         return np.maximum(np.searchsorted(made, np.arange(self.motion.frame_count), side="right") - 1, 0)
+
+
+def stated_at(mesh: Mesh, stage: str, root: str | None) -> tuple[str, ...]:
+    """Return the paths at which stages may direct a garment: that in the character's stage, and of its training."""
+    from ssilk_usd.opening.stage import open_stage
+    from ssilk_usd.writing.look import look_source
+
+    opened = open_stage(stage)  # prims live as long as it
+    there, trained = look_source(mesh, opened, root), split_location(mesh.path)[1]
+    found = [*([str(there.prim.GetPath())] if there else []), *([trained] if trained else [])]
+    return tuple(dict.fromkeys(found))  # a model may know its garment by a name alone
+
+
+def need_moving(request: BakeRequest, hold: int) -> None:
+    """Raise `SsilkError` where poses are held for some frames that are to be refined."""
+    if hold > 1 and request.refine:
+        found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
+        fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
 
 
 def held_parts(

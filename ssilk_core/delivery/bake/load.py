@@ -26,7 +26,7 @@ from ...scene.posed_alike import shaped_as_in_stage
 from ...scene.riders import Rider
 from ..targets import JointNames, Target, fit, joint_names
 from .bodies import WornModel, other_bones, worn
-from .direction import Direction, held_parts, held_proxies
+from .direction import Direction, held_parts, held_proxies, need_moving, stated_at
 from .fabrics import in_fabric
 from .inputs import InputContents, InputHashes, model_contents, read_unchanged, shapes_of, stage_contents
 from .looped import MOST_ROUNDS, Loop, find_loop, need_alone, need_constant, need_same_colliders
@@ -86,9 +86,10 @@ class LoadedGarment:
         told: what was found about the body and riders, to be reported.
         body: which body it lies on (`bodies.WornModel.body`).
         first: the skeleton of the first body of the model's family; None where it lies on no other one of that.
-        taller: height of the hub over the ground, relative to that body's, of a body that weights of the stage's
-            shapes make; None for others.
-        moves: likewise how far each of its proxies is from where that body has it, along its parent's axes [m], (3,).
+        hub_ratio: height of the hub over the ground, relative to that body's, of another body that weights of the
+            stage's shapes make; None where motions are played as they are.
+        moves: of such a body how far each of its proxies is from where the first has it, along its parent's axes [m],
+            (3,).
     """
 
     request: BakeRequest
@@ -106,7 +107,7 @@ class LoadedGarment:
     told: tuple[Event, ...] = ()
     body: tuple[float, ...] | None = None
     first: Skeleton | None = None
-    taller: float | None = None
+    hub_ratio: float | None = None
     moves: Mapping[str, Floats] = field(default_factory=dict)
     played: GarmentRecord | None = None
 
@@ -220,21 +221,14 @@ class LoadedGarment:
     def _between_own_bones(self, motion: Motion) -> tuple[Motion, tuple[Event, ...]]:
         """Return a motion of the first body as a body moves that shapes of its stage make: no shot has its bones."""
         skeleton, first = self.deformer.scene.character.skeleton, self.first
-        if self.taller is None or first is None or has_bones(motion, skeleton) or not has_bones(motion, first):
+        if self.hub_ratio is None or first is None or has_bones(motion, skeleton) or not has_bones(motion, first):
             return motion, ()
         text = "its joints are as far apart as those of the stage's own body, and are played between this one's bones"
-        return motion_on(motion, first, skeleton, self.taller), (Message(f"{motion.path}: {text}"),)
+        return motion_on(motion, first, skeleton, self.hub_ratio), (Message(f"{motion.path}: {text}"),)
 
     @cached_property
     def _places(self) -> tuple[str, ...]:
-        """Paths at which stages may direct the garment: that in the character's stage, and that of its training."""
-        from ssilk_usd.opening.stage import open_stage
-        from ssilk_usd.writing.look import look_source
-
-        mesh, stage = self.deformer.scene.garment.mesh, open_stage(self.request.stage)
-        there, trained = look_source(mesh, stage, self.request.root), split_location(mesh.path)[1]
-        found = [*([str(there.prim.GetPath())] if there else []), *([trained] if trained else [])]
-        return tuple(dict.fromkeys(found))  # a model may know its garment by a name alone
+        return stated_at(self.deformer.scene.garment.mesh, self.request.stage, self.request.root)
 
     def _loops(self, request: BakeRequest, motion: Motion) -> bool:
         """Return whether a shot is to be a loop; skinning alone repeats by itself."""
@@ -311,9 +305,7 @@ class LoadedGarment:
         if said.parts:
             parts = held_parts(said.parts, self.deformer, self.model.scene, request, read.whole, moves)
         hold = request.hold or said.hold
-        if hold > 1 and request.refine:
-            found, allowed = f"poses that are held for {hold} frames, and --refine", "the solver moves each frame"
-            fail(request.motion, found, allowed, "leave --refine out, or give --hold 1")
+        need_moving(request, hold)
         if read.loop is not None:
             looped = self._directed_in_loop(request, read, read.loop, said, parts)
             return looped and replace(looped, hand_moves=moves)
@@ -379,6 +371,7 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
     file, in_words = in_fabric(own, request.model, request.fabric, request.material, request.feedback)
     model = None if request.lbs else network(file, scene).to(device)
     deformer = lbs_deformer(scene) if model is None else model.deformer()
+    by_shapes = bool(shapes_of(request.stage) and on.member)
     return LoadedGarment(
         request=request,
         file=file,
@@ -400,17 +393,16 @@ def load_garment(request: BakeRequest) -> LoadedGarment:
         told=(*told, *in_words),
         body=on.body,
         first=first.scene.character.skeleton if on.member else None,
-        taller=_taller(first, on) if shapes_of(request.stage) else None,
-        moves=_moves(first.scene, scene) if shapes_of(request.stage) and on.member else {},
+        hub_ratio=_hub_ratio(first, on.member) if on.member and by_shapes else None,
+        moves=_moves(first.scene, scene) if by_shapes else {},
     )
 
 
-def _taller(file: ModelFile, on: WornModel) -> float | None:
+def _hub_ratio(file: ModelFile, member: tuple[float, ...]) -> float:
     """Return how much higher than the first body's the hub of another member is, in parts of it."""
-    if not (on.member and file.bodies):
-        return None
+    assert file.bodies is not None
     bodies = file.bodies.family.bodies
-    return bodies.height_ratio(np.array(on.member[: bodies.size]))
+    return bodies.height_ratio(np.array(member[: bodies.size]))
 
 
 def _moves(base: Scene, other: Scene) -> dict[str, Floats]:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ...errors import fail
+from ...errors import SsilkError, fail
 from ...files import split_body, split_location
 from ...scene.plain import from_plain
 from ...scene.shape_weights import body_name
+from .request import parse_range
 
 FIELDS = "{stem}, {prim}, {parent}, {parent2}, {parent3}, ... are names of its file, prim and folders"
 LONGEST = 100  # characters of a name; file systems take 255 bytes
@@ -140,4 +141,9 @@ def _listed(path: Path, name: str, entry: object, allowed: str) -> ListedShot:
         fail(str(path), f"in the shot '{name}', {error}", allowed)
     if not (name.strip() and shot.motion):
         fail(str(path), f"the shot '{name}' has '{shot.motion}' for a motion", allowed)
+    if shot.range is not None:
+        try:
+            parse_range(shot.range)
+        except SsilkError as error:
+            fail(str(path), f"the shot '{name}' has '{shot.range}' for a range", error.allowed)
     return replace(shot, motion=str(path.parent / shot.motion))

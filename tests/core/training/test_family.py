@@ -273,8 +273,12 @@ def test_validation_measures_members_as_models_of_these_alone(scene, members, fa
     assert not any(module.place.any() for module in parts.model.modules() if isinstance(module, SeenBody))
     again = Score.of(json.loads(json.dumps(asdict(score))))
     assert again.bodies == score.bodies and parts.validator.lbs_score().bodies == ()
-    worst = worst_body(replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), BodyScore("/b", 3.0, 2.9, 0.0))))
-    assert worst.name == "/b"
+    several = replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), BodyScore("/b", 3.0, 2.9, 0.0)))
+    lbs = replace(score, bodies=())
+    worst = worst_body(several.of_each("/base", lbs))
+    assert worst.name == "/b" and worst_body(lbs.of_each("/base", lbs)) is None
+    low = replace(lbs, terms={"all": score.total - 2 * abs(score.total) - 1})
+    assert worst_body(several.of_each("/base", low)).name == "/base"
     (told,) = worse_bodies("m", replace(score, bodies=(BodyScore("/a", 1.0, 4.0, 0.0), worst)))
     assert "on /b the model is worse than none" in told.text
 

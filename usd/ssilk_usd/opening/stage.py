@@ -15,6 +15,7 @@ from pxr import Ar, Pcp, Tf, Usd, UsdGeom, UsdUtils
 from ssilk_core.errors import fail
 from ssilk_core.files import split_body
 from ssilk_core.scene.assets import Floats
+from ssilk_core.scene.shape_weights import need_weights
 
 from ..names import LAYER_SUFFIXES
 from . import memory, trial
@@ -107,6 +108,7 @@ def open_stage(source: StageLike) -> Usd.Stage:
     if Path(file).is_dir():
         fail(str(source), "this is a folder", "a USD file is needed", "name one of its files")
     if not Path(file).is_file():
+        need_weights(str(source))
         fail(str(source), "there is no such file", "a USD file is needed", "check the path")
     if Path(file).suffix == ".safetensors":
         fail(str(source), "this is a trained model", "a USD file is needed", "model and stage may have been swapped")

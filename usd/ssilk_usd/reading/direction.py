@@ -15,9 +15,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
+from typing import NoReturn
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdSkel
+from pxr import Sdf, Usd, UsdGeom, UsdSkel
 
 from ssilk_core.errors import did_you_mean, fail
 from ssilk_core.files import split_location
@@ -33,6 +34,8 @@ from .motion import find_animation, read_motion
 from .skin import match_joints
 
 DIRECTING = FREE, HOLD, LOOP, POSED
+PRIMVARS = "primvars:"
+POSING = UsdSkel.Root, UsdSkel.Skeleton, UsdSkel.Animation
 ROUNDING = 1e-6
 MOST_NAMES = 6  # in a message
 NEAR = 0.7  # likeness of names from which on one may be the other misspelt
@@ -65,7 +68,7 @@ class SaidDirection:
         free: at each frame of the motion, 0 to 1, shape (F,); None where it is 1 throughout.
         hold: frames that each pose is held.
         parts: those that are held by themselves.
-        unheard: of prims that direct nothing, and may be the garment's with a misspelt name.
+        unheard: of prims that direct nothing, and may be meant to.
     """
 
     free: Floats | None
@@ -191,33 +194,55 @@ def _refuse_misspelt(prim: Usd.Prim) -> None:
     """Refuse attributes whose names are nearly those that direct a garment: they would direct nothing."""
     for attribute in prim.GetPropertiesInNamespace("ssilk"):
         name = attribute.GetName()
-        base = ":".join(name.split(":", 2)[:2])
-        if base not in DIRECTING and (near := get_close_matches(base, DIRECTING, n=1, cutoff=0.88)):
-            allowed = f"{', '.join(DIRECTING)} direct a garment"
-            fail(location(prim), f"an attribute {name}", allowed, f"did you mean '{near[0]}'?")
+        if _base(name) not in DIRECTING and (near := get_close_matches(_base(name), DIRECTING, n=1, cutoff=0.88)):
+            _fail_misspelt(prim, name, near[0])
+    for attribute in prim.GetPropertiesInNamespace(f"{PRIMVARS}ssilk"):
+        meant = attribute.GetName().removeprefix(PRIMVARS)
+        if _base(meant) in DIRECTING:
+            _fail_misspelt(prim, attribute.GetName(), meant)
+
+
+def _fail_misspelt(prim: Usd.Prim, name: str, near: str) -> NoReturn:
+    fail(
+        location(prim), f"an attribute {name}", f"{', '.join(DIRECTING)} direct a garment", f"did you mean '{near}'?"
+    )
 
 
 def _unheard(stage: Usd.Stage, home: Usd.Stage, garment: Sequence[str], prims: Sequence[Usd.Prim]) -> Iterator[str]:
-    """Yield of prims without a type that direct nothing, and whose names are nearly the garment's.
+    """Yield of prims that direct nothing, though their attributes would direct a garment.
 
-    There is nothing to tell where the stage directs the garment itself: others may be of another character.
+    That are what poses a character, and prims above the garment. They are also prims without a type whose names are
+    nearly the garment's. Of these there is nothing to tell where the stage directs the garment itself: they may be of
+    another character.
     """
     leaves = [path.rpartition("/")[2].lower() for path in garment]
-    if any(prim.GetStage() == stage and _directing(prim) for prim in prims):
-        return
+    own = [prim for prim in prims if prim.GetStage() == stage]
+    paths = [*map(Sdf.Path, garment), *(prim.GetPath() for prim in own)]
+    directed = any(map(_directing, own))
     for prim in stage.TraverseAll():
+        if prim in own or not (said := _directing(prim)):
+            continue
+        text = f"{location(prim)}: {said[0]} directs nothing"
+        if any(map(prim.IsA, POSING)) or any(path.HasPrefix(prim.GetPath()) for path in paths):
+            kind = prim.GetTypeName() or "prim above the garment"
+            yield f"{text} on a {kind}; it is an attribute of the garment, {garment[0]}, put it there"
+            continue
         there = home.GetPrimAtPath(prim.GetPath())
-        if prim.GetTypeName() or (there and there.GetTypeName()) or prim in prims or not (said := _directing(prim)):
+        if directed or prim.GetTypeName() or (there and there.GetTypeName()):
             continue
         if get_close_matches(prim.GetName().lower(), leaves, cutoff=NEAR):
-            text = f"{said[0]} directs nothing; the garment is {garment[0]}, rename the prim if that is meant"
-            yield f"{location(prim)}: {text}"
+            yield f"{text}; the garment is {garment[0]}, rename the prim if that is meant"
+
+
+def _base(name: str) -> str:
+    """Return the name of an attribute without that of the part of a garment that it is of."""
+    return ":".join(name.split(":", 2)[:2])
 
 
 def _directing(prim: Usd.Prim) -> list[str]:
     """Return the names of a prim's attributes that direct a garment."""
     names = (attribute.GetName() for attribute in prim.GetPropertiesInNamespace("ssilk"))
-    return [name for name in names if ":".join(name.split(":", 2)[:2]) in DIRECTING]
+    return [name for name in names if _base(name) in DIRECTING]
 
 
 def _parts(prims: Sequence[Usd.Prim], seconds: Floats, proxies: set[str]) -> Iterator[SaidPart]:
