@@ -107,6 +107,6 @@ def bodies() -> str:
             ", ".join(percent(each["mean"], 3) for each in skin),
             ", ".join(percent(each["worst"], 2) for each in skin),
         ])  # fmt: skip
-    header = ("body", "beyond [%]", "LBS [J]", "energy [J]", "simulator [J]", "steps miss [mJ]", "skin that shows [%]",
-              "in the worst frame [%]")  # fmt: skip
+    header = ("body", "beyond [%]", "LBS [J]", "energy [J]", "simulator [J]", "steps miss [mJ]",
+              "skin that shows [%]", "in the worst frame [%]")  # fmt: skip
     return table(header, rows)
