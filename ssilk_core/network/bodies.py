@@ -119,21 +119,21 @@ def misfit(columns: Columns, parameters: Mapping[str, Floats]) -> str | None:
     return None
 
 
-def _place(layer: str) -> int:
-    return int(layer.rpartition(".")[2])
+def hidden_layers(parameters: Mapping[str, Floats]) -> list[str]:
+    """Return the names of the layers of a model's networks that see bodies: all but the last of each."""
+    found = []
+    for name in SEEING:
+        places = (re.fullmatch(rf"{name}\.(\d+)\.weight", each) for each in parameters)
+        layers = sorted(int(place[1]) for place in places if place)
+        found += [f"{name}.{layer}" for layer in layers[:-1]]
+    return found
 
 
 def completed(columns: Columns, parameters: Mapping[str, Floats], size: int) -> dict[str, Floats]:
-    """Return weights of K coordinates for all hidden layers of a model: those given, and others that count
-    nothing, by the layer's name."""
-    seeing = [name.removesuffix(".weight") for name in parameters if name.endswith(".weight")]
-    seeing = [layer for layer in seeing if LAYER.fullmatch(layer)]
-    last = {
-        max((layer for layer in seeing if layer.startswith(f"{name}.")), default="", key=_place) for name in SEEING
-    }
-    layers = {layer: len(parameters[f"{layer}.weight"]) for layer in seeing if layer not in last}
-    blank = {layer: np.zeros((2, outputs, size), np.float32) for layer, outputs in layers.items()}
-    return {**blank, **columns}
+    """Return weights of K coordinates for all hidden layers of a model, by the layer's name: those given, and others
+    that count nothing."""
+    sizes = {layer: len(parameters[f"{layer}.weight"]) for layer in hidden_layers(parameters)}
+    return {**{layer: np.zeros((2, outputs, size), np.float32) for layer, outputs in sizes.items()}, **columns}
 
 
 PARAMETER = re.compile(r"(\w+\.\d+)\.parametrizations\.(bias|weight)\.(original|0\.columns)")
