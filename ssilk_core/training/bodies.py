@@ -55,15 +55,19 @@ class DrawnBodies:
         drawn = random_body(self.family, np.random.default_rng([self.seed, iteration]))
         self.place.copy_(torch.from_numpy(drawn))
 
-    def take_off(self) -> None:
-        """Put on the base."""
-        self.place.zero_()
-        self.put_on()
-
     def put_on(self) -> None:
         """Put on the body that was drawn: part of the step, so that a captured graph does it too."""
         for wearer in self.wearers:
             wearer.wear(self.place)
+
+    def wear(self, coordinates: Floats) -> None:
+        """Put on the body at coordinates (K,)."""
+        self.place.copy_(torch.as_tensor(coordinates))
+        self.put_on()
+
+    def take_off(self) -> None:
+        """Put on the base."""
+        self.wear(np.zeros(self.family.size))
 
 
 class FamilyBody:
