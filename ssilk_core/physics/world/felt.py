@@ -22,9 +22,10 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
-from .colliders import ColliderPoser, Nearby, carried_points, voting_points
+from .colliders import ColliderPoser, carried_points, voting_points
 from .surface import Search, boxes
 
+AT_ONCE = 64  # frames in which colliders are looked for together, to bound memory
 PLACES = 32  # vertices at which the air is averaged
 Places = Callable[[Motion], Floats]
 Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
@@ -56,9 +57,9 @@ class ColliderSight:
         world: its time runs from the first frame of motions.
         places: takes a motion, and returns the points from which colliders are seen in its frames [m], (F, M, 3).
         within: distance up to which they count [m].
-        see: takes the points of a frame (M, 3), distances (M,), directions away from what is nearest (M, 3) and the
-            position of the root (3,), and returns what is seen (M, 5); where nothing is near distances are infinite
-            and directions zero.
+        see: takes the points of frames (N, M, 3), distances (N, M), directions away from what is nearest (N, M, 3)
+            and positions of the root (N, 3), and returns what is seen (N, M, 5); where nothing is near distances are
+            infinite and directions zero.
         search: finds nearest points on triangles.
     """
 
@@ -72,16 +73,14 @@ class ColliderSight:
         """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
         points, voters = self._places(own), voting_points(own, self._scene)
-        roots, found = hub_places(self._scene.character.skeleton, own.rotations, own.translations), []
-        for frame, here, votes, root in zip(frames.tolist(), points, voters, roots):
-            distance, normal = np.full(len(here), np.inf), np.zeros((len(here), 3))
-            close = Nearby.of(here, self._within)
-            for collider in self._poser.at(self._world, frame / motion.fps, np.zeros(3), votes, close):
-                near, met = collider.near(here, self._within)
-                closer = met.distance < distance[near]
-                distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
-            found.append(self._see(here, distance, normal, root))
-        return np.stack(found)
+        roots = hub_places(self._scene.character.skeleton, own.rotations, own.translations)
+        parts = []
+        for at in range(0, len(frames), AT_ONCE):
+            some = slice(at, at + AT_ONCE)
+            given = points[some], voters[some], self._within
+            found = self._poser.nearest(self._world, frames[some] / motion.fps, *given)
+            parts.append(self._see(points[some], *found, roots[some]))
+        return np.concatenate(parts)
 
 
 def _loose(scene: Scene) -> Ints:

@@ -99,8 +99,8 @@ class CollisionSurface:
             fail(path, "no triangle of it has an area", "cloth meets surfaces", "leave it out of the colliders")
         swapped, self.part = _wound_alike(welded[kept])
         own = np.where(swapped[:, None], faces[kept][:, ::-1], faces[kept])
-        sides = np.sort(np.stack([place[own], np.roll(place[own], -1, axis=1)], axis=-1), axis=-1).reshape(-1, 2)
-        _, edge, used = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
+        sides = topology.half_edges(place[own])
+        _, edge, used = np.unique(topology.edge_keys(sides), return_inverse=True, return_counts=True)
         self._edge = edge.reshape(-1, 3)  # of corners (0, 1), (1, 2) and (2, 0)
         border = used == 1
         self.closed = np.ones(self.part.max() + 1, dtype=bool)
@@ -118,6 +118,8 @@ class CollisionSurface:
         self._border_vertex = np.zeros(len(points), dtype=bool)
         self._border_vertex[sides[border[edge.reshape(-1)]]] = True
         self._edge_count = len(used)
+        self._by_part = np.argsort(self.part, kind="stable")
+        self._firsts = np.searchsorted(self.part[self._by_part], np.arange(len(self.closed)))
 
     def at(self, points: Floats, search: Search = boxes) -> PosedSurface:
         """Return the surface with its mesh's points (P, 3) [m]."""
@@ -137,35 +139,60 @@ class PosedSurface:
         surface, corners = self.surface, self.points[self.surface.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), np.finfo(float).tiny)
-        edge = np.zeros((surface._edge_count, 3))
-        np.add.at(edge, surface._edge, face[:, None])
-        vertex = np.zeros_like(self.points)
+        edge = _added(surface._edge, face[:, None], surface._edge_count)
         ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-        sine = np.linalg.norm(np.cross(ahead, behind), axis=2)
-        angle = np.arctan2(sine, (ahead * behind).sum(axis=2))
-        np.add.at(vertex, surface._welded, angle[..., None] * face[:, None])
+        # Twice the area is the sine at each corner, times the lengths of its sides as the cosine is.
+        angle = np.arctan2(np.linalg.norm(cross, axis=1)[:, None], (ahead * behind).sum(axis=2))
+        vertex = _added(surface._welded, angle[..., None] * face[:, None], len(self.points))
         return face, edge, vertex
 
-    def distance(self, queries: Floats, sides: Floats | None = None) -> SurfaceDistance:
-        """Return the distances of queries (M, 3), where each part's outside is turned by `sides` (C,), 1 or -1."""
+    @cached_property
+    def _bounds(self) -> tuple[Floats, Floats]:
+        """The corners of the box around each part, shapes (C, 3)."""
+        corners = self.points[self.surface.faces[self.surface._by_part].reshape(-1)]
+        firsts = 3 * self.surface._firsts
+        return np.minimum.reduceat(corners, firsts), np.maximum.reduceat(corners, firsts)
+
+    @cached_property
+    def _up(self) -> tuple[Floats, Floats]:
+        """The mean normal n of each part, times its area, (C, 3), and the largest n . x of its points (C,).
+
+        That is infinite for a part that does not face along n everywhere.
+        """
+        surface = self.surface
+        corners = self.points[surface.faces[surface._by_part]]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal, part = np.add.reduceat(cross, surface._firsts), surface.part[surface._by_part]
+        facing = np.minimum.reduceat((cross * normal[part]).sum(axis=1), surface._firsts) > 0
+        height = np.einsum("tkc,tc->tk", corners, normal[part]).max(axis=1)
+        return normal, np.where(facing, np.maximum.reduceat(height, surface._firsts), np.inf)
+
+    def distance(self, queries: Floats, sides: Floats | None = None, garment: Ints | None = None) -> SurfaceDistance:
+        """Return the distances of queries (M, 3).
+
+        Args:
+            sides: by which each part's outside is turned, 1 or -1, shape (C,).
+            garment: the row of each query (M,) in `sides` of several garments (N, C).
+        """
         surface = self.surface
         squares, face, nearest = self._nearest(queries)
         weights = _barycentric(self.points[surface.faces[face]], nearest)
-        away = queries - nearest
+        away, part = queries - nearest, surface.part[face]
         length = np.sqrt(np.maximum(squares, 0.0))
         normal, on_border = self._at(face, weights)
-        turned = np.ones(len(face)) if sides is None else sides[surface.part[face]]
-        side = np.where((away * normal).sum(axis=1) * turned < 0, -1.0, 1.0)
+        turned = np.ones(1) if sides is None else sides[part] if garment is None else sides[garment, part]
+        side = np.where(_dot(away, normal) * turned < 0, -1.0, 1.0)
         behind = on_border & (side < 0)
         side[on_border] = 1.0
-        normal = normal * (turned / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny))[:, None]
+        normal = normal * (turned / np.maximum(np.sqrt(_dot(normal, normal)), np.finfo(float).tiny))[:, None]
         direct = away * (side / np.maximum(length, TOUCHING))[:, None]
         direction = np.where((length > TOUCHING)[:, None], direct, normal)
-        where = surface.part[face], on_border, behind, surface.faces[face], weights
-        return SurfaceDistance(side * length, direction, *where)
+        return SurfaceDistance(side * length, direction, part, on_border, behind, surface.faces[face], weights)
 
     def outside(self, carried: Floats) -> Floats:
         """Return on which side each part's outside is, 1 or -1 (C,), for a garment (V, 3) as the body carries it."""
+        if self.needs_no_vote(carried.min(axis=0), carried.max(axis=0)):
+            return np.ones(len(self.surface.closed))
         surface = self.surface
         found = self.distance(carried)
         count = len(surface.closed)
@@ -174,28 +201,66 @@ class PosedSurface:
         around = surface.closed & (near == len(carried)) & (votes == -len(carried))
         return np.where(around | (~surface.closed & (votes < 0)), -1.0, 1.0)
 
+    def needs_no_vote(self, low: Floats, high: Floats) -> NDArray[np.bool_]:
+        """Return whether garments in boxes of corners (..., 3) are surely outside of each part as it is wound, (...).
+
+        None is inside a closed part that reaches beyond the part's box. None is below an open part that is above the
+        highest of its points, if the whole part faces up, along its mean normal.
+        """
+        surface = self.surface
+        if surface.closed.all() and not self._may_hold(low, high, *self._whole).any():
+            return np.ones(low.shape[:-1], dtype=bool)
+        clear = ~self._may_hold(low[..., None, :], high[..., None, :], *self._bounds)
+        if not surface.closed.all():
+            normal, top = self._up
+            lowest = (low + high) / 2 @ normal.T - (high - low) / 2 @ np.abs(normal).T
+            clear = np.where(surface.closed, clear, lowest > top)
+        return np.asarray(clear.all(axis=-1))
+
+    @cached_property
+    def _whole(self) -> tuple[Floats, Floats]:
+        """The corners of the box around all of it, shapes (3,)."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    @staticmethod
+    def _may_hold(low: Floats, high: Floats, least: Floats, most: Floats) -> NDArray[np.bool_]:
+        return ((low >= least) & (high <= most)).all(axis=-1)
+
     def _at(self, face: Ints, weights: Floats) -> tuple[Floats, NDArray[np.bool_]]:
         """Return the pseudonormals at points of faces (M, 3), and whether they are on a border (M,)."""
         faces, edges, vertices = self._normals
         surface = self.surface
         none = weights <= ON_EDGE
-        count = none.sum(axis=1)
-        edge = surface._edge[face, (none.argmax(axis=1) + 1) % 3]
-        vertex = surface._welded[face, weights.argmax(axis=1)]
-        normal = np.where((count == 1)[:, None], edges[edge], faces[face])
-        normal = np.where((count == 2)[:, None], vertices[vertex], normal)
-        border = np.where(count == 1, surface._border_edge[edge], (count == 2) & surface._border_vertex[vertex])
+        count = none @ np.ones(3, dtype=np.int8)
+        on_edge, at_vertex = np.flatnonzero(count == 1), np.flatnonzero(count == 2)
+        edge = surface._edge[face[on_edge], (none[on_edge].argmax(axis=1) + 1) % 3]
+        vertex = surface._welded[face[at_vertex], weights[at_vertex].argmax(axis=1)]
+        normal, border = faces.take(face, axis=0), np.zeros(len(face), dtype=bool)
+        normal[on_edge], border[on_edge] = edges[edge], surface._border_edge[edge]
+        normal[at_vertex], border[at_vertex] = vertices[vertex], surface._border_vertex[vertex]
         return normal, border
+
+
+def _dot(one: Floats, other: Floats) -> Floats:
+    """Return the products of vectors (M, 3), shape (M,)."""
+    found: Floats = np.einsum("mc,mc->m", one, other)
+    return found
+
+
+def _added(place: Ints, values: Floats, count: int) -> Floats:
+    """Return sums (count, 3) of values, broadcast to (T, 3, 3), that belong to places (T, 3)."""
+    place, values = place.reshape(-1), np.broadcast_to(values, (*place.shape, 3)).reshape(-1, 3)
+    return np.stack([np.bincount(place, part, count) for part in values.T], axis=1)
 
 
 def _barycentric(corners: Floats, points: Floats) -> Floats:
     """Return the barycentric coordinates (M, 3), none negative, of points (M, 3) on triangles (M, 3, 3)."""
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     normal = np.cross(b - a, c - a)
-    whole = np.maximum((normal * normal).sum(axis=1), np.finfo(float).tiny)
-    u = (np.cross(c - b, points - b) * normal).sum(axis=1) / whole
-    v = (np.cross(a - c, points - c) * normal).sum(axis=1) / whole
-    found = np.clip(np.stack([u, v, 1 - u - v], axis=1), 0.0, 1.0)
+    whole = np.maximum(_dot(normal, normal), np.finfo(float).tiny)
+    u = _dot(np.cross(c - b, points - b), normal) / whole
+    v = _dot(np.cross(a - c, points - c), normal) / whole
+    found = np.stack([u, v, 1 - u - v], axis=1).clip(0.0, 1.0)
     return found / found.sum(axis=1, keepdims=True)
 
 
