@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 
 import numpy as np
@@ -19,10 +21,17 @@ from ...scene.kinematics import (
     skinning_matrices,
     slerp,
 )
-from .surface import CollisionSurface, PosedSurface, Search, SurfaceDistance, boxes
+from ..loops import installed
+from .moving import MovingSurface
+from .surface import CollisionSurface, Garment, PosedSurface, Search, SurfaceDistance, boxes
 
 AT_ONCE = 256  # frames that are skinned together, to bound memory
+TOGETHER = 64  # frames in which a collider is searched together, likewise
+COMPILED_FROM = (
+    2**20
+)  # triangles of a mesh that moves, over all frames, that gain more by loops than these take to load
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
+Meet = Callable[[Floats, Garment, Floats, Floats], SurfaceDistance]  # as `PosedSurface.met`
 
 
 class PosedCollider:
@@ -135,7 +144,7 @@ class ColliderPoser:
     ) -> tuple[Floats, Floats]:
         """Return distances to the nearest of all colliders in N frames [m], (N, M), and their gradients (N, M, 3).
 
-        All frames of a mesh that keeps its shape are searched at once, which costs them no more than a few did.
+        Frames of a mesh that keeps its shape are searched together, which takes hardly longer than one of them did.
 
         Args:
             seconds: time of each frame (N,).
@@ -151,22 +160,37 @@ class ColliderPoser:
             placed = np.stack([placed_at(collider.placements, world, each) for each in seconds.tolist()])
             turn, place = placed[:, :3, :3], placed[:, None, :3, 3]
             frames = np.flatnonzero(there & ~self._is_far(collider, turn, place[:, 0], near))
-            for own in [frames] if len(collider.points) == 1 and len(frames) else frames[:, None]:
-                surface, back = self._surface(collider, world, float(seconds[own[0]])), turn[own]
-                centre, reach = (middle[own] - place[own]) @ back, half[own] @ np.abs(back)
-                sides = np.ones((len(own), len(surface.surface.closed)))
-                for row in np.flatnonzero(
-                    ~surface.needs_no_vote(centre[:, 0] - reach[:, 0], centre[:, 0] + reach[:, 0])
-                ):
-                    sides[row] = surface.outside((carried[own[row]] - place[own[row]]) @ back[row])
-                asked = ((queries[own] - place[own]) @ back).reshape(-1, 3)
-                found = surface.distance(asked, sides, np.arange(len(own)).repeat(queries.shape[1]))
+            for own, meet in self._together(collider, world, seconds, frames):
+                back, here = turn[own], place[own]
+
+                def garment(number: int, own: Ints = own, back: Floats = back, here: Floats = here) -> Floats:
+                    return (carried[own[number]] - here[number]) @ back[number]
+
+                centre, reach = ((middle[own] - here) @ back)[:, 0], (half[own] @ np.abs(back))[:, 0]
+                found = meet((queries[own] - here) @ back, garment, centre - reach, centre + reach)
                 reached, known = found.distance.reshape(len(own), -1), distance[own]
                 closer = (reached <= within) & (reached < known)
                 distance[own] = np.where(closer, reached, known)
                 gradient = found.normal.reshape(*reached.shape, 3) @ back.swapaxes(1, 2)
                 normal[own] = np.where(closer[..., None], gradient, normal[own])
         return distance, normal
+
+    def _together(
+        self, collider: Collider, world: ShotWorld, seconds: Floats, frames: Ints
+    ) -> Iterator[tuple[Ints, Meet]]:
+        """Yield frames that are searched together, and what finds the distances in these to a collider."""
+        parts = [frames[at : at + TOGETHER] for at in range(0, len(frames), TOGETHER)]
+        if len(collider.points) == 1:
+            for part in parts:
+                yield part, self._surface(collider, world, 0.0).met
+        elif len(frames) * len(collider.faces) >= COMPILED_FROM and installed():
+            moving = MovingSurface(self._shape(collider), collider.points[0])
+            for part in parts:
+                points = [world.between(collider.points, each) for each in seconds[part].tolist()]
+                yield part, partial(moving.met, np.stack(points))
+        else:
+            for frame in frames:
+                yield frame[None], self._surface(collider, world, float(seconds[frame])).met
 
     def _is_far(self, collider: Collider, turn: Floats, place: Floats, near: Nearby) -> NDArray[np.bool_]:
         """Return whether cloth does not meet a collider where turns (..., 3, 3) and places (..., 3) put it."""
@@ -180,13 +204,17 @@ class ColliderPoser:
     def _surface(self, collider: Collider, world: ShotWorld, seconds: float) -> PosedSurface:
         """Return a collider's surface at a time, in its own space."""
         key = id(collider)
+        if len(collider.points) > 1:
+            return self._shape(collider).at(world.between(collider.points, seconds), self._search)
+        if key not in self._still:
+            self._still[key] = self._shape(collider).at(collider.points[0], self._search)
+        return self._still[key]
+
+    def _shape(self, collider: Collider) -> CollisionSurface:
+        key = id(collider)
         if key not in self._surfaces:
             self._surfaces[key] = CollisionSurface(collider.path, collider.points[0], collider.faces)
-        if len(collider.points) > 1:
-            return self._surfaces[key].at(world.between(collider.points, seconds), self._search)
-        if key not in self._still:
-            self._still[key] = self._surfaces[key].at(collider.points[0], self._search)
-        return self._still[key]
+        return self._surfaces[key]
 
 
 def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:

@@ -25,7 +25,6 @@ from .air import MovingAir
 from .colliders import ColliderPoser, carried_points, voting_points
 from .surface import Search, boxes
 
-AT_ONCE = 64  # frames in which colliders are looked for together, to bound memory
 PLACES = 32  # vertices at which the air is averaged
 Places = Callable[[Motion], Floats]
 Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
@@ -74,13 +73,8 @@ class ColliderSight:
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
         points, voters = self._places(own), voting_points(own, self._scene)
         roots = hub_places(self._scene.character.skeleton, own.rotations, own.translations)
-        parts = []
-        for at in range(0, len(frames), AT_ONCE):
-            some = slice(at, at + AT_ONCE)
-            given = points[some], voters[some], self._within
-            found = self._poser.nearest(self._world, frames[some] / motion.fps, *given)
-            parts.append(self._see(points[some], *found, roots[some]))
-        return np.concatenate(parts)
+        found = self._poser.nearest(self._world, frames / motion.fps, points, voters, self._within)
+        return self._see(points, *found, roots)
 
 
 def _loose(scene: Scene) -> Ints:

@@ -28,6 +28,7 @@ ON_EDGE = 1e-7  # barycentric coordinate up to which a point is on the edge oppo
 TOUCHING = 1e-9  # [m] from the surface, up to which its normal is the direction away from it
 Nearest = Callable[[Floats], tuple[Floats, Ints, Floats]]
 Search = Callable[[Floats, Ints], Nearest]
+Garment = Callable[[int], Floats]
 
 
 def boxes(points: Floats, faces: Ints) -> Nearest:
@@ -82,6 +83,8 @@ class CollisionSurface:
         faces: the mesh's vertices at the corners, shape (T, 3).
         part: of each triangle, shape (T,).
         closed: whether each part has no border, shape (C,).
+        welded: places of the corners, (T, 3): one number for all that lie on one another.
+        edge: numbers of the edges between corners 0 and 1, 1 and 2, 2 and 0, shape (T, 3).
 
     Args:
         path: of the mesh, for messages.
@@ -101,10 +104,10 @@ class CollisionSurface:
         own = np.where(swapped[:, None], faces[kept][:, ::-1], faces[kept])
         sides = topology.half_edges(place[own])
         _, edge, used = np.unique(topology.edge_keys(sides), return_inverse=True, return_counts=True)
-        self._edge = edge.reshape(-1, 3)  # of corners (0, 1), (1, 2) and (2, 0)
+        self.edge = edge.reshape(-1, 3)
         border = used == 1
         self.closed = np.ones(self.part.max() + 1, dtype=bool)
-        self.closed[self.part[border[self._edge].any(axis=1)]] = False
+        self.closed[self.part[border[self.edge].any(axis=1)]] = False
         inward = np.bincount(self.part, _volumes(points[own])) < 0
         inward &= self.closed
         # The winding of an open part is the mesh's own, where it is consistent: of most of its area.
@@ -112,14 +115,53 @@ class CollisionSurface:
         inward |= ~self.closed & (np.bincount(self.part, np.where(swapped, area, -area)) > 0)
         flipped = inward[self.part]
         own[flipped] = own[flipped][:, ::-1]
-        self._edge[flipped] = self._edge[flipped][:, [1, 0, 2]]
-        self.faces, self._welded = own, place[own]
+        self.edge[flipped] = self.edge[flipped][:, [1, 0, 2]]
+        self.faces, self.welded = own, place[own]
         self._border_edge = border
         self._border_vertex = np.zeros(len(points), dtype=bool)
         self._border_vertex[sides[border[edge.reshape(-1)]]] = True
         self._edge_count = len(used)
         self._by_part = np.argsort(self.part, kind="stable")
         self._firsts = np.searchsorted(self.part[self._by_part], np.arange(len(self.closed)))
+
+    def features(self, face: Ints, weights: Floats) -> tuple[Ints, Ints, Ints, Ints]:
+        """Return which of points (M,) are on an edge, on which, which are at a vertex, and at which."""
+        none = weights <= ON_EDGE
+        count = none @ np.ones(3, dtype=np.int8)
+        on_edge, at_vertex = np.flatnonzero(count == 1), np.flatnonzero(count == 2)
+        edge = self.edge[face[on_edge], (none[on_edge].argmax(axis=1) + 1) % 3]
+        vertex = self.welded[face[at_vertex], weights[at_vertex].argmax(axis=1)]
+        return on_edge, edge, at_vertex, vertex
+
+    def signed(
+        self, away: Floats, length: Floats, face: Ints, weights: Floats, normal: Floats, turned: Floats
+    ) -> SurfaceDistance:
+        """Return the distances of M queries.
+
+        Args:
+            away: from the nearest points [m], (M, 3); length: of these, (M,); normal: pseudonormals there, (M, 3).
+            face, weights: of the nearest points, shapes (M,) and (M, 3).
+            turned: whether the outside there is as the part is wound, 1, or the other one, -1, (M,) or (1,).
+        """
+        side = np.where(_dot(away, normal) * turned < 0, -1.0, 1.0)
+        on_edge, edge, at_vertex, vertex = self.features(face, weights)
+        on_border = np.zeros(len(face), dtype=bool)
+        on_border[on_edge], on_border[at_vertex] = self._border_edge[edge], self._border_vertex[vertex]
+        behind = on_border & (side < 0)
+        side[on_border] = 1.0
+        normal = normal * (turned / np.maximum(np.sqrt(_dot(normal, normal)), np.finfo(float).tiny))[:, None]
+        direct = away * (side / np.maximum(length, TOUCHING))[:, None]
+        direction = np.where((length > TOUCHING)[:, None], direct, normal)
+        where = self.part[face], on_border, behind, self.faces[face], weights
+        return SurfaceDistance(side * length, direction, *where)
+
+    def voted(self, found: SurfaceDistance) -> Floats:
+        """Return on which side each part's outside is, 1 or -1 (C,), by the distances of a garment's vertices."""
+        count = len(self.closed)
+        votes = np.bincount(found.part, np.where(found.on_border, 0.0, np.sign(found.distance)), count)
+        near, voters = np.bincount(found.part, minlength=count), len(found.part)
+        around = self.closed & (near == voters) & (votes == -voters)
+        return np.where(around | (~self.closed & (votes < 0)), -1.0, 1.0)
 
     def at(self, points: Floats, search: Search = boxes) -> PosedSurface:
         """Return the surface with its mesh's points (P, 3) [m]."""
@@ -139,11 +181,11 @@ class PosedSurface:
         surface, corners = self.surface, self.points[self.surface.faces]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), np.finfo(float).tiny)
-        edge = _added(surface._edge, face[:, None], surface._edge_count)
+        edge = _added(surface.edge, face[:, None], surface._edge_count)
         ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
         # Twice the area is the sine at each corner, times the lengths of its sides as the cosine is.
         angle = np.arctan2(np.linalg.norm(cross, axis=1)[:, None], (ahead * behind).sum(axis=2))
-        vertex = _added(surface._welded, angle[..., None] * face[:, None], len(self.points))
+        vertex = _added(surface.welded, angle[..., None] * face[:, None], len(self.points))
         return face, edge, vertex
 
     @cached_property
@@ -174,32 +216,33 @@ class PosedSurface:
             sides: by which each part's outside is turned, 1 or -1, shape (C,).
             garment: the row of each query (M,) in `sides` of several garments (N, C).
         """
-        surface = self.surface
         squares, face, nearest = self._nearest(queries)
-        weights = _barycentric(self.points[surface.faces[face]], nearest)
-        away, part = queries - nearest, surface.part[face]
-        length = np.sqrt(np.maximum(squares, 0.0))
-        normal, on_border = self._at(face, weights)
-        turned = np.ones(1) if sides is None else sides[part] if garment is None else sides[garment, part]
-        side = np.where(_dot(away, normal) * turned < 0, -1.0, 1.0)
-        behind = on_border & (side < 0)
-        side[on_border] = 1.0
-        normal = normal * (turned / np.maximum(np.sqrt(_dot(normal, normal)), np.finfo(float).tiny))[:, None]
-        direct = away * (side / np.maximum(length, TOUCHING))[:, None]
-        direction = np.where((length > TOUCHING)[:, None], direct, normal)
-        return SurfaceDistance(side * length, direction, part, on_border, behind, surface.faces[face], weights)
+        weights = _barycentric(self.points[self.surface.faces[face]], nearest)
+        turned = np.ones(1)
+        if sides is not None:
+            part = self.surface.part[face]
+            turned = sides[part] if garment is None else sides[garment, part]
+        return self.surface.signed(
+            queries - nearest, np.sqrt(squares.clip(0)), face, weights, self._at(face, weights), turned
+        )
 
     def outside(self, carried: Floats) -> Floats:
         """Return on which side each part's outside is, 1 or -1 (C,), for a garment (V, 3) as the body carries it."""
         if self.needs_no_vote(carried.min(axis=0), carried.max(axis=0)):
             return np.ones(len(self.surface.closed))
-        surface = self.surface
-        found = self.distance(carried)
-        count = len(surface.closed)
-        votes = np.bincount(found.part, np.where(found.on_border, 0.0, np.sign(found.distance)), count)
-        near = np.bincount(found.part, minlength=count)
-        around = surface.closed & (near == len(carried)) & (votes == -len(carried))
-        return np.where(around | (~surface.closed & (votes < 0)), -1.0, 1.0)
+        return self.surface.voted(self.distance(carried))
+
+    def met(self, queries: Floats, garment: Garment, low: Floats, high: Floats) -> SurfaceDistance:
+        """Return the distances of queries (N, M, 3) of N garments, one garment after the other.
+
+        Args:
+            garment: returns the vertices (V, 3) of one of them, as the body carries it, by its number.
+            low, high: corners of boxes that hold these, shapes (N, 3).
+        """
+        sides = np.ones((len(queries), len(self.surface.closed)))
+        for number in np.flatnonzero(~self.needs_no_vote(low, high)):
+            sides[number] = self.surface.voted(self.distance(garment(number)))
+        return self.distance(queries.reshape(-1, 3), sides, np.arange(len(queries)).repeat(queries.shape[1]))
 
     def needs_no_vote(self, low: Floats, high: Floats) -> NDArray[np.bool_]:
         """Return whether garments in boxes of corners (..., 3) are surely outside of each part as it is wound, (...).
@@ -226,19 +269,13 @@ class PosedSurface:
     def _may_hold(low: Floats, high: Floats, least: Floats, most: Floats) -> NDArray[np.bool_]:
         return ((low >= least) & (high <= most)).all(axis=-1)
 
-    def _at(self, face: Ints, weights: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Return the pseudonormals at points of faces (M, 3), and whether they are on a border (M,)."""
+    def _at(self, face: Ints, weights: Floats) -> Floats:
+        """Return the pseudonormals at points of faces, shape (M, 3)."""
         faces, edges, vertices = self._normals
-        surface = self.surface
-        none = weights <= ON_EDGE
-        count = none @ np.ones(3, dtype=np.int8)
-        on_edge, at_vertex = np.flatnonzero(count == 1), np.flatnonzero(count == 2)
-        edge = surface._edge[face[on_edge], (none[on_edge].argmax(axis=1) + 1) % 3]
-        vertex = surface._welded[face[at_vertex], weights[at_vertex].argmax(axis=1)]
-        normal, border = faces.take(face, axis=0), np.zeros(len(face), dtype=bool)
-        normal[on_edge], border[on_edge] = edges[edge], surface._border_edge[edge]
-        normal[at_vertex], border[at_vertex] = vertices[vertex], surface._border_vertex[vertex]
-        return normal, border
+        on_edge, edge, at_vertex, vertex = self.surface.features(face, weights)
+        normal = faces.take(face, axis=0)
+        normal[on_edge], normal[at_vertex] = edges[edge], vertices[vertex]
+        return normal
 
 
 def _dot(one: Floats, other: Floats) -> Floats:

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from ssilk_core.physics import loops
+from ssilk_core.physics.world import colliders as world
 from ssilk_core.physics.world.colliders import ColliderPoser
 from ssilk_core.physics.world.surface import CollisionSurface, PosedSurface
 from ssilk_core.scene.assets import Collider, ShotWorld
@@ -39,18 +41,20 @@ def around(rng) -> dict[str, Collider]:
     """Colliders that keep still, turn, bend, come and go."""
     ground, faces = hills(rng)
     bent = BALL.vertices * rng.uniform(0.7, 1.3, (FRAMES, 1, 3)) + rng.normal(size=(FRAMES, 1, 3))
+    waves = ground + 0.3 * rng.normal(size=(FRAMES, 1, 3)) + 0.05 * rng.normal(size=(FRAMES, *ground.shape))
     comes = np.arange(FRAMES) % 3 != 1
     return {
         "ground": Collider("/ground", faces, ground[None], np.eye(4)[None], EVERY),
         "ceiling": Collider("/ceiling", faces, ground[None] + [0, 2.5, 0], np.eye(4)[None], EVERY),
         "ring": Collider("/ring", RING.faces, RING.vertices[None], turning(rng), EVERY),
+        "waves": Collider("/waves", faces, waves, np.eye(4)[None], EVERY),
         "ball": Collider("/ball", BALL.faces, bent, np.eye(4)[None], comes),
         "room": Collider("/room", ROOM.faces, ROOM.vertices[None], np.eye(4)[None], EVERY),
     }
 
 
 def expected(collider: Collider, frame: int, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest points (M, 3) of a collider to queries (M, 3) in the world, and whether these are inside it (M,)."""
+    """The points of a collider nearest to queries (M, 3) in the world, (M, 3), and whether these are inside, (M,)."""
     place = collider.placements[min(frame, len(collider.placements) - 1)]
     points = collider.points[min(frame, len(collider.points) - 1)] @ place[:3, :3].T + place[:3, 3]
     found = np.stack(
@@ -65,8 +69,15 @@ def expected(collider: Collider, frame: int, queries: np.ndarray) -> tuple[np.nd
     return found[best, np.arange(len(queries))], ~inside if collider.path == "/room" else inside
 
 
-@pytest.mark.parametrize("name", ["ground", "ceiling", "ring", "ball", "room", "all"])
-def test_frames_at_once_have_the_distances_of_all_triangles_in_each(name: str) -> None:
+@pytest.mark.parametrize(
+    "name, compiled",
+    [(name, False) for name in ("ground", "ceiling", "ring", "room", "waves", "ball", "all")]
+    + [(name, True) for name in ("waves", "ball", "all")],
+)
+def test_frames_at_once_have_the_distances_of_all_triangles_in_each(name: str, compiled: bool, monkeypatch) -> None:
+    if compiled and not loops.installed():
+        pytest.skip("numba is not installed")
+    monkeypatch.setattr(world, "COMPILED_FROM", 0 if compiled else np.inf)
     rng = np.random.default_rng(4)
     own = around(rng)
     colliders = tuple(own.values()) if name == "all" else (own[name],)
