@@ -217,23 +217,34 @@ class ColliderPoser:
         return self._surfaces[key]
 
 
+class CarriedPoints:
+    """Some vertices (P,) of a garment under linear blend skinning."""
+
+    def __init__(self, scene: Scene, rows: Ints) -> None:
+        skin, skeleton = scene.lbs_skin, scene.character.skeleton
+        self._joints, place = np.unique(skin.indices[rows], return_inverse=True)
+        self._parents, self._bind = skeleton.parents, skeleton.bind_transforms[self._joints]
+        # Weights times points, homogeneous, of each joint: one product then blends all frames.
+        points = np.concatenate([scene.garment.mesh.points[rows], np.ones((len(rows), 1))], axis=1)
+        shares, own = np.zeros((len(self._joints), len(rows), 4)), np.arange(len(rows))
+        for joint, weight in zip(place.reshape(len(rows), -1).T, skin.weights[rows].T):
+            shares[joint, own] += weight[:, None] * points
+        self._shares = shares.swapaxes(1, 2).reshape(-1, len(rows))
+
+    def __call__(self, motion: Motion) -> Floats:
+        """Return the vertices in each frame of a motion, in the world [m], shape (F, P, 3)."""
+        world = motion_transforms(motion, self._parents)[:, self._joints]
+        matrices = skinning_matrices(world, self._bind)[:, :, :3]
+        found = np.empty((len(matrices), 3, self._shares.shape[1]))
+        for at in range(0, len(matrices), AT_ONCE):
+            part = matrices[at : at + AT_ONCE].swapaxes(1, 2)
+            np.matmul(part.reshape(*part.shape[:2], -1), self._shares, out=found[at : at + AT_ONCE])
+        return found.swapaxes(1, 2)
+
+
 def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
     """Return some vertices (P,) of a garment under linear blend skinning in the world [m], shape (F, P, 3)."""
-    skin, skeleton = scene.lbs_skin, scene.character.skeleton
-    joints, place = np.unique(skin.indices[rows], return_inverse=True)
-    world = motion_transforms(motion, skeleton.parents)[:, joints]
-    matrices = skinning_matrices(world, skeleton.bind_transforms[joints])[:, :, :3]
-    # Weights times points, homogeneous, of each joint: one product then blends all frames.
-    points = np.concatenate([scene.garment.mesh.points[rows], np.ones((len(rows), 1))], axis=1)
-    shares, own = np.zeros((len(joints), len(rows), 4)), np.arange(len(rows))
-    for joint, weight in zip(place.reshape(len(rows), -1).T, skin.weights[rows].T):
-        shares[joint, own] += weight[:, None] * points
-    basis = shares.swapaxes(1, 2).reshape(-1, len(rows))
-    found = np.empty((len(matrices), 3, len(rows)))
-    for at in range(0, len(matrices), AT_ONCE):
-        part = matrices[at : at + AT_ONCE].swapaxes(1, 2)
-        np.matmul(part.reshape(*part.shape[:2], -1), basis, out=found[at : at + AT_ONCE])
-    return found.swapaxes(1, 2)
+    return CarriedPoints(scene, rows)(motion)
 
 
 def voting_points(motion: Motion, scene: Scene) -> Floats:

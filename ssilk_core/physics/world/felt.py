@@ -22,7 +22,7 @@ from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
-from .colliders import ColliderPoser, carried_points, voting_points
+from .colliders import CarriedPoints, ColliderPoser, carried_points, voting_rows
 from .surface import Search, boxes
 
 PLACES = 32  # vertices at which the air is averaged
@@ -67,11 +67,12 @@ class ColliderSight:
     ) -> None:
         self._world, self._scene, self._places, self._within, self._see = world, scene, places, within, see
         self._poser = ColliderPoser(search)
+        self._voters = CarriedPoints(scene, voting_rows(scene.garment.mesh.vertex_count))
 
     def near(self, motion: Motion, frames: Ints) -> Floats:
         """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
-        points, voters = self._places(own), voting_points(own, self._scene)
+        points, voters = self._places(own), self._voters(own)
         roots = hub_places(self._scene.character.skeleton, own.rotations, own.translations)
         found = self._poser.nearest(self._world, frames / motion.fps, points, voters, self._within)
         return self._see(points, *found, roots)
