@@ -237,8 +237,8 @@ class CarriedPoints:
         matrices = skinning_matrices(world, self._bind)[:, :, :3]
         found = np.empty((len(matrices), 3, self._shares.shape[1]))
         for at in range(0, len(matrices), AT_ONCE):
-            part = matrices[at : at + AT_ONCE].swapaxes(1, 2)
-            np.matmul(part.reshape(*part.shape[:2], -1), self._shares, out=found[at : at + AT_ONCE])
+            rows = matrices[at : at + AT_ONCE].swapaxes(1, 2).reshape(-1, len(self._shares))
+            np.matmul(rows, self._shares, out=found[at : at + AT_ONCE].reshape(len(rows), -1))
         return found.swapaxes(1, 2)
 
 

@@ -18,6 +18,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld
+from ...scene.assets.world import interpolated
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, split_at_cuts
 from ..constants import GRAVITY
@@ -25,6 +26,7 @@ from .air import MovingAir
 from .colliders import CarriedPoints, ColliderPoser, carried_points, voting_rows
 from .surface import Search, boxes
 
+AT_ONCE = 64  # frames in which air is looked for together, to bound memory
 PLACES = 32  # vertices at which the air is averaged
 Places = Callable[[Motion], Floats]
 Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
@@ -41,11 +43,12 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     seconds = np.arange(motion.frame_count) / motion.fps
     found = np.tile(-GRAVITY * UP, (motion.frame_count, 1))
     if world.gravity is not None:
-        found = np.stack([world.between(world.gravity, float(each)) for each in seconds])
+        found = interpolated(world.gravity, seconds, world.fps)
     if world.air and fabric.drag:
         air, places = MovingAir(world.air, world.fps), carried_points(motion, scene, _loose(scene))
-        blown = np.stack([air.velocity(points, float(each)).mean(axis=0) for points, each in zip(places, seconds)])
-        found += fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
+        parts = [slice(at, at + AT_ONCE) for at in range(0, len(seconds), AT_ONCE)]
+        blown = np.concatenate([air.velocities(places[part], seconds[part]).mean(axis=1) for part in parts])
+        found = found + fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
     return found
 
 
