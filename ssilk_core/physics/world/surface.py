@@ -25,6 +25,7 @@ from ...scene.assets import Floats, Ints
 from ...scene.mesh import topology
 
 ON_EDGE = 1e-7  # barycentric coordinate up to which a point is on the edge opposite
+FEW = 8  # times as many triangles as queries, from which on normals are found where they are needed
 TOUCHING = 1e-9  # [m] from the surface, up to which its normal is the direction away from it
 Nearest = Callable[[Floats], tuple[Floats, Ints, Floats]]
 Search = Callable[[Floats, Ints], Nearest]
@@ -174,19 +175,25 @@ class PosedSurface:
     def __init__(self, surface: CollisionSurface, points: Floats, search: Search) -> None:
         self.surface, self.points = surface, np.ascontiguousarray(points)
         self._nearest = search(self.points, np.ascontiguousarray(surface.faces))
+        self._is_new = True  # until it was asked for the first time
 
     @cached_property
     def _normals(self) -> tuple[Floats, Floats, Floats]:
         """Pseudonormals of faces (T, 3), edges (E, 3) and vertices (P, 3)."""
-        surface, corners = self.surface, self.points[self.surface.faces]
+        return self._normals_of(np.arange(len(self.surface.faces)))
+
+    def _normals_of(self, rows: Ints) -> tuple[Floats, Floats, Floats]:
+        """Return the same, but as if some faces (R,) were all that there are; those of others are zero."""
+        surface, corners = self.surface, self.points[self.surface.faces[rows]]
         cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        face = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), np.finfo(float).tiny)
-        edge = _added(surface.edge, face[:, None], surface._edge_count)
+        length = np.sqrt(_dot(cross, cross))[:, None]
+        face, unit = np.zeros(surface.faces.shape), cross / np.maximum(length, np.finfo(float).tiny)
+        face[rows] = unit
+        edge = _added(surface.edge[rows], unit[:, None], surface._edge_count)
         ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
         # Twice the area is the sine at each corner, times the lengths of its sides as the cosine is.
-        angle = np.arctan2(np.linalg.norm(cross, axis=1)[:, None], (ahead * behind).sum(axis=2))
-        vertex = _added(surface.welded, angle[..., None] * face[:, None], len(self.points))
-        return face, edge, vertex
+        angle = np.arctan2(length, (ahead * behind).sum(axis=2))
+        return face, edge, _added(surface.welded[rows], angle[..., None] * unit[:, None], len(self.points))
 
     @cached_property
     def _bounds(self) -> tuple[Floats, Floats]:
@@ -271,10 +278,21 @@ class PosedSurface:
 
     def _at(self, face: Ints, weights: Floats) -> Floats:
         """Return the pseudonormals at points of faces, shape (M, 3)."""
-        faces, edges, vertices = self._normals
-        on_edge, edge, at_vertex, vertex = self.surface.features(face, weights)
-        normal = faces.take(face, axis=0)
-        normal[on_edge], normal[at_vertex] = edges[edge], vertices[vertex]
+        surface = self.surface
+        on_edge, edge, at_vertex, vertex = surface.features(face, weights)
+        if self._is_new and FEW * len(face) < len(
+            surface.faces
+        ):  # of a mesh that moves, few are asked for in a frame
+            edges, vertices = np.zeros(surface._edge_count, dtype=bool), np.zeros(len(self.points), dtype=bool)
+            edges[edge], vertices[vertex] = True, True
+            around = edges[surface.edge].any(axis=1) | vertices[surface.welded].any(axis=1)
+            around[face] = True
+            of_faces, of_edges, of_vertices = self._normals_of(np.flatnonzero(around))
+        else:
+            of_faces, of_edges, of_vertices = self._normals
+        self._is_new = False
+        normal = of_faces.take(face, axis=0)
+        normal[on_edge], normal[at_vertex] = of_edges[edge], of_vertices[vertex]
         return normal
 
 
