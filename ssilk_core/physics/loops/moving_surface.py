@@ -22,6 +22,19 @@ GROUP = 8  # blocks that have a box together
 
 
 @compiled
+def _enclose(points, faces, part, volumes):
+    """Add up six times the volumes that parts (C,) enclose, of which each triangle (T,) belongs to one."""
+    o, volumes[:] = points[faces[0, 0]], 0
+    for face in range(len(faces)):
+        i, j, k = faces[face]
+        ax, ay, az = points[i, 0] - o[0], points[i, 1] - o[1], points[i, 2] - o[2]
+        bx, by, bz = points[j, 0] - o[0], points[j, 1] - o[1], points[j, 2] - o[2]
+        cx, cy, cz = points[k, 0] - o[0], points[k, 1] - o[1], points[k, 2] - o[2]
+        x, y, z = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+        volumes[part[face]] += ax * x + ay * y + az * z
+
+
+@compiled
 def _bound(points, faces, blocks, boxes, groups, whole):
     """Write boxes around blocks (B, size) of triangles (T, 3), groups of `GROUP` of these, and all, (..., 6)."""
     whole[:3], whole[3:], groups[:, :3], groups[:, 3:] = FAR, -FAR, FAR, -FAR
@@ -99,23 +112,25 @@ def _add_normal(points, face, corner, by_angle, normal):
 
 
 @compiled
-def nearest_on_moving(points, faces, blocks, at_edges, at_vertices, on_edge, queries, face, weights, normal, squares,
-                      whole):  # fmt: skip
+def nearest_on_moving(points, faces, part, blocks, at_edges, at_vertices, on_edge, queries, face, weights, normal,
+                      squares, whole, volumes):  # fmt: skip
     """Write the nearest triangles, the weights of their corners there, pseudonormals and squared distances [m2].
 
     Args:
-        points: of the mesh in N frames [m], (N, P, 3); faces: its triangles, (T, 3); blocks: of these, (B, size).
+        points: of the mesh in N frames [m], (N, P, 3); faces: its triangles, (T, 3).
+        part: of each triangle, (T,); blocks: of triangles, (B, size).
         at_edges, at_vertices: for each, its number at the sides and corners of triangles, (T, 3), then the corners
             that have a number, counted through all triangles in the order of the numbers, (3 T,), and where each
             number begins among these.
         on_edge: weight up to which a point is on the edge opposite.
         queries: of each frame [m], shape (N, M, 3).
         face, weights, normal, squares: shapes (N, M), (N, M, 3), (N, M, 3) and (N, M).
-        whole: corners of the boxes around the mesh, shape (N, 6).
+        whole, volumes: corners of the boxes around the mesh, and six times what parts enclose, (N, 6) and (N, C).
     """
     boxes, groups, own = np.empty((len(blocks), 6)), np.empty(((len(blocks) - 1) // GROUP + 1, 6)), np.empty(3)
     for n in range(len(points)):
         _bound(points[n], faces, blocks, boxes, groups, whole[n])
+        _enclose(points[n], faces, part, volumes[n])
         for m in range(queries.shape[1]):
             x, y, z = queries[n, m]
             guess = face[n - 1, m] if n else face[n, max(m - 1, 0)] * (m > 0)

@@ -23,6 +23,7 @@ class Found(NamedTuple):
     normal: Floats
     squares: Floats
     whole: Floats
+    volumes: Floats
 
 
 class MovingSurface:
@@ -35,6 +36,7 @@ class MovingSurface:
     def __init__(self, surface: CollisionSurface, points: Floats) -> None:
         self.surface = surface
         self._faces = np.ascontiguousarray(surface.faces, dtype=np.int32)
+        self._part = np.ascontiguousarray(surface.part, dtype=np.int32)
         self._blocks = compact_blocks(points[surface.faces].mean(axis=1), TRIANGLES)
         self._at_edges, self._at_vertices = (_listed(numbers) for numbers in (surface.edge, surface.welded))
 
@@ -47,7 +49,8 @@ class MovingSurface:
         found = self._nearest(points, queries)
         inside = (low >= found.whole[:, :3]).all(axis=1) & (high <= found.whole[:, 3:]).all(axis=1)
         sides = np.ones((len(points), len(self.surface.closed)))
-        for frame in np.flatnonzero(inside | ~self.surface.closed.all()):
+        inside_out = (found.volumes[:, self.surface.closed] <= 0).any(axis=1)
+        for frame in np.flatnonzero(inside | inside_out | ~self.surface.closed.all()):
             here, voters, wound = points[frame, None], garment(frame)[None], np.ones_like(sides[:1])
             sides[frame] = self.surface.voted(self._signed(here, voters, self._nearest(here, voters), wound))
         return self._signed(points, queries, found, sides)
@@ -58,9 +61,17 @@ class MovingSurface:
         shape = queries.shape[:2]
         found = Found(
             np.empty(shape, np.int32), np.empty(queries.shape), np.empty(queries.shape), np.empty(shape),
-            np.empty((len(points), 6)),
+            np.empty((len(points), 6)), np.empty((len(points), len(self.surface.closed))),
         )  # fmt: skip
-        mesh = np.ascontiguousarray(points), self._faces, self._blocks, self._at_edges, self._at_vertices, ON_EDGE
+        mesh = (
+            np.ascontiguousarray(points),
+            self._faces,
+            self._part,
+            self._blocks,
+            self._at_edges,
+            self._at_vertices,
+            ON_EDGE,
+        )
         nearest_on_moving(*mesh, np.ascontiguousarray(queries), *found)
         return found
 

@@ -196,6 +196,12 @@ class PosedSurface:
         return face, edge, _added(surface.welded[rows], angle[..., None] * unit[:, None], len(self.points))
 
     @cached_property
+    def _is_inside_out(self) -> bool:
+        """Whether some closed part encloses no volume, or a negative one."""
+        volumes = np.bincount(self.surface.part, _volumes(self.points[self.surface.faces]))
+        return bool((volumes[self.surface.closed] <= 0).any())
+
+    @cached_property
     def _bounds(self) -> tuple[Floats, Floats]:
         """The corners of the box around each part, shapes (C, 3)."""
         corners = self.points[self.surface.faces[self.surface._by_part].reshape(-1)]
@@ -255,9 +261,12 @@ class PosedSurface:
         """Return whether garments in boxes of corners (..., 3) are surely outside of each part as it is wound, (...).
 
         None is inside a closed part that reaches beyond the part's box. None is below an open part that is above the
-        highest of its points, if the whole part faces up, along its mean normal.
+        highest of its points, if the whole part faces up, along its mean normal. A closed part that this pose turns
+        inside out, as a scale that becomes negative does, needs votes.
         """
         surface = self.surface
+        if self._is_inside_out:
+            return np.zeros(low.shape[:-1], dtype=bool)
         if surface.closed.all() and not self._may_hold(low, high, *self._whole).any():
             return np.ones(low.shape[:-1], dtype=bool)
         clear = ~self._may_hold(low[..., None, :], high[..., None, :], *self._bounds)

@@ -48,6 +48,13 @@ def around(rng) -> dict[str, Collider]:
         "ceiling": Collider("/ceiling", faces, ground[None] + [0, 2.5, 0], np.eye(4)[None], EVERY),
         "ring": Collider("/ring", RING.faces, RING.vertices[None], turning(rng), EVERY),
         "waves": Collider("/waves", faces, waves, np.eye(4)[None], EVERY),
+        "mirrored": Collider(
+            "/mirrored",
+            BALL.faces,
+            bent * [-1, 1, 1] ** (np.arange(FRAMES) > 2)[:, None, None],
+            np.eye(4)[None],
+            EVERY,
+        ),
         "ball": Collider("/ball", BALL.faces, bent, np.eye(4)[None], comes),
         "room": Collider("/room", ROOM.faces, ROOM.vertices[None], np.eye(4)[None], EVERY),
     }
@@ -71,8 +78,8 @@ def expected(collider: Collider, frame: int, queries: np.ndarray) -> tuple[np.nd
 
 @pytest.mark.parametrize(
     "name, compiled",
-    [(name, False) for name in ("ground", "ceiling", "ring", "room", "waves", "ball", "all")]
-    + [(name, True) for name in ("waves", "ball", "all")],
+    [(name, False) for name in ("ground", "ceiling", "ring", "room", "waves", "mirrored", "ball", "all")]
+    + [(name, True) for name in ("waves", "mirrored", "ball", "all")],
 )
 def test_frames_at_once_have_the_distances_of_all_triangles_in_each(name: str, compiled: bool, monkeypatch) -> None:
     if compiled and not loops.installed():
