@@ -60,10 +60,10 @@ def spread_rows(points: Floats, count: int) -> Ints:
     """Return which of points (P, 3) `spread_vertices` chooses."""
     count = min(count, len(points))
     chosen: list[int] = []
-    nearest = np.full(len(points), np.inf)
+    nearest, columns = np.full(len(points), np.inf), np.ascontiguousarray(points.T)
     while len(chosen) < count:
         chosen.append(int(nearest.argmax()) if chosen else int(points[:, 1].argmin()))
-        x, y, z = (points - points[chosen[-1]]).T
+        x, y, z = columns - columns[:, chosen[-1:]]
         nearest = np.minimum(nearest, x * x + y * y + z * z)
     return np.array(chosen, dtype=np.int64)
 

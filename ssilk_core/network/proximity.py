@@ -49,18 +49,18 @@ def proximity_reach(scene: Scene) -> float:
 
 
 def proximity(points: Floats, distance: Floats, normal: Floats, origin: Floats, reach: float) -> Floats:
-    """Return the proximity of one frame (M, 5), as `Motion` holds it.
+    """Return the proximity (..., M, 5) of frames, as `Motion` holds it.
 
     Args:
-        points: at which colliders are seen [m], shape (M, 3).
-        distance: to the nearest one [m], shape (M,); infinite where none was found.
-        normal: directions away from it, shape (M, 3); zero where none was found.
-        origin: position of the root [m], shape (3,).
+        points: at which colliders are seen [m], shape (..., M, 3).
+        distance: to the nearest one [m], shape (..., M); infinite where none was found.
+        normal: directions away from it, shape (..., M, 3); zero where none was found.
+        origin: position of the root [m], shape (..., 3).
         reach: of `proximity_reach`.
     """
     distance = np.minimum(distance, reach)
-    height = (normal * (points - origin)).sum(axis=1) - distance
-    return np.concatenate([normal, distance[:, None] / reach, height[:, None]], axis=1)
+    height = (normal * (points - origin[..., None, :])).sum(axis=-1) - distance
+    return np.concatenate([normal, distance[..., None] / reach, height[..., None]], axis=-1)
 
 
 def proximity_vectors(values: Floats) -> Floats:

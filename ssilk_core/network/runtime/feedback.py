@@ -20,6 +20,7 @@ from .decoder import NumpyDecoder
 from .networks import LayerBuffers, as_float32
 from .two_frames import COLUMNS, PointRig, TwoFrames
 
+ZERO = np.float32(0)
 SATURATION = np.float32(UNIT * LIMIT)  # [m]
 
 
@@ -146,10 +147,12 @@ class SeenCloth:
             away: of the flight from where the points are carried, changed in place.
         """
         normals, offsets, frame = self.course.normals, self.course.offsets, self.frame + 1
-        count = offsets.shape[1]
-        was = offsets[frame] - (normals[frame] * now[:, :count]).sum(axis=0)
-        deeper = offsets[frame + 1] - (normals[frame + 1] * flight[:, :count]).sum(axis=0) - was.clip(0)
-        away[:, :count] += normals[frame + 1] * deeper.clip(0)
+        count, away_from = offsets.shape[1], normals[frame + 1]
+        was = offsets[frame] - np.add.reduce(normals[frame] * now[:, :count])
+        deeper = offsets[frame + 1] - np.add.reduce(away_from * flight[:, :count])
+        np.subtract(deeper, np.maximum(was, ZERO, was), deeper)
+        if deeper.item(deeper.argmax()) > 0:
+            away[:, :count] += away_from * np.maximum(deeper, ZERO, deeper)
 
     def _points(self, outputs: NDArray, first: int) -> NDArray:
         """Return points of outputs (2, outputs) in two frames of the course, counted with the two before it."""

@@ -55,16 +55,22 @@ def as_float32(values: NDArray) -> NDArray:
 
 def evaluate(network: list[Layer], inputs: NDArray) -> NDArray:
     """Return a perceptron's outputs (outputs, N) for inputs (inputs, N)."""
-    first = network[0]
-    return evaluate_tail(network[1:], first.weights @ inputs + first.bias)
+    sums: NDArray = network[0].weights @ inputs
+    sums += network[0].bias
+    return evaluate_tail(network[1:], sums)
 
 
 def evaluate_tail(network: list[Layer], sums: NDArray) -> NDArray:
-    """Return the outputs (outputs, N) of the layers after the first, from the first layer's sums (hidden, N)."""
+    """Return the outputs (outputs, N) of the layers after the first, from the first layer's sums (hidden, N).
+
+    The sums are overwritten: writing to fresh memory takes a third of the time of a product.
+    """
     for layer in network:
         with np.errstate(over="ignore"):  # an activation of minus infinity is zero
-            active = sums / (np.exp(sums) + np.float32(1))
-        sums = layer.weights @ active
+            scale = np.exp(sums)
+        scale += np.float32(1)
+        sums /= scale
+        sums = layer.weights @ sums
         sums += layer.bias
     return sums
 

@@ -21,7 +21,7 @@ from .skinning import skin_garment, vertex_block
 from .span import DecodedFrames, RolledSpan, roll_span
 
 BLOCK = 64  # frames computed together: a product of matrices takes a third of the time of 64 with vectors
-COMPILED_FROM = 8192  # frames of a motion that gain more by compiled loops than it takes to load these, a second
+COMPILED_FROM = 4096  # frames of a motion that gain more by compiled loops than it takes to load these, half a second
 
 
 @dataclass(frozen=True, eq=False)

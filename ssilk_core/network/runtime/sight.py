@@ -14,8 +14,7 @@ from ...scene.assets import Floats, Motion, ShotWorld
 from ..proximity import proximity, proximity_reach, proximity_vertices
 from .character import character_frames
 from .garment import NumpyGarment
-from .networks import as_float32, evaluate
-from .two_frames import COLUMNS, PointRig, TwoFrames
+from .skinning import picked, skin_garment
 
 AT_ONCE = 256  # frames, to bound memory
 
@@ -24,9 +23,8 @@ class RestingPoints:
     """The points at which a garment sees colliders, where they would rest without any."""
 
     def __init__(self, garment: NumpyGarment) -> None:
-        self._garment, file = garment, garment.file
-        rows = proximity_vertices(file.scene, file.config)
-        self._rig = PointRig(file.scene, file.parameters, garment.decoder, rows)
+        self._garment = garment
+        self._tile = picked(garment.tiles, proximity_vertices(garment.file.scene, garment.file.config))
 
     def __call__(self, motion: Motion) -> Floats:
         """Return the points in each frame of a motion [m], shape (F, M, 3)."""
@@ -35,18 +33,12 @@ class RestingPoints:
         return np.concatenate(parts)
 
     def _of(self, motion: Motion) -> Floats:
-        garment, rig, count = self._garment, self._rig, motion.frame_count
-        file, skeleton = garment.file, garment.skeleton
-        frames = character_frames(motion, skeleton, file.joints, kind=file.config.descriptors, seen=garment.proximity)
-        outputs = evaluate(garment.decoder.layers, garment.quasi_static(frames.static).T).T
-        own = frames.matrices[:, :, COLUMNS].transpose(1, 2, 3, 0)
-        anchors, affine = as_float32(own[..., rig.anchors]), as_float32(own @ rig.of_character)
-        pairs, found = TwoFrames(rig), []
-        for at in range(0, count, 2):
-            two = [at, min(at + 1, count - 1)]
-            points = pairs.points(as_float32(outputs[two]), anchors[:, :, two], affine[:, :, two])
-            found.append(points.transpose(1, 2, 0).copy())
-        return np.concatenate(found)[:count] + frames.origins[:, None]
+        garment, file = self._garment, self._garment.file
+        kind, seen = file.config.descriptors, garment.proximity
+        frames = character_frames(motion, garment.skeleton, file.joints, kind=kind, seen=seen)
+        activations, transforms = garment.decoder.decode(garment.quasi_static(frames.static))
+        matrices = garment.kinematics.matrices(transforms, frames.matrices)
+        return skin_garment([self._tile], activations, matrices, frames.origins)
 
 
 def collider_sight(garment: NumpyGarment, world: ShotWorld, search: Search = boxes) -> ColliderSight:

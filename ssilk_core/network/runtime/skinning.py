@@ -89,6 +89,19 @@ def tiles_of(shapes: NDArray, indices: NDArray, weights: NDArray) -> list[Tile]:
     ]
 
 
+def picked(garment: list[Tile], rows: Ints) -> Tile:
+    """Return some vertices (M,) of a garment as one tile, in their order, of which `vertices` counts them."""
+    number, column = np.divmod(rows, TILE)
+    joints = np.unique(np.concatenate([garment[tile].joints for tile in np.unique(number)]))
+    shapes = np.empty((len(garment[0].shapes), 3, len(rows)), dtype=np.float32)
+    weights = np.zeros((len(joints), len(rows)), dtype=np.float32)
+    for tile in np.unique(number):
+        here, whole = number == tile, garment[tile]
+        shapes[..., here] = whole.shapes.reshape(len(shapes), 3, -1)[..., column[here]]
+        weights[np.ix_(np.searchsorted(joints, whole.joints), here)] = whole.weights[:, column[here]]
+    return Tile(slice(0, len(rows)), shapes.reshape(len(shapes), -1), joints, weights)
+
+
 def trained_weights(scene: Scene, parameters: Parameters) -> NDArray:
     """Return the weights of each influence (V, I): a softmax over each vertex's support.
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...scene.assets import Air, Floats
-from ...scene.assets.world import frame_at, interpolated
+from ...scene.assets.world import interpolated
 
 MODES = 48
 SMALLEST = 1 / 16  # of the largest eddy
@@ -42,20 +42,26 @@ class MovingAir:
 
     def velocity(self, points: Floats, seconds: float) -> Floats:
         """Return the velocity of the air [m/s] at points (V, 3) in the world [m], shape (V, 3)."""
-        wind, gusts = (interpolated(values, seconds, self._fps) for values in (self._air.velocity, self._air.gusts))
-        found = np.broadcast_to(wind, points.shape)
-        if not gusts > 0:
-            return found
-        turned = self._turning * (self._air.begins + seconds)
-        phase = (points - self._carried(seconds)) @ self._waves.T + turned + self._phase
-        return found + gusts * (np.cos(phase) @ self._across)
+        return self.velocities(points[None], np.array([seconds]))[0]
 
-    def _carried(self, seconds: float) -> Floats:
-        """Return how far the wind has carried the air since time zero [m], shape (3,).
+    def velocities(self, points: Floats, seconds: Floats) -> Floats:
+        """Return the velocity of the air [m/s] at points (N, V, 3) at times (N,), shape (N, V, 3)."""
+        wind, gusts = (interpolated(values, seconds, self._fps) for values in (self._air.velocity, self._air.gusts))
+        found = np.broadcast_to(wind[:, None], points.shape)
+        if not (gusts > 0).any():
+            return found
+        turned = self._turning * (self._air.begins + seconds)[:, None]
+        phase = (points - self._carried(seconds)[:, None]) @ self._waves.T + (turned + self._phase)[:, None]
+        return found + gusts[:, None, None] * (np.cos(phase) @ self._across)
+
+    def _carried(self, seconds: Floats) -> Floats:
+        """Return how far the wind has carried the air since time zero [m], shape (N, 3).
 
         Before the first frame it blew as it does then.
         """
         velocity, now = self._air.velocity, interpolated(self._air.velocity, seconds, self._fps)
-        low, part = frame_at(seconds, self._fps, len(velocity))
-        inside = self._travelled[low] + 0.5 * part / self._fps * (velocity[low] + now)
-        return self._air.begins * velocity[0] + inside + (seconds - (low + part) / self._fps) * now
+        at = (seconds * self._fps).clip(0.0, len(velocity) - 1.0)
+        low = at.astype(int)
+        since = ((at - low) / self._fps)[:, None]
+        inside = self._travelled[low] + 0.5 * since * (velocity[low] + now)
+        return self._air.begins * velocity[0] + inside + (seconds - at / self._fps)[:, None] * now

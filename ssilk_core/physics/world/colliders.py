@@ -3,26 +3,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...scene.assets import Collider, Floats, Ints, Motion, Scene, ShotWorld, SkinWeights
+from ...scene.assets import Collider, Floats, Ints, Motion, Scene, ShotWorld
 from ...scene.assets.world import frame_at
 from ...scene.kinematics import (
     matrix_from_quaternion,
     motion_transforms,
     quaternion_from_matrix,
     rigid,
-    skin_points,
     skinning_matrices,
     slerp,
 )
-from .surface import CollisionSurface, PosedSurface, Search, SurfaceDistance, boxes
+from ..loops import installed
+from .moving import MovingSurface
+from .surface import CollisionSurface, Garment, PosedSurface, Search, SurfaceDistance, boxes
 
 AT_ONCE = 256  # frames that are skinned together, to bound memory
+TOGETHER = 64  # frames in which a collider is searched together, likewise
+COMPILED_FROM = (
+    2**20
+)  # triangles of a mesh that moves, over all frames, that gain more by loops than these take to load
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
+Meet = Callable[[Floats, Garment, Floats, Floats], SurfaceDistance]  # as `PosedSurface.met`
 
 
 class PosedCollider:
@@ -79,7 +88,7 @@ class PosedCollider:
 
 @dataclass(frozen=True, eq=False)
 class Nearby:
-    """What lies up to a distance `within` [m] from a box of corners `low` and `high` (3,)."""
+    """What lies up to a distance `within` [m] from boxes of corners `low` and `high` (..., 3)."""
 
     low: Floats
     high: Floats
@@ -87,12 +96,13 @@ class Nearby:
 
     @classmethod
     def of(cls, points: Floats, within: float) -> Nearby:
-        """Return that of the box around points (P, 3)."""
-        return cls(points.min(axis=0), points.max(axis=0), within)
+        """Return that of the boxes around points (..., P, 3)."""
+        return cls(points.min(axis=-2), points.max(axis=-2), within)
 
-    def gap(self, place: Floats) -> float:
-        """Return how far a place (3,) is outside [m]; negative or zero inside."""
-        return float(np.linalg.norm(place - place.clip(self.low, self.high))) - self.within
+    def gap(self, place: Floats) -> Floats:
+        """Return how far places (..., 3) are outside [m], shape (...); negative or zero inside."""
+        away: Floats = np.linalg.norm(place - place.clip(self.low, self.high), axis=-1)
+        return away - self.within
 
 
 class ColliderPoser:
@@ -117,54 +127,124 @@ class ColliderPoser:
             carried: vertices of the garment as the body carries it, relative to the root (V, 3).
             near: leaves out what is further away; by default nothing is.
         """
-        firsts = accumulate((each.points.shape[1] for each in world.colliders), initial=0)
-        own = [
-            self._posed(each, first, world, seconds, root, carried, near)
-            for each, first in zip(world.colliders, firsts)
-        ]
-        return tuple(each for each in own if each)
+        firsts, found = accumulate((each.points.shape[1] for each in world.colliders), initial=0), []
+        for collider, first in zip(world.colliders, firsts):
+            if not collider.is_there(world.fps, seconds):
+                continue
+            place = placed_at(collider.placements, world, seconds)
+            turn, place = place[:3, :3], place[:3, 3] - root
+            if near and self._is_far(collider, turn, place, near):
+                continue
+            surface = self._surface(collider, world, seconds)
+            found.append(PosedCollider(collider.name, first, surface, turn, place, carried))
+        return tuple(found)
 
-    def _posed(
-        self,
-        collider: Collider,
-        first: int,
-        world: ShotWorld,
-        seconds: float,
-        root: Floats,
-        carried: Floats,
-        near: Nearby | None,
-    ) -> PosedCollider | None:
-        """Return a collider at a time; None where cloth does not meet it then."""
-        if not collider.is_there(world.fps, seconds):
-            return None
+    def nearest(
+        self, world: ShotWorld, seconds: Floats, queries: Floats, carried: Floats, within: float
+    ) -> tuple[Floats, Floats]:
+        """Return distances to the nearest of all colliders in N frames [m], (N, M), and their gradients (N, M, 3).
+
+        Frames of a mesh that keeps its shape are searched together, which takes hardly longer than one of them did.
+
+        Args:
+            seconds: time of each frame (N,).
+            queries, carried: points, and vertices of the garment as the body carries it, in the world [m], shapes
+                (N, M, 3) and (N, V, 3).
+            within: distance up to which colliders are looked for [m]; beyond, distances are infinite and gradients 0.
+        """
+        distance, normal = np.full(queries.shape[:2], np.inf), np.zeros(queries.shape)
+        near, around = Nearby.of(queries, within), Nearby.of(carried, 0.0)
+        middle, half = (around.low + around.high)[:, None] / 2, (around.high - around.low)[:, None] / 2
+        for collider in world.colliders:
+            there = [collider.is_there(world.fps, each) for each in seconds.tolist()]
+            placed = np.stack([placed_at(collider.placements, world, each) for each in seconds.tolist()])
+            turn, place = placed[:, :3, :3], placed[:, None, :3, 3]
+            frames = np.flatnonzero(there & ~self._is_far(collider, turn, place[:, 0], near))
+            for own, meet in self._together(collider, world, seconds, frames):
+                back, here = turn[own], place[own]
+
+                def garment(number: int, own: Ints = own, back: Floats = back, here: Floats = here) -> Floats:
+                    return (carried[own[number]] - here[number]) @ back[number]
+
+                centre, reach = ((middle[own] - here) @ back)[:, 0], (half[own] @ np.abs(back))[:, 0]
+                found = meet((queries[own] - here) @ back, garment, centre - reach, centre + reach)
+                reached, known = found.distance.reshape(len(own), -1), distance[own]
+                closer = (reached <= within) & (reached < known)
+                distance[own] = np.where(closer, reached, known)
+                gradient = found.normal.reshape(*reached.shape, 3) @ back.swapaxes(1, 2)
+                normal[own] = np.where(closer[..., None], gradient, normal[own])
+        return distance, normal
+
+    def _together(
+        self, collider: Collider, world: ShotWorld, seconds: Floats, frames: Ints
+    ) -> Iterator[tuple[Ints, Meet]]:
+        """Yield frames that are searched together, and what finds the distances in these to a collider."""
+        parts = [frames[at : at + TOGETHER] for at in range(0, len(frames), TOGETHER)]
+        if len(collider.points) == 1:
+            for part in parts:
+                yield part, self._surface(collider, world, 0.0).met
+        elif len(frames) * len(collider.faces) >= COMPILED_FROM and installed():
+            moving = MovingSurface(self._shape(collider), collider.points[0])
+            for part in parts:
+                points = [world.between(collider.points, each) for each in seconds[part].tolist()]
+                yield part, partial(moving.met, np.stack(points))
+        else:
+            for frame in frames:
+                yield frame[None], self._surface(collider, world, float(seconds[frame])).met
+
+    def _is_far(self, collider: Collider, turn: Floats, place: Floats, near: Nearby) -> NDArray[np.bool_]:
+        """Return whether cloth does not meet a collider where turns (..., 3, 3) and places (..., 3) put it."""
         key = id(collider)
-        place = placed_at(collider.placements, world, seconds)
-        if near:
-            if key not in self._balls:
-                low, high = collider.points.min(axis=(0, 1)), collider.points.max(axis=(0, 1))
-                self._balls[key] = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
-            centre, radius = self._balls[key]
-            if near.gap(place[:3, :3] @ centre + place[:3, 3] - root) > radius:
-                return None
+        if key not in self._balls:
+            low, high = collider.points.min(axis=(0, 1)), collider.points.max(axis=(0, 1))
+            self._balls[key] = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
+        centre, radius = self._balls[key]
+        return np.asarray(near.gap(turn @ centre + place) > radius)
+
+    def _surface(self, collider: Collider, world: ShotWorld, seconds: float) -> PosedSurface:
+        """Return a collider's surface at a time, in its own space."""
+        key = id(collider)
+        if len(collider.points) > 1:
+            return self._shape(collider).at(world.between(collider.points, seconds), self._search)
+        if key not in self._still:
+            self._still[key] = self._shape(collider).at(collider.points[0], self._search)
+        return self._still[key]
+
+    def _shape(self, collider: Collider) -> CollisionSurface:
+        key = id(collider)
         if key not in self._surfaces:
             self._surfaces[key] = CollisionSurface(collider.path, collider.points[0], collider.faces)
-        if len(collider.points) > 1:
-            surface = self._surfaces[key].at(world.between(collider.points, seconds), self._search)
-        else:
-            if key not in self._still:
-                self._still[key] = self._surfaces[key].at(collider.points[0], self._search)
-            surface = self._still[key]
-        return PosedCollider(collider.name, first, surface, place[:3, :3], place[:3, 3] - root, carried)
+        return self._surfaces[key]
+
+
+class CarriedPoints:
+    """Some vertices (P,) of a garment under linear blend skinning."""
+
+    def __init__(self, scene: Scene, rows: Ints) -> None:
+        skin, skeleton = scene.lbs_skin, scene.character.skeleton
+        self._joints, place = np.unique(skin.indices[rows], return_inverse=True)
+        self._parents, self._bind = skeleton.parents, skeleton.bind_transforms[self._joints]
+        # Weights times points, homogeneous, of each joint: one product then blends all frames.
+        points = np.concatenate([scene.garment.mesh.points[rows], np.ones((len(rows), 1))], axis=1)
+        shares, own = np.zeros((len(self._joints), len(rows), 4)), np.arange(len(rows))
+        for joint, weight in zip(place.reshape(len(rows), -1).T, skin.weights[rows].T):
+            shares[joint, own] += weight[:, None] * points
+        self._shares = shares.swapaxes(1, 2).reshape(-1, len(rows))
+
+    def __call__(self, motion: Motion) -> Floats:
+        """Return the vertices in each frame of a motion, in the world [m], shape (F, P, 3)."""
+        world = motion_transforms(motion, self._parents)[:, self._joints]
+        matrices = skinning_matrices(world, self._bind)[:, :, :3]
+        found = np.empty((len(matrices), 3, self._shares.shape[1]))
+        for at in range(0, len(matrices), AT_ONCE):
+            rows = matrices[at : at + AT_ONCE].swapaxes(1, 2).reshape(-1, len(self._shares))
+            np.matmul(rows, self._shares, out=found[at : at + AT_ONCE].reshape(len(rows), -1))
+        return found.swapaxes(1, 2)
 
 
 def carried_points(motion: Motion, scene: Scene, rows: Ints) -> Floats:
     """Return some vertices (P,) of a garment under linear blend skinning in the world [m], shape (F, P, 3)."""
-    skin, skeleton = scene.lbs_skin, scene.character.skeleton
-    matrices = skinning_matrices(motion_transforms(motion, skeleton.parents), skeleton.bind_transforms)
-    own = SkinWeights(skin.path, skin.indices[rows], skin.weights[rows])
-    points = scene.garment.mesh.points[rows]
-    parts = (matrices[at : at + AT_ONCE] for at in range(0, len(matrices), AT_ONCE))
-    return np.concatenate([skin_points(points, own, part) for part in parts])
+    return CarriedPoints(scene, rows)(motion)
 
 
 def voting_points(motion: Motion, scene: Scene) -> Floats:

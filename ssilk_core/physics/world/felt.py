@@ -18,13 +18,15 @@ from collections.abc import Callable
 import numpy as np
 
 from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld
+from ...scene.assets.world import interpolated
 from ...scene.fabrics import Fabric
 from ...scene.kinematics import hub_places, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
-from .colliders import ColliderPoser, Nearby, carried_points, voting_points
+from .colliders import CarriedPoints, ColliderPoser, carried_points, voting_rows
 from .surface import Search, boxes
 
+AT_ONCE = 64  # frames in which air is looked for together, to bound memory
 PLACES = 32  # vertices at which the air is averaged
 Places = Callable[[Motion], Floats]
 Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
@@ -41,11 +43,12 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     seconds = np.arange(motion.frame_count) / motion.fps
     found = np.tile(-GRAVITY * UP, (motion.frame_count, 1))
     if world.gravity is not None:
-        found = np.stack([world.between(world.gravity, float(each)) for each in seconds])
+        found = interpolated(world.gravity, seconds, world.fps)
     if world.air and fabric.drag:
         air, places = MovingAir(world.air, world.fps), carried_points(motion, scene, _loose(scene))
-        blown = np.stack([air.velocity(points, float(each)).mean(axis=0) for points, each in zip(places, seconds)])
-        found += fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
+        parts = [slice(at, at + AT_ONCE) for at in range(0, len(seconds), AT_ONCE)]
+        blown = np.concatenate([air.velocities(places[part], seconds[part]).mean(axis=1) for part in parts])
+        found = found + fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
     return found
 
 
@@ -56,9 +59,9 @@ class ColliderSight:
         world: its time runs from the first frame of motions.
         places: takes a motion, and returns the points from which colliders are seen in its frames [m], (F, M, 3).
         within: distance up to which they count [m].
-        see: takes the points of a frame (M, 3), distances (M,), directions away from what is nearest (M, 3) and the
-            position of the root (3,), and returns what is seen (M, 5); where nothing is near distances are infinite
-            and directions zero.
+        see: takes the points of frames (N, M, 3), distances (N, M), directions away from what is nearest (N, M, 3)
+            and positions of the root (N, 3), and returns what is seen (N, M, 5); where nothing is near distances are
+            infinite and directions zero.
         search: finds nearest points on triangles.
     """
 
@@ -67,21 +70,15 @@ class ColliderSight:
     ) -> None:
         self._world, self._scene, self._places, self._within, self._see = world, scene, places, within, see
         self._poser = ColliderPoser(search)
+        self._voters = CarriedPoints(scene, voting_rows(scene.garment.mesh.vertex_count))
 
     def near(self, motion: Motion, frames: Ints) -> Floats:
         """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
-        points, voters = self._places(own), voting_points(own, self._scene)
-        roots, found = hub_places(self._scene.character.skeleton, own.rotations, own.translations), []
-        for frame, here, votes, root in zip(frames.tolist(), points, voters, roots):
-            distance, normal = np.full(len(here), np.inf), np.zeros((len(here), 3))
-            close = Nearby.of(here, self._within)
-            for collider in self._poser.at(self._world, frame / motion.fps, np.zeros(3), votes, close):
-                near, met = collider.near(here, self._within)
-                closer = met.distance < distance[near]
-                distance[near[closer]], normal[near[closer]] = met.distance[closer], met.normal[closer]
-            found.append(self._see(here, distance, normal, root))
-        return np.stack(found)
+        points, voters = self._places(own), self._voters(own)
+        roots = hub_places(self._scene.character.skeleton, own.rotations, own.translations)
+        found = self._poser.nearest(self._world, frames / motion.fps, points, voters, self._within)
+        return self._see(points, *found, roots)
 
 
 def _loose(scene: Scene) -> Ints:

@@ -85,10 +85,13 @@ class PosedWorld:
         """
         vertices, shares, frames = (each.cpu().numpy().T for each in (corners, weights.double(), frame))
         found = np.full(vertices.shape, np.nan)
+        order = np.lexsort((vertices[:, 0], frames))  # those of a frame, and of a collider in it, are neighbours
+        ends = np.searchsorted(frames[order], np.arange(len(self.colliders) + 1))
         for number in np.unique(frames):
+            own = order[ends[number] : ends[number + 1]]
             for collider in self.colliders[number]:
-                inside = (vertices[:, 0] >= collider.first) & (vertices[:, 0] < collider.first + collider.count)
-                rows = np.flatnonzero((frames == number) & inside)
+                edges = np.searchsorted(vertices[own, 0], [collider.first, collider.first + collider.count])
+                rows = own[slice(*edges)]
                 found[rows] = collider.on_surface(vertices[rows] - collider.first, shares[rows])
         return torch.as_tensor(found.T.copy(), dtype=weights.dtype, device=weights.device)
 

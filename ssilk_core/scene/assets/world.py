@@ -129,8 +129,13 @@ class ShotWorld:
         return interpolated(values, seconds, self.fps)
 
 
-def interpolated(values: np.ndarray, seconds: float, fps: float) -> np.ndarray:
-    """Return values (F or 1, ...) of frames at a time, linear between frames and constant beyond them."""
+def interpolated(values: np.ndarray, seconds: float | Floats, fps: float) -> np.ndarray:
+    """Return values (F or 1, ...) of frames at a time, or at times (N,): linear in between, constant beyond."""
+    if isinstance(seconds, np.ndarray):
+        at = (seconds * fps).clip(0.0, len(values) - 1.0)
+        lows = at.astype(int)
+        shares = (at - lows).reshape(-1, *[1] * (values.ndim - 1))
+        return (1 - shares) * values[lows] + shares * values[np.minimum(lows + 1, len(values) - 1)]
     low, part = frame_at(seconds, fps, len(values))
     return values[low] if part == 0 else (1 - part) * values[low] + part * values[low + 1]
 

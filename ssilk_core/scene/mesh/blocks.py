@@ -19,7 +19,7 @@ def compact_blocks(points: Floats, size: int) -> Ints:
     while parts:
         part = parts.pop()
         if len(part) <= size:
-            blocks.append(np.pad(part, (0, size - len(part)), mode="edge"))
+            blocks.append(np.append(part, np.repeat(part[-1:], size - len(part))) if len(part) < size else part)
             continue
         widest = np.ptp(points[part], axis=0).argmax()
         part = part[np.argsort(points[part, widest], kind="stable")]
