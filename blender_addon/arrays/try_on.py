@@ -49,9 +49,7 @@ def member_points(base: Character, other: Character) -> list[np.ndarray]:
     if told:
         todo = MEMBERS
         if len(told) == 1 and missing and not _moves_bodies(base, [own.index(name) for name in missing]):
-            todo = (
-                f"They move no body: if they are proxies of an imported garment, Adopt Rig recognises them. {MEMBERS}"
-            )
+            todo = f"They move no body: {ADOPTED}. {MEMBERS}"
         raise SetupError(f"'{other.path}' is no member of the family: {'; '.join(told)}. {todo}")
     placed = _placed(np.concatenate(matched), base.merged_body().mesh.points)
     return np.split(placed, np.cumsum([len(points) for points in matched])[:-1])

@@ -45,7 +45,7 @@ class ShownBeneath:
         from ssilk_usd.opening.garment_api import GarmentRecord
         from ssilk_usd.writing.files import write_cache
 
-        for uid, name in self._inner:
+        for number, (uid, name) in enumerate(self._inner):
             points: list[np.ndarray] = []
             yield from sample_vertices(found_again(uid, name), self._frames, points)
             garment = found_again(uid, name)
@@ -55,6 +55,6 @@ class ShownBeneath:
             mesh = read_mesh(garment, garment.data, file.scene.garment.mesh.path, rest_points(garment))
             made = GarmentRecord(model_hash=sha256(model), parameters={"thickness": file.fabric.thickness})
             folder.mkdir(exist_ok=True)
-            path = folder / f"{bpy.path.clean_name(name)}.usdc"
+            path = folder / f"{number}_{bpy.path.clean_name(name)}.usdc"  # clean names may be the same
             write_cache(path, mesh, points, scene_rate(), self._frames.start, made)
             self.files[name] = path

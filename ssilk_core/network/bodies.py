@@ -88,8 +88,13 @@ class SeenBodies:
         if found != (skeleton.joint_count, vertices, proxies):
             wanted = f"{skeleton.joint_count} joints, {vertices} vertices and {proxies} proxies are needed"
             fail("body family", f"{found[0]} joints, {found[1]} vertices and {found[2]} proxies", wanted)
-        if name := misfit(self.columns, parameters):
-            fail("body family", f"weights '{name}' do not fit the network", "one row for each unit is needed")
+        layers = hidden_layers(parameters)
+        first = {layer for layer in layers if layer.endswith(".0")}
+        for name in sorted(first - self.columns.keys()):
+            fail("body family", f"no weights '{name}'", "each network sees bodies", "train again")
+        for name, values in self.columns.items():
+            if name not in layers or len(parameters[f"{name}.weight"]) != values.shape[1]:
+                fail("body family", f"weights '{name}' do not fit the network", "one row for each unit is needed")
 
     def parameters(self, parameters: Mapping[str, Floats], coordinates: Floats) -> dict[str, Floats]:
         """Return the weights and biases that differ on a body at coordinates (K,), by name."""
@@ -108,15 +113,6 @@ class SeenBodies:
     def stored(self) -> SeenBodies:
         """Return this as files hold it."""
         return replace(self, family=self.family.stored())
-
-
-def misfit(columns: Columns, parameters: Mapping[str, Floats]) -> str | None:
-    """Return the first layer whose weights of coordinates do not fit its outputs; None where all fit."""
-    for layer, values in columns.items():
-        weight = parameters.get(f"{layer}.weight")
-        if weight is None or len(weight) != values.shape[1]:
-            return layer
-    return None
 
 
 def hidden_layers(parameters: Mapping[str, Floats]) -> list[str]:

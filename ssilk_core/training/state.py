@@ -148,6 +148,14 @@ def restore(path: Path, stepper: Stepper, tensors: Tensors, rank: int = 0) -> No
     Raises:
         SsilkError: the tensors do not fit.
     """
+    scaled = (".parametrizations.weight." in name for name in stepper.model.state_dict())
+    if any(scaled) and not any(".parametrizations.weight." in name for name in tensors):
+        fail(
+            str(path),
+            "a training of an earlier version, whose networks saw bodies in their first layers alone",
+            "it cannot be resumed",
+            "train anew with --start-from its model, without --resume",
+        )
     with _name_damage(path):
         stepper.sampler.restore(_group(tensors, f"{SAMPLER_PREFIX}{rank}."))
         restore_learned(stepper, tensors)

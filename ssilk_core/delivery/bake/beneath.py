@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from .opened import open_shot, provenance_of
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot
+    from ssilk_usd.shots.read import ShotPart
 
     from ...physics.collision.inner_cloth import InnerSurface
 
@@ -142,8 +143,23 @@ def _files_said(said: Mapping[str, Any], path: Path) -> dict[str, Path]:
 
 def left_out(over: Mapping[str, str], beneath: Iterable[Path]) -> list[str]:
     """Return which models, whose SHA-256 are by name, are not those of files of garments beneath."""
-    there = {provenance_of(path).get("model_sha256") for path in beneath}
+    there = {_model_said(path) for path in beneath}
     return [name for name, digest in over.items() if digest not in there]
+
+
+def _model_said(path: Path) -> str | None:
+    """Return the SHA-256 of the model that a file's garment is played by; None where it says none."""
+    if (said := provenance_of(path).get("model_sha256")) or path.suffix == GLB:
+        return said
+    record = _garment_part(path).record  # of what another program showed, such as Blender
+    return record.model_hash if record else None
+
+
+def _garment_part(path: Path, shot: Shot | None = None) -> ShotPart:
+    from ssilk_usd.shots.read import read_parts
+
+    shot = shot or cast("Shot", open_shot(path))
+    return next(part for part, own in zip(read_parts(shot), shot.meshes) if own.is_garment)
 
 
 def tell_left_out(where: str, missing: Sequence[str], made: str, report: Reporter) -> None:
@@ -155,7 +171,8 @@ def tell_left_out(where: str, missing: Sequence[str], made: str, report: Reporte
         made: how it is made, such as "refined".
     """
     text = f"it was trained over {', '.join(missing)}, which is not baked beneath it here, and is {made} without"
-    report(Message(f"{where}: {text}; bake what lies beneath first, into the same folder or glb", "warning"))
+    todo = "bake what lies beneath first, into the same folder or glb, or name it by --over"
+    report(Message(f"{where}: {text}; {todo}", "warning"))
 
 
 def _surface(path: Path, shot: Shot | GlbShot) -> InnerSurface:
@@ -164,9 +181,7 @@ def _surface(path: Path, shot: Shot | GlbShot) -> InnerSurface:
     if isinstance(shot, GlbShot):
         rest, thickness = shot.garment_at_rest, provenance_of(path).get(THICKNESS)
     else:
-        from ssilk_usd.shots.read import read_parts
-
-        part = next(part for part, own in zip(read_parts(shot), shot.meshes) if own.is_garment)
+        part = _garment_part(path, shot)
         rest, thickness = part.mesh, part.record and part.record.parameters.get(THICKNESS)
     if not isinstance(thickness, int | float):
         found, allowed = "it does not say how thick its cloth is", "a garment is refined over what 'ssilk bake' wrote"

@@ -263,7 +263,7 @@ class LayerFolder:
         missing = [name for name, digest in over.items() if digest not in known]
         if missing and not damaged and not task.over:
             tell_left_out(task.name, missing, request.made, report)
-        elif missing:
+        elif missing and damaged:
             records = ", ".join(str(self._home(replace(task, garment=name)) / RECORD) for name in damaged)
             text = f"{records} is damaged, and nothing tells whether '{task.garment}' was trained over that garment"
             todo = f"it is {task.request.made} without; bake what is damaged again with --replace, then this"

@@ -78,8 +78,7 @@ def bake(
     rollout.tell(report)
     if rollout.request.meets_beneath:
         over: Any = rollout.provenance.get("trained_over", {})
-        met = beneath or {}
-        if len(met) < len(over) and (missing := left_out(over, met.values())):
+        if over and (missing := left_out(over, (beneath or {}).values())):
             where = f"{place}: {path.stem}" if place else str(path)
             tell_left_out(where, missing, rollout.request.made, report)
     rollout = certified(refined(solved(rollout, report), report, beneath=beneath), report, beneath)

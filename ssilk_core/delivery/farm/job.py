@@ -39,8 +39,8 @@ def submitted(tasks: Sequence[BakeTask], report: Reporter) -> FarmJob:
     submitted again.
 
     Raises:
-        SsilkError: no task is left that can be baked, because an input cannot be read, a model has not the fabric
-            that is asked for, or a motion not the range.
+        SsilkError: no task is left that can be baked, because an input cannot be read, or lacks what is asked of it
+            (`tell_impossible`).
     """
     files = InputFiles()
     found: dict[str, InputContents] = {}

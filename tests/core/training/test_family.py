@@ -35,6 +35,7 @@ from ssilk_core.training.motion_bank import build_bank
 from ssilk_core.training.obstacles import Obstacles
 from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
+from ssilk_core.training.state import learned_tensors, restore
 from ssilk_core.training.step import Stepper
 from ssilk_core.training.validation import BodyScore, Score, Validator
 from ssilk_core.training.verdict import worse_bodies, worst_body
@@ -184,10 +185,13 @@ def test_a_stored_family_finds_its_members(model, members, tmp_path):
 
 def test_a_family_of_another_network_is_refused(model, tmp_path):
     file = model_file(model, Fabric("toy"), {})
-    columns = {name: values[:, :-1] for name, values in file.bodies.columns.items()}
-    save_model(tmp_path / "odd.safetensors", replace(file, bodies=replace(file.bodies, columns=columns)))
-    with pytest.raises(SsilkError, match="do not fit the network"):
-        load_model(tmp_path / "odd.safetensors")
+    columns = file.bodies.columns
+    shorter = {name: values[:, :-1] for name, values in columns.items()}
+    last = {"output.4": np.zeros((2, len(file.parameters["output.4.weight"]), file.bodies.family.bodies.size))}
+    for odd, told in ((shorter, "do not fit the network"), ({}, "no weights"), (columns | last, "'output.4' do not")):
+        save_model(tmp_path / "odd.safetensors", replace(file, bodies=replace(file.bodies, columns=odd)))
+        with pytest.raises(SsilkError, match=told):
+            load_model(tmp_path / "odd.safetensors")
 
 
 def test_a_network_that_saw_bodies_in_its_first_layers_alone_plays_as_before(model):
@@ -339,6 +343,10 @@ def test_a_step_from_a_model_of_one_body_teaches_it_bodies(scene, family, toy_mo
     for iteration in range(3):
         stepper.run(iteration)
     assert all(module.columns.any() for module in parts.model.modules() if isinstance(module, SeenBody))
+    before = {name: value for name, value in learned_tensors(stepper).items() if ".weight.0.columns" not in name}
+    before = {name.replace(".parametrizations.weight.original", ".weight"): value for name, value in before.items()}
+    with pytest.raises(SsilkError, match="of an earlier version"):
+        restore(tmp_path / "state.safetensors", stepper, before)
     onward = model_file(parts.model, Fabric("toy"), {})
     again = build_parts(replace(job, base=onward), CPU).model
     for name, value in parts.model.state_dict().items():
