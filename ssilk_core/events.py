@@ -10,7 +10,7 @@ import time
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Protocol, TextIO
 
-_ONE = {"vertices": "vertex", "isolated vertices": "isolated vertex"}
+_ONE = {"bodies": "body", "vertices": "vertex", "isolated vertices": "isolated vertex"}
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import SsilkError, fail
-from ..events import Reporter, Result, silent
+from ..events import Reporter, Result, format_count, silent
 from ..files import replacing, split_location
+from ..scene.shape_weights import bodies_within
 from ..training.settings import PRESETS, preset_named
 from . import options as shared
 from ._inspected import Inspected
@@ -168,7 +169,7 @@ def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Repo
         return _parameters(inputs)
     from ..authoring.bodies.differences import family_findings
 
-    others = [shared.read_member(options, member, report) for member in shared.members(options)]
+    others = [shared.read_member(options, member, report) for member in shared.members(options, report)]
     return list(family_findings([inputs.character, *others]))
 
 
@@ -180,7 +181,9 @@ def _parameters(inputs: PreflightInput) -> list[Finding]:
         return []
     marked = [f"{name} ({low:g} to {high:g})" for name, (low, high) in inputs.body_ranges.items()]
     found = f"shapes are marked as body parameters: {', '.join(marked)}"
-    fix = "--family alone takes them all; --family tall=1 names a body by weights of shapes"
+    alone, combined = bodies_within(inputs.body_ranges)
+    bodies = format_count(len(alone) + len(combined), "bodies")
+    fix = f"--family without a word takes {bodies} of them, single and combined; --family tall=1 names one by weights"
     return [Finding(severity="info", code="body-parameters", prim=inputs.character.path, found=found, fix=fix)]
 
 

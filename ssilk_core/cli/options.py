@@ -25,7 +25,7 @@ from ..delivery.bake.task import named_by_bodies
 from ..delivery.bake.world import GUSTS
 from ..delivery.targets import TARGETS
 from ..errors import fail
-from ..events import Message, Reporter
+from ..events import Message, Reporter, format_count
 from ..files import is_same_file, need_not_input, need_writable, split_body, split_location
 from ..network.settings import apply_overrides, setting_names
 from ..quality.levels import QUALITIES
@@ -34,7 +34,7 @@ from ..scene.fabric_range import FACTORS
 from ..scene.fabrics import FABRICS, Fabric, fabric_named, fabric_of_surface, stiffness_words, surface_message
 from ..scene.kinematics import MAX_FPS, MIN_FPS
 from ..scene.posed_alike import shaped_as_in_stage
-from ..scene.shape_weights import body_name, body_of, parse_shapes, shapes_text
+from ..scene.shape_weights import bodies_within, body_name, body_of, parse_shapes, shapes_text
 
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
@@ -519,10 +519,11 @@ def read_member(options: argparse.Namespace, location: str, report: Reporter, ro
     return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
 
 
-def members(options: argparse.Namespace) -> list[str]:
+def members(options: argparse.Namespace, report: Reporter) -> list[str]:
     """Return where the bodies of --family are, as `open_stage` takes them.
 
-    Without a word, --family means the ends of the ranges of all shapes that the stage marks as body parameters.
+    Without a word, --family means bodies within the ranges of all shapes that the stage marks as body parameters:
+    each shape alone, and combinations of all. It says which these are.
 
     Raises:
         SsilkError: it marks none, or a body is named twice.
@@ -543,13 +544,17 @@ def members(options: argparse.Namespace) -> list[str]:
         there = f"its blendshapes are {', '.join(known)}" if known else "its bodies have no blendshapes"
         fail(file, "it marks no body parameters with ssilk:weightRange", there,
              "name the bodies, such as --family tall=1 heavy=1")  # fmt: skip
-    return [f"{file}:{name}={weight:.9g}" for name, of in marked.items() for weight in (of.low, of.high) if weight]
+    alone, combined = bodies_within({name: (each.low, each.high) for name, each in marked.items()})
+    told = f"{len(alone)} with one shape at an end of its range"
+    told += f", and {len(combined)} with every shape at an end" if combined else ""
+    report(Message(f"--family takes {format_count(len(alone + combined), 'bodies')} beside the stage's own: {told}"))
+    return [f"{file}:{shapes}" for shapes in (*alone, *combined)]
 
 
 def _as_compared(body: str) -> str:
     """Return where a body is with its weights of shapes as they are compared."""
     file, shapes = split_body(body)
-    return f"{file}:{shapes_text(parse_shapes(body, shapes))}" if shapes else body
+    return f"{Path(file)}:{shapes_text(parse_shapes(body, shapes))}" if shapes else str(Path(body))
 
 
 def tell_shapes(

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
-from ..events import Message, Reporter, Result, TextReporter, silent
+from ..events import Message, Reporter, Result, TextReporter, format_seconds, silent
 from ..files import split_body
 from ..network.settings import ModelConfig, apply_overrides, setting_names
 from ..scene.fabric_range import FACTORS, FabricRange
@@ -95,7 +95,8 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         "--family", type=Path, nargs="*", metavar="STAGE|SHAPES",
         help="other bodies of the character's skeleton and topology, which the model is to dress as well: stages, or "
              "the stage's own blendshapes with weights, such as tall=1,heavy=0.5 (default: the ends of the ranges of "
-             "those that are marked by ssilk:weightRange). Steps are done on bodies drawn among these",
+             "those that are marked by ssilk:weightRange, alone and combined). Steps are done on bodies drawn "
+             "among these",
     )  # fmt: skip
     verb.add_argument(
         "--graded", action="store_true",
@@ -245,7 +246,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             was, now = now, was
         report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
     over = InnerModel.load_all(options.over, options.output)
-    others = shared.members(options)
+    others = shared.members(options, report)
     family = _family(options, others, scene, report) if others else None
     files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
@@ -285,7 +286,9 @@ def _family(options: argparse.Namespace, others: Sequence[str], scene: Scene, re
     bodies = need_family([scene.character, *characters], trained=True)
     how = ", and graded to each" if options.graded else ""
     report(Message(f"the garment is carried onto {len(characters)} more bodies, along {bodies.size} directions{how}"))
+    started = time.monotonic()
     dressed, carried = dressed_family(scene, bodies, characters)
+    report(Message(f"it was carried onto them in {format_seconds(time.monotonic() - started)}"))
     for one, other in zip(carried, characters):
         if left := describe_left(one.settled, one.unsettled, other):
             report(Message(f"{other.path}: {left}", "warning"))

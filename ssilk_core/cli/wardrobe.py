@@ -36,7 +36,7 @@ from pathlib import Path
 
 from ..devices import default_preset
 from ..errors import EXIT_OK, EXIT_WORSE, SsilkError, fail
-from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent
+from ..events import Failed, GarmentEvent, Message, Reporter, Result, Started, TaskEvent, silent
 from ..files import need_writable, sha256, split_body
 from ..scene.shape_weights import is_shapes, need_weights
 from ..training.wardrobe.listing import WardrobeEntry, read_list, write_list
@@ -198,7 +198,7 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
     stage, named = folder / options.stage, options.family
     family = named and [each if is_shapes(str(each)) else folder / each for each in named]
-    for body in (str(stage), *shared.members(argparse.Namespace(stage=stage, family=family))):
+    for body in (str(stage), *shared.members(argparse.Namespace(stage=stage, family=family), silent)):
         if split_body(body)[1]:
             open_stage(body)
 

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import re
-from math import isfinite
+from collections.abc import Mapping
+from itertools import count, product
+from math import isfinite, isqrt
 from pathlib import Path
 
 from ..errors import fail
 from ..files import USD_NAMES, split_body, split_location
 
+ALL_CORNERS = 4  # shapes, up to which bodies at all corners of the box of weights are few
 ALLOWED = "a body of a stage is named as STAGE:SHAPE=WEIGHT,..., such as hero.usd:tall=1,heavy=0.5"
 
 
@@ -64,3 +67,38 @@ def body_name(location: str) -> str:
         return Path(file).stem
     weights = parse_shapes(location, shapes)
     return "_".join(name if weight == 1 else f"{name}{weight:g}" for name, weight in weights.items())
+
+
+def bodies_within(ranges: Mapping[str, tuple[float, float]]) -> tuple[list[str], list[str]]:
+    """Return the bodies that stand for all that shapes make within ranges of weights, "tall=1,heavy=0.5".
+
+    The first have one shape at an end of its range. The second are corners of the box of weights, which have all
+    shapes at ends. The stage's own body, whose weights are zero, is left out, and so are weights that are zero.
+
+    Args:
+        ranges: the least weight and the most by the names of shapes; zero is between them.
+    """
+    alone = [{name: weight} for name, ends in ranges.items() for weight in ends if weight]
+    corners = [
+        {name: ends[at] for (name, ends), at in zip(ranges.items(), corner) if ends[at]}
+        for corner in _balanced_corners(len(ranges))
+    ]
+    singles = [shapes_text(body) for body in alone]
+    texts = [shapes_text(body) for body in corners if body]
+    return singles, [text for text in dict.fromkeys(texts) if text not in singles]
+
+
+def _balanced_corners(size: int) -> list[list[bool]]:
+    """Return corners of a cube: all of few, else between two and four times as many as it has directions.
+
+    Any three directions have all eight combinations of ends equally often, for which fewer corners than twice the
+    directions do not suffice: the rows of a Hadamard matrix, which Paley makes of the squares modulo a prime, and
+    the corners opposite to these.
+    """
+    if size <= ALL_CORNERS:
+        return [list(ends) for ends in product((False, True), repeat=size)]
+    prime = next(p for p in count(3, 4) if p + 1 >= size and all(p % divisor for divisor in range(2, isqrt(p) + 1)))
+    squares = {number**2 % prime for number in range(prime)}
+    rows = [[True] * (prime + 1)]
+    rows += [[False, *((row - column) % prime in squares for column in range(prime))] for row in range(prime)]
+    return [[end != opposite for end in row[:size]] for opposite in (False, True) for row in rows]

@@ -741,6 +741,12 @@ def test_inspect_tells_bodies_by_shapes_with_their_millimetres(shapes, capsys):
     assert code == 0 and "slight (-0.5 to 1)" in found["body-parameters"]["found"]
     code, found = findings(capsys, "inspect shapes.usda --family")
     assert code == 0 and found["family"]["count"] == 3
+    stage = Usd.Stage.Open("shapes.usda")
+    mark = stage.GetPrimAtPath("/Hero/Body/Taller").CreateAttribute("ssilk:weightRange", Sdf.ValueTypeNames.Float2)
+    mark.Set((0, 1))
+    stage.Save()
+    code, found = findings(capsys, "inspect shapes.usda --family")
+    assert code == 0 and found["family"]["count"] == 6
     assert run("inspect rigged.usda --family") == 2
     assert "it marks no body parameters with ssilk:weightRange" in capsys.readouterr().err
 

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies of a stage as texts: weights of its shapes."""
 
+from itertools import combinations, product
+
+import numpy as np
 import pytest
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.files import need_not_input, split_body, split_location
-from ssilk_core.scene.shape_weights import body_name, body_of, is_shapes, parse_shapes, shapes_text
+from ssilk_core.scene.family import BodyFamily
+from ssilk_core.scene.shape_weights import bodies_within, body_name, body_of, is_shapes, parse_shapes, shapes_text
 
 BODIES = {
     "a/hero.usd": ("a/hero.usd", ""),
@@ -56,3 +60,43 @@ def test_the_stage_of_a_body_is_not_written_over(tmp_path):
     (tmp_path / "hero.usd").touch()
     with pytest.raises(SsilkError, match="never overwritten"):
         need_not_input(tmp_path / "hero.usd", f"{tmp_path}/hero.usd:tall=1")
+
+
+def test_bodies_within_ranges_have_one_shape_or_all_at_ends():
+    alone, combined = bodies_within({"tall": (0, 1), "heavy": (-0.5, 1)})
+    assert alone == ["tall=1", "heavy=-0.5", "heavy=1"]
+    assert sorted(combined) == ["heavy=-0.5,tall=1", "heavy=1,tall=1"]  # other corners have one shape, or none
+    assert bodies_within({"tall": (-1, 0.35)}) == (["tall=-1", "tall=0.35"], [])
+
+
+@pytest.mark.parametrize("count", [3, 4, 5, 8, 9, 12, 13])
+def test_any_three_shapes_are_combined_in_every_way_equally_often(count):
+    names = [f"shape{number:02}" for number in range(count)]
+    combined = bodies_within(dict.fromkeys(names, (-1, 1)))[1]
+    corners = [parse_shapes("here", body) for body in combined]
+    assert 2 * count <= len(corners) <= 4 * count
+    for chosen in combinations(names, 3):
+        ways = [tuple(corner[name] for name in chosen) for corner in corners]
+        assert {ways.count(way) for way in product((-1, 1), repeat=3)} == {len(corners) / 8}
+
+
+def test_combinations_that_no_member_has_are_near_the_members():
+    names = "abcde"
+    alone, combined = bodies_within(dict.fromkeys(names, (0, 1)))
+    without, with_them = (family_of(names, bodies) for bodies in (alone, alone + combined))
+    left_out = [
+        corner for corner in product((0.0, 1.0), repeat=5) if corner not in set(map(tuple, with_them.members))
+    ]
+    assert len(left_out) == 32 - len(with_them.members)
+    for corner in map(np.array, left_out[-3:]):
+        assert with_them.beyond(corner) < 0.5 < without.beyond(corner)
+        assert with_them.beyond(0.5 * corner) < 1e-3
+
+
+def family_of(names: str, bodies: list[str]) -> BodyFamily:
+    """Return the family of bodies by shapes, each of which moves a point of its own."""
+    weights = [parse_shapes("here", body) for body in bodies]
+    members = np.array([[0.0] * len(names), *([each.get(name, 0.0) for name in names] for each in weights)])
+    moves, count = np.eye(len(names))[:, :, None] * [1.0, 0, 0], len(names)
+    return BodyFamily(("base", *bodies), members, np.arange(count), np.zeros((1, 3)), np.zeros((count, 3)),
+                      np.zeros((count, 1, 3)), moves, np.zeros(count), ("Body",), (count,))  # fmt: skip
