@@ -313,7 +313,7 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         choices=LATENT_ELEMENTS,
         default=ALL_ELEMENTS,
         help="that solver sums the energy over the whole garment (default), or over few of its elements: five "
-        "times as fast, less exact in wild motion",
+        "four times as fast, less exact in wild motion",
     )
     verb.add_argument(
         "--refined-output",
