@@ -312,7 +312,7 @@ def _add_output(verb: argparse.ArgumentParser) -> None:
         "--latent-elements",
         choices=LATENT_ELEMENTS,
         default=ALL_ELEMENTS,
-        help="that solver sums the energy over the whole garment (default), or over few of its elements: five "
+        help="that solver sums the energy over the whole garment (default), or over few of its elements: some "
         "four times as fast, less exact in wild motion",
     )
     verb.add_argument(
