@@ -299,7 +299,7 @@ def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(c
     assert main([*glb, "--range", "4-8"]) == 0 and main(["verify", "both.glb"]) == 0
     reader, faces = Reader("both.glb"), load_model("coat.safetensors").scene.garment.mesh.faces
     names = {mesh["extras"].get("garment"): mesh["name"] for mesh in reader.json["meshes"]}
-    # 57 % cross where each is refined by itself. At hems 0.3 to 5.2 % still do: trainings differ by their last digits.
+    # 57 % cross where each is refined by itself. At hems 0.3 to 5.2 % still do, as no two trainings are alike.
     for frame in range(5):
         coat, skirt = (np.float64(reader.skinned(names[name], frame)) for name in ("coat", "skirt"))
         assert len(np.unique(intersections_between(coat, faces, skirt, faces)[:, 0])) < 0.2 * len(faces), frame
