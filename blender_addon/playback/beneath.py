@@ -54,7 +54,8 @@ class ShownBeneath:
                 raise SetupError(f"'{name}' has other vertices than its model; train it again, and bake it.")
             mesh = read_mesh(garment, garment.data, file.scene.garment.mesh.path, rest_points(garment))
             made = GarmentRecord(model_hash=sha256(model), parameters={"thickness": file.fabric.thickness})
-            folder.mkdir(exist_ok=True)
-            path = folder / f"{number}_{bpy.path.clean_name(name)}.usdc"  # clean names may be the same
+            own = folder / str(number)  # names that are clean may be the same: the command line tells of it
+            own.mkdir(parents=True, exist_ok=True)
+            path = own / f"{bpy.path.clean_name(name)}.usdc"
             write_cache(path, mesh, points, scene_rate(), self._frames.start, made)
             self.files[name] = path
