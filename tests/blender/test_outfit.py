@@ -127,7 +127,7 @@ def baked_over_what_is_shown_beneath(bpy, coat, skirt, folder, capfd) -> None:
     capfd.readouterr()
     assert bpy.ops.ssilk.bake(quality="hero", pre_roll=0, to_usd=True, filepath=str(usd)) == {"FINISHED"}
     assert "of 2 frames intersect themselves or Skirt" in capfd.readouterr().out
-    met = inputs_folder(coat, model_of(coat)) / BENEATH / "Skirt.usdc"
+    met = inputs_folder(coat, model_of(coat)) / BENEATH / "0" / "Skirt.usdc"
     cache = Shot(met)
     inner = np.array([cache.garment_points(time) for time in cache.frame_times])
     np.testing.assert_allclose(inner, shown(bpy, skirt, frames)[..., [0, 2, 1]] * [1, 1, -1], atol=1e-5)
