@@ -16,6 +16,7 @@ from ssilk_core.cli import main
 from ssilk_core.cli.inputs import CHARACTER, MODEL, MOTIONS, need_input
 from ssilk_core.cli.options import members
 from ssilk_core.errors import SsilkError
+from ssilk_core.events import silent
 
 
 def refusal(name: object, kind=MODEL) -> str:
@@ -74,10 +75,10 @@ def test_a_shape_that_is_named_like_a_file_is_suggested_with_its_weight(tmp_path
 
 def test_a_body_is_named_once_however_its_weights_are_written():
     options = Namespace(stage=Path("hero.usda"), family=[Path("tall=1,heavy=0.5"), Path("heavy=1")])
-    assert members(options) == ["hero.usda:heavy=0.5,tall=1", "hero.usda:heavy=1"]
+    assert members(options, silent) == ["hero.usda:heavy=0.5,tall=1", "hero.usda:heavy=1"]
     options.family.append(Path("hero.usda:heavy=1.0"))
     with pytest.raises(SsilkError, match=r"--family hero\.usda:heavy=1: a body that is named twice"):
-        members(options)
+        members(options, silent)
 
 
 def test_nothing_heavy_is_loaded_to_say_so(tmp_path, monkeypatch):

@@ -263,7 +263,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "pipeline.md"
 
 
 def test_the_python_example_runs_as_it_is_written(world, capsys):
-    (code,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
+    code, *_ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), flags=re.DOTALL)
     Path("model.safetensors").rename("cape.safetensors")
     for name, frames in (("walk", 8), ("run", 6)):
         world.write_clip(Path(f"{name}.usdc"), frames=frames)

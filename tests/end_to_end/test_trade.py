@@ -71,6 +71,7 @@ def test_points_are_of_what_files_hold_and_not_of_their_names(world):
         options = argparse.Namespace(
             models=[folder / "model.safetensors"], stage=folder / "above.usda", motions=folder / "motions",
             clips=["long"], frames=12, root=None, device="cpu", output=folder / "trade.json",
+            fabric=None, material=[],
         )  # fmt: skip
         return Bench(options, silent).asked
 

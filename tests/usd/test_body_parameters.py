@@ -180,7 +180,7 @@ REFUSED = {
     "tall=1.5": "shape 'tall' weighs 1.5; -0.5 to 1 is allowed",
     "wide=-0.1": "shape 'wide' weighs -0.1; 0 to 1 is allowed; its ssilk:weightRange may say otherwise",
     "tal=1": "no body has the blendshape 'tal'; it is one of tall, wide; did you mean 'tall'?",
-    "tall": "there is no such file",
+    "tall": "'tall' is no shape with a weight",
 }
 
 

@@ -266,7 +266,7 @@ def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path,
         finished=True,
         seconds=1.0,
     )
-    job = SimpleNamespace(train=SimpleNamespace(iterations=1), is_trainable=True)
+    job = SimpleNamespace(train=SimpleNamespace(iterations=1), is_trainable=True, family=None)
     monkeypatch.setattr(parallel, "join_process_group", lambda device: nullcontext((ProcessGroup(rank, 2), "cpu")))
     monkeypatch.setattr("ssilk_core.training.run.train", lambda *_: trained)
     monkeypatch.setattr("ssilk_core.cli.train.training_job", lambda *_: job)

@@ -845,7 +845,7 @@ def test_a_model_that_is_hardly_trained_or_shows_skin_is_warned_of_with_what_goe
     model = tmp_path / "skirt.safetensors"
     trained = training.TrainingResult(True, 86, 80, shows, Score({"stretch": 1.0}, 0.0), True, 360.0)
     monkeypatch.setattr(training, "train", lambda *_: trained)
-    ready = SimpleNamespace(train=TrainConfig(iterations=500), is_trainable=True)
+    ready = SimpleNamespace(train=TrainConfig(iterations=500), is_trainable=True, family=None)
     monkeypatch.setattr(command, "training_job", lambda *_: ready)
     words = ["train", "hero.usda", "--motions", "walks", "-o", str(model), "--device", "cpu"]
     assert main(words) == 0
