@@ -96,19 +96,17 @@ def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measure
     assert "unfinished" not in found and names == [(row["split"], row["place"]) for row in measured["figures"]]
 
 
-@pytest.mark.parametrize(("shots", "at_once"), [("", 1), ("--shots 3", 3)])
-def test_times_are_kept_beside_the_errors(measured, script, world, shots, at_once):
-    path = world / f"times{at_once}.json"
+def test_times_are_kept_beside_the_errors(measured, script, world):
+    path = world / "times.json"
     path.write_text(json.dumps(measured))
-    script(f"times {OPTIONS} {shots} --output {path.name}")
+    script(f"times {OPTIONS} --shots 3 --output {path.name}")
     found = json.loads(path.read_text())
     assert found["figures"] == measured["figures"] and found["command"] == measured["command"]
     times = {time["place"]: time for time in found["times"]}
     assert set(times) == {row["place"] for row in measured["figures"]} - {"simulator, 1 mm off"}
     assert {time["device"] for time in found["times"]} == {"cpu"}
     assert all(time["milliseconds"] > 0 for time in found["times"])
-    others = {place for place, time in times.items() if time["shots"] != at_once}
-    assert others == ({"refine 4"} if at_once > 1 else set())
+    assert {place for place, time in times.items() if time["shots"] != 3} == {"refine 4"}
 
 
 @pytest.mark.parametrize(
