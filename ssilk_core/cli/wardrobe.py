@@ -198,7 +198,8 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
     stage, named = folder / options.stage, options.family
     family = named and [each if is_shapes(str(each)) else folder / each for each in named]
-    for body in (str(stage), *shared.members(argparse.Namespace(stage=stage, family=family), silent)):
+    others = shared.members(argparse.Namespace(stage=stage, family=family), silent)
+    for body in (str(stage), *(others if named else ())):  # unnamed ones are within the ranges that the stage marks
         if split_body(body)[1]:
             open_stage(body)
 

@@ -35,7 +35,12 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     """
     left = [task for task in tasks if all(path in readable for path in task.request.inputs.values())]
     told, known = set[str](), _Known()
-    for asked, found in ((_fabric, _in_fabric), (_body, known.of_body), (_range, _in_range), (_shot, known.of_shot)):
+    for asked, found in (
+        (_fabric, _in_fabric),
+        (_body, known.of_body),
+        (_range, known.of_range),
+        (_shot, known.of_shot),
+    ):
         groups: dict[tuple[object, ...], list[BakeTask]] = {}
         for task in left:
             groups.setdefault(asked(task.request), []).append(task)
@@ -55,10 +60,11 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
 
 
 class _Known:
-    """Garments on their characters, each read once for all shots."""
+    """Garments on their characters, and frames of shots, each read once for all tasks."""
 
     def __init__(self) -> None:
         self._scenes: dict[tuple[object, ...], Scene] = {}
+        self._frames: dict[tuple[object, ...], Motion] = {}
 
     def of_body(self, request: BakeRequest) -> tuple[Event, ...]:
         from ssilk_usd.opening.stage import open_stage
@@ -67,11 +73,15 @@ class _Known:
         self._scenes[_body(request)] = on.scene
         return on.told
 
+    def of_range(self, request: BakeRequest) -> tuple[Event, ...]:
+        self._frames[_range(request)] = _frames(request)
+        return ()
+
     def of_shot(self, request: BakeRequest) -> tuple[Event, ...]:
         from ssilk_usd.reading.direction import read_direction, read_loop
         from ssilk_usd.reading.world import find_world
 
-        scene, motion = self._scenes[_body(request)], _frames(request)
+        scene, motion = self._scenes[_body(request)], self._frames[_range(request)]
         mesh, shot = scene.garment.mesh, (request.motion, request.stage)
         asked = asked_world(request.colliders, request.wind, request.gusts, request.gravity)
         find_world(*shot, scene.character, motion, asked, garment=split_location(mesh.path)[1])
@@ -115,11 +125,6 @@ def _body(request: BakeRequest) -> tuple[object, ...]:
 
 def _range(request: BakeRequest) -> tuple[object, ...]:
     return request.motion, request.root, request.range
-
-
-def _in_range(request: BakeRequest) -> tuple[Event, ...]:
-    _frames(request)
-    return ()
 
 
 def _shot(request: BakeRequest) -> tuple[object, ...]:

@@ -27,9 +27,7 @@ from .surface import CollisionSurface, Garment, PosedSurface, Search, SurfaceDis
 
 AT_ONCE = 256  # frames that are skinned together, to bound memory
 TOGETHER = 64  # frames in which a collider is searched together, likewise
-COMPILED_FROM = (
-    2**20
-)  # triangles of a mesh that moves, over all frames, that gain more by loops than these take to load
+COMPILED_FROM = 2**20  # triangles of a moving mesh, over all frames: they gain more by loops than these take to load
 VOTERS = 512  # vertices of the garment that tell which side of a floor is the outside
 Meet = Callable[[Floats, Garment, Floats, Floats], SurfaceDistance]  # as `PosedSurface.met`
 
