@@ -20,6 +20,7 @@ import torch
 from helpers.reports import provenance, table
 from ssilk_usd.opening.stage import open_stage
 from ssilk_usd.reading.motion import read_motion
+from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
 from ssilk_core.delivery.bake import worn
@@ -68,9 +69,10 @@ def traced(run: TrainingRun) -> tuple[dict[str, float], float]:
     with profile(activities=[ProfilerActivity.CUDA]) as trace:
         milliseconds(run, TRACED)
     found: dict[str, float] = {}
-    for event in trace.events():
+    kernels = [event for event in trace.events() if event.device_type == DeviceType.CUDA]  # others are the host's calls
+    for event in kernels:
         found[event.name] = found.get(event.name, 0.0) + event.time_range.elapsed_us() / 1e3 / TRACED
-    return found, len(trace.events()) / TRACED
+    return found, len(kernels) / TRACED
 
 
 def kind_of(kernel: str) -> str:

@@ -150,9 +150,9 @@ class SeenCloth:
         count, away_from = offsets.shape[1], normals[frame + 1]
         was = offsets[frame] - np.add.reduce(normals[frame] * now[:, :count])
         deeper = offsets[frame + 1] - np.add.reduce(away_from * flight[:, :count])
-        np.subtract(deeper, np.maximum(was, ZERO, was), deeper)
+        np.subtract(deeper, np.maximum(was, ZERO, out=was), deeper)
         if deeper.item(deeper.argmax()) > 0:
-            away[:, :count] += away_from * np.maximum(deeper, ZERO, deeper)
+            away[:, :count] += away_from * np.maximum(deeper, ZERO, out=deeper)
 
     def _points(self, outputs: NDArray, first: int) -> NDArray:
         """Return points of outputs (2, outputs) in two frames of the course, counted with the two before it."""

@@ -66,8 +66,8 @@ class SoftClamp:
         largest = np.abs(values, over).argmax()  # four times as fast as `max`
         if over.item(largest) <= self.half:
             return
-        np.minimum(values, self.high, inner)
-        np.maximum(inner, self.low, inner)
+        np.minimum(values, self.high, out=inner)
+        np.maximum(inner, self.low, out=inner)
         np.subtract(values, inner, over)
         np.divide(over, self.high, over)
         np.tanh(over, over)
