@@ -69,7 +69,7 @@ def traced(run: TrainingRun) -> tuple[dict[str, float], float]:
     with profile(activities=[ProfilerActivity.CUDA]) as trace:
         milliseconds(run, TRACED)
     found: dict[str, float] = {}
-    kernels = [event for event in trace.events() if event.device_type == DeviceType.CUDA]  # others are the host's calls
+    kernels = [event for event in trace.events() if event.device_type == DeviceType.CUDA]  # else calls
     for event in kernels:
         found[event.name] = found.get(event.name, 0.0) + event.time_range.elapsed_us() / 1e3 / TRACED
     return found, len(kernels) / TRACED

@@ -79,18 +79,20 @@ def drape() -> str:
 
 
 def peers() -> str:
-    """The simulator beside the engine newton."""
+    """The simulator beside the engine newton, two clips at once on a GPU and one on a processor."""
     rows = []
-    for found in result("peers").values():
-        times, terms = np.quantile(found["milliseconds"], (0.5, 0.25, 0.75)), found["terms"]
-        shares = [f"{np.mean(found[name]):.2f}, {np.max(found[name]):.1f}" for name in ("shares", "inside")]
-        energies = sum(terms.values()), terms["stretch"], terms["inertia"]
-        rows.append(
-            [found["method"], found["cloth"], *map(digits, map(float, times)), *shares, *map(digits, energies)]
-        )
-    header = ("method", "cloth through cloth", "ms a frame", "a quarter below", "above", "intersect [%]",
+    for file, where in (("peers_cuda", "GPU"), ("peers", "one core")):
+        for number, found in enumerate(result(file).values()):
+            times, terms = np.quantile(found["milliseconds"], (0.5, 0.25, 0.75)), found["terms"]
+            shares = [f"{np.mean(found[name]):.2f}, {np.max(found[name]):.1f}" for name in ("shares", "inside")]
+            energies = sum(terms.values()), terms["stretch"], terms["inertia"]
+            rows.append([
+                "" if number else where, found["method"], found["cloth"], *map(digits, map(float, times)), *shares,
+                *map(digits, energies),
+            ])  # fmt: skip
+    header = ("on", "method", "cloth through cloth", "ms a frame", "a quarter below", "above", "intersect [%]",
               "inside the body [%]", "total [J]", "stretch [J]", "inertia [J]")  # fmt: skip
-    return table(header, rows, 2)
+    return table(header, rows, 3)
 
 
 def bodies() -> str:
