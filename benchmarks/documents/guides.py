@@ -61,7 +61,7 @@ def presets() -> str:
 PUBLISHED_DRAPE = {  # [%] of real cloth
     "silk": "20 to 40", "cotton": "68", "denim": "70 to 90", "wool": "40 to 70", "leather": "47 to 70",
 }  # fmt: skip
-STATED_DRAPE = {"silk": 35, "cotton": 70, "denim": 87, "wool": 62, "leather": 68}  # [%] of another simulator's presets
+STATED_DRAPE = {"silk": 35, "cotton": 70, "denim": 87, "wool": 62, "leather": 68}  # [%] of another simulator
 
 
 def drape() -> str:
@@ -72,7 +72,7 @@ def drape() -> str:
         others = found["drape coefficients with other waves [%]"].values()
         lengths, shares = ([each[key] for each in (fine, coarse)] for key in ("bending length [mm]",
                                                                               "drape coefficient [%]"))  # fmt: skip
-        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), f"{found['bending [N m]']:.0e}",
+        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), f"{found['bending [N m]']:.1e}",
                      fixed(found["rigidity's bending length [mm]"], 1), *(fixed(length, 1) for length in lengths),
                      *(fixed(share) for share in shares), f"{fixed(min(others))} to {fixed(max(others))}",
                      PUBLISHED_DRAPE.get(name, ""), STATED_DRAPE.get(name, "")])  # fmt: skip

@@ -149,7 +149,7 @@ FABRICS: dict[str, Fabric] = {
             lame_lambda=160.0,
             stretch=110.0,
             shear=25.0,
-            bending=3e-4,
+            bending=2.8e-4,
             thickness=1.5e-3,
         ),
     )
