@@ -248,7 +248,7 @@ def test_names_of_presets_mean_what_they_meant_when_a_range_was_made(scene, mode
     monkeypatch.setitem(FABRICS, "leather", replace(FABRICS["leather"], bending=5e-3, drag=0.6))
     found = load_model(path).fabrics.range
     np.testing.assert_array_equal(found.factors_of(OWN, "leather"), RANGE.points[0])
-    assert found.other_words(OWN, "leather") == "bending 50, not 3, drag 2, not 1"
+    assert found.other_words(OWN, "leather") == "bending 50, not 2.8, drag 2, not 1"
     assert found.factors_of(OWN, "silk")[2] == pytest.approx(FABRICS["silk"].bending / OWN.bending)
     with pytest.raises(SsilkError, match="each preset has five factors within the range"):
         replace(RANGE, points=((1.0, 1.0, 99.0, 1.0, 1.0),))
