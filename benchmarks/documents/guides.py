@@ -58,23 +58,27 @@ def presets() -> str:
     return table(header, rows, 7)
 
 
-STATED_DRAPE = {"silk": 35, "cotton": 70, "denim": 85}  # [%] by the add-on of another simulator
+PUBLISHED_DRAPE = {  # [%] of real cloth
+    "silk": "20 to 40", "cotton": "68", "denim": "70 to 90", "wool": "40 to 70", "leather": "47 to 70",
+}  # fmt: skip
+STATED_DRAPE = {"silk": 35, "cotton": 70, "denim": 87, "wool": 62, "leather": 68}  # [%] of another simulator
 
 
 def drape() -> str:
     """How the presets of fabrics hang."""
     rows = []
     for name, found in result("drape").items():
-        length, share = found["bending length [mm]"], found["drape coefficient [%]"]
-        stiffer = [
-            f"{found['stiffer: bending [N m]']:.1e}", fixed(found["stiffer: bending length [mm]"], 1),
-            fixed(found["stiffer: drape coefficient [%]"]),
-        ] if name in STATED_DRAPE else [""] * 3  # fmt: skip
-        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), f"{found['bending [N m]']:.1e}", fixed(length, 1),
-                     fixed(share), STATED_DRAPE.get(name, ""), *stiffer])  # fmt: skip
-    header = ("preset", "weight [g/m²]", "`bending` [N m]", "bending length [mm]", "drape coefficient [%]",
-              "stated elsewhere [%]", "reached with `bending` [N m]", "bending length [mm]",
-              "drape coefficient [%]")  # fmt: skip
+        coarse, fine = found["10 mm"], found["5 mm"]
+        others = found["drape coefficients with other waves [%]"].values()
+        lengths, shares = ([each[key] for each in (fine, coarse)] for key in ("bending length [mm]",
+                                                                              "drape coefficient [%]"))  # fmt: skip
+        rows.append([f"`{name}`", fixed(found["density [g/m2]"]), f"{found['bending [N m]']:.1e}",
+                     fixed(found["rigidity's bending length [mm]"], 1), *(fixed(length, 1) for length in lengths),
+                     *(fixed(share) for share in shares), f"{fixed(min(others))} to {fixed(max(others))}",
+                     PUBLISHED_DRAPE.get(name, ""), STATED_DRAPE.get(name, "")])  # fmt: skip
+    header = ("preset", "weight [g/m²]", "`bending` [N m]", "(D / w)^(1/3) [mm]", "bending length [mm]", "on 10 mm",
+              "drape coefficient [%]", "on 10 mm", "5 to 9 waves", "published [%]",
+              "another simulator's [%]")  # fmt: skip
     return table(header, rows)
 
 

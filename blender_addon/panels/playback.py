@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import bpy
+import numpy as np
 
 from ssilk_core.errors import SsilkError
 from ssilk_core.scene.fabric_range import FACTORS
@@ -12,7 +13,7 @@ from ..motions.colliders import unmet, unseen
 from ..motions.freedom import has_held_parts
 from ..motions.keys import has_keys
 from ..playback import playing
-from ..playback.fabrics import played_factors
+from ..playback.fabrics import SAME, played_factors
 from ..playback.live import Live
 from ..playback.models import fabrics_of, no_model, sees_colliders
 from ..playback.overrides import overriding
@@ -20,6 +21,7 @@ from ..playback.solving import SOLVED
 from ..preferences import no_certificates
 from ..scene.armature import owners_of
 from ..scene.garment import armature_of
+from ..settings.played import OWN
 from .base import PlayableGarmentPanel, SidebarPanel, draw_text, saying_errors
 
 
@@ -108,8 +110,13 @@ def fabric_line(garment: bpy.types.Object) -> str:
     known = fabrics_of(garment)
     if known is None:
         return "The model knows one fabric: train it with Range of Fabrics"
-    beyond = known[1].beyond(factors)
-    return f"The network sees the nearest fabric of its training: {beyond} is beyond" if beyond else ""
+    (own, fabrics), chosen = known, garment.ssilk.played.preset
+    if beyond := fabrics.beyond(factors):
+        return f"The network sees the nearest fabric of its training: {beyond} is beyond"
+    if chosen == OWN or not np.allclose(factors, fabrics.factors_of(own, chosen), rtol=SAME):
+        return ""
+    other = fabrics.other_words(own, chosen)
+    return f"'{chosen}' is the fabric that its training called so; the preset has now: {other}" if other else ""
 
 
 class PlayedFabricPanel(PlayableGarmentPanel, bpy.types.Panel):

@@ -21,9 +21,9 @@ ABOUT = {
     "paper": "The paper's energy of contact, which depends on the mesh",
     "silk": "Light and very soft, 80 g/m²",
     "cotton": "A shirt, 150 g/m²",
-    "denim": "Stiff and heavy, 400 g/m²",
+    "denim": "Very stiff and heavy, 400 g/m²",
     "wool": "A coat, soft and heavy, 300 g/m²",
-    "leather": "Very stiff and heavy, 600 g/m²",
+    "leather": "Stiff and very heavy, 600 g/m²",
 }
 CHOICES = [(name, name.capitalize(), ABOUT[name]) for name in FABRICS]
 MODELS = [

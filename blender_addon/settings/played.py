@@ -8,7 +8,7 @@ import numpy as np
 from bpy.props import EnumProperty, FloatProperty
 
 from ssilk_core.errors import SsilkError
-from ssilk_core.scene.fabric_range import FACTORS, factors_of
+from ssilk_core.scene.fabric_range import FACTORS
 from ssilk_core.scene.fabrics import FABRICS, MOST_FRICTION
 
 from .fabric import CHOICES
@@ -40,7 +40,7 @@ def take_preset(played: PlayedFabric, _: object = None) -> None:
     if played.preset != OWN:
         try:
             known = fabrics_of(played.id_data)
-            factors = factors_of(known[0], FABRICS[played.preset]) if known else factors
+            factors = known[1].factors_of(known[0], played.preset) if known else factors
         except SsilkError:  # of which playing and baking tell
             pass
     for name, factor in zip(FACTORS, factors.tolist()):

@@ -275,7 +275,7 @@ def _need_header(document: dict[str, Any]) -> None:
     members, meshes = (document.get(name, []) for name in ("family", "body_meshes"))
     for words in (document["joint_names"], document["proxy_names"], document["paths"].values(), members, meshes):
         _need_types(dict(enumerate(words)), dict.fromkeys(range(len(words)), ""))
-    _need_types(document.get("fabrics", {}), {"low": (), "high": (), "presets": ()})
+    _need_types(document.get("fabrics", {}), {"low": (), "high": (), "presets": (), "points": ()})
     seed = document["provenance"].get("seed", 0)
     if type(seed) is not int or not -(2**63) <= seed < 2**63:  # shots store it in 64 bits
         raise TypeError(f"the seed {str(seed)[:40]!r} is not a whole number of 64 bits")

@@ -54,7 +54,7 @@ class SeenFabrics:
 
     def document(self) -> dict[str, Any]:
         """Return what the header of a file says."""
-        return {name: list(values) for name, values in vars(self.range).items()}
+        return {name: list(values) for name, values in vars(self.range).items() if values is not None}
 
     @classmethod
     def of(cls, tensors: Mapping[str, Any], document: Mapping[str, Any]) -> SeenFabrics:
@@ -64,7 +64,7 @@ class SeenFabrics:
             TypeError: the header's range is none.
         """
         return cls(
-            FabricRange(**document),
+            FabricRange(**{"points": None, **document}),
             {name: tensors[f"fabrics.{name}"] for name in SEEING if f"fabrics.{name}" in tensors},
         )
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene.fabric_range import FACTORS, FabricRange, factors_of, inputs_of
-from ..scene.fabrics import Fabric, fabric_named
+from ..scene.fabric_range import FACTORS, FabricRange, inputs_of
+from ..scene.fabrics import Fabric
 
 OWN, MIXED = 0.2, 0.4
 CHANGED = 0.05  # chance that a window that continues another has another fabric, as where an artist turns a slider
@@ -22,7 +22,7 @@ class FabricDrawer:
     """Draws fabrics as the features that networks see."""
 
     def __init__(self, fabrics: FabricRange, own: Fabric, generator: torch.Generator, device: torch.device) -> None:
-        presets = [inputs_of(factors_of(own, fabric_named(name))) for name in fabrics.presets]
+        presets = [inputs_of(fabrics.factors_of(own, name)) for name in fabrics.presets]
 
         def tensor(values: object) -> Tensor:
             return torch.as_tensor(np.array(values), dtype=torch.float32, device=device)

@@ -223,9 +223,14 @@ class TrainJob:
                 "scene": scene_digest(self.scene),
                 **({"over": {one.name: one.sha256 for one in self.over}} if self.over else {}),
                 **({"family": family_digest(self.family, self.scene.garment.graded)} if self.family else {}),
-                **({"fabrics": asdict(self.fabrics)} if self.fabrics else {}),
+                **({"fabrics": _stated(self.fabrics)} if self.fabrics else {}),
             }
         )
+
+
+def _stated(fabrics: FabricRange) -> dict[str, Any]:
+    """Return a range as runs compare it: without points where it names no preset, as runs of before have it."""
+    return {name: value for name, value in asdict(fabrics).items() if value or name != "points"}
 
 
 def _need_same_scene(base: ModelFile, scene: Scene, moved: bool) -> None:

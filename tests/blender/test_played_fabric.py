@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -93,11 +94,16 @@ def test_keys_show_the_fabric_that_is_played(ready, ranged):
         playing().start_listening()
 
 
-def test_the_panel_says_what_the_network_does_not_know(ready, trained, ranged):
+def test_the_panel_says_what_the_network_does_not_know(ready, trained, ranged, monkeypatch):
     from blender_addon.panels.playback import PlayedFabricPanel
 
     names = ["preset", "stretch", "shear", "bending", "density", "drag", "friction"]
     assert drawn(PlayedFabricPanel, ready.context) == names
+    ranged.ssilk.played.preset = "silk"
+    assert len(drawn(PlayedFabricPanel, ready.context)) == len(names)
+    monkeypatch.setitem(FABRICS, "silk", replace(FABRICS["silk"], bending=2e-5))
+    line = " ".join(drawn(PlayedFabricPanel, ready.context)[len(names) :])
+    assert line == "'silk' is the fabric that its training called so; the preset has now: bending 2, not 0.7"
     ranged.ssilk.played.drag = 9.0
     line = " ".join(drawn(PlayedFabricPanel, ready.context)[len(names) :])
     assert line == "The network sees the nearest fabric of its training: drag 9 (trained from 0.25 to 4) is beyond"

@@ -176,6 +176,7 @@ def test_a_job_tells_what_its_tasks_lack_and_replaces_no_files_of_others(copy, c
         ("--material stretch=-1x", "finite and not negative"),
         ("--material bending=2x --material bending=3x", "'bending=2x' and 'bending=3x' are two values of 'bending'"),
         ("--lbs --fabric silk", "linear blend skinning has no fabric"),
+        ("--fabric paper", "fabric 'paper': its contact, 'vertex', is all that it has of its own"),
     ],
 )
 def test_what_networks_do_not_see_is_refused(copy, capsys, words, text):

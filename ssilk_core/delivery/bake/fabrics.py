@@ -13,7 +13,7 @@ from ...events import Event, Message
 from ...network.checkpoint import ONE_FABRIC, ModelFile
 from ...network.settings import apply_overrides
 from ...scene.assets import Floats
-from ...scene.fabric_range import FACTORS, PROPERTIES, fabric_with, factors_of, properties
+from ...scene.fabric_range import FACTORS, PROPERTIES, FabricRange, fabric_with, factors_of, properties
 from ...scene.fabrics import Fabric, fabric_named
 
 OPTION = "--material"
@@ -38,7 +38,7 @@ def in_fabric(
 
     Raises:
         SsilkError: the model knows one fabric alone, its networks do not see a property that is asked for, or
-            nothing knows the friction that is.
+            nothing knows the friction that is; or a preset differs from the model's own fabric in contact alone.
     """
     rough, others = _friction_apart(material, rubs)
     if rough:
@@ -52,10 +52,13 @@ def in_fabric(
         asked = " ".join([*([f"--fabric {fabric}"] if fabric else []), *(f"--material {each}" for each in material)])
         fail(where, f"{asked} for a model of one fabric", *ONE_FABRIC)
     own, known = file.fabric, file.fabrics.range
-    wanted = _asked(own, fabric, material)
+    wanted = _asked(own, known, fabric, material)
     factors = factors_of(own, wanted)
     values = ", ".join(f"{name} {factor:.3g}" for name, factor in zip(FACTORS, factors))
     told: list[Event] = [Message(f"{where}: fabric '{wanted.name}', as factors of the model's own: {values}")]
+    if fabric and (other := known.other_words(own, fabric)):
+        text = f"'{fabric}' is the fabric that its training called so; the preset has other factors now: {other}"
+        told.append(Message(f"{where}: {text}; --material NAME=FACTORx sets them"))
     if beyond := known.beyond(factors):
         text = f"{beyond} is beyond the fabrics of its training: the network sees the nearest of these"
         told.append(Message(f"{where}: {text}; --refine N or --quality hero solve for it", "warning"))
@@ -77,9 +80,9 @@ def _friction_apart(material: Sequence[str], rubs: bool) -> tuple[list[str], lis
     return rough, [each for each in material if each not in rough]
 
 
-def _asked(own: Fabric, fabric: str | None, material: Sequence[str]) -> Fabric:
+def _asked(own: Fabric, known: FabricRange, fabric: str | None, material: Sequence[str]) -> Fabric:
     """Return the fabric that options ask for, with all that networks do not see as the model's own has it."""
-    preset = factors_of(own, fabric_named(fabric)) if fabric else np.ones(len(FACTORS))
+    preset = known.factors_of(own, fabric) if fabric else np.ones(len(FACTORS))
     factors = _factors(preset, material)
     _need_factors(factors)
     return apply_overrides(fabric_with(own, factors, fabric), _absolute(properties(own), material), OPTION)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.delivery.bake.fabrics import in_fabric
+from ssilk_core.demo.shipped import shipped_path
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 from ssilk_core.network.checkpoint import load_model, model_file, network, save_model
@@ -80,16 +82,16 @@ def test_a_preset_is_a_point_that_its_factors_give_back(kind, name):
 
 def test_a_range_spans_all_that_it_names():
     own = FABRICS["default"]
-    usual, wide = FabricRange.of(own, []), FabricRange.of(own, ["2", "leather", "silk"])
+    usual, wide = FabricRange.of(own, []), FabricRange.of(own, ["2", "denim", "silk"])
     assert usual.low == (0.25,) * 5 and usual.high == (4.0,) * 5
-    for name in ("leather", "silk"):
+    for name in ("denim", "silk"):
         assert not wide.beyond(factors_of(own, FABRICS[name]))
     assert wide.high[FACTORS.index("bending")] == pytest.approx(40) and wide.high[FACTORS.index("drag")] == 2
-    assert wide.beyond(np.array([1, 1, 50, 1, 1])) == "bending 50 (trained from 0.3 to 40)"
+    assert wide.beyond(np.array([1, 1, 50, 1, 1])) == "bending 50 (trained from 0.5 to 40)"
     np.testing.assert_allclose(
         wide.seen(np.array([1, 1, 400, 0, 1])), [0, 0, np.log(40) / UNIT, wide.bounds[0][3], 0]
     )
-    assert [fabric.name for fabric in ends(own, wide)] == ["leather", "silk"]
+    assert [fabric.name for fabric in ends(own, wide)] == ["denim", "silk"]
     soft, stiff = ends(own, usual)
     assert stiff.bending == 16 * soft.bending and stiff.lame_lambda == pytest.approx(16 * soft.lame_lambda)
 
@@ -101,6 +103,7 @@ def test_a_range_spans_all_that_it_names():
         (["1"], "the factor 1 is given|the factor 1;"),
         (["1e9"], "a factor above 1, to 1000, means"),
         (["nan"], "a factor above 1"),
+        (["paper"], "contact, 'vertex', is all that it has of its own; contact is as in the training, 'surface'"),
     ],
 )
 def test_what_is_no_range_is_refused(words, text):
@@ -239,6 +242,32 @@ def test_a_model_of_one_fabric_refuses_another_and_its_file_knows_nothing_of_fab
         load_model(path).on_fabric(FABRICS["silk"])
 
 
+def test_names_of_presets_mean_what_they_meant_when_a_range_was_made(scene, model, tmp_path, monkeypatch):
+    path = tmp_path / "range.safetensors"
+    save_model(path, model_file(model, OWN, {}, RANGE))
+    monkeypatch.setitem(FABRICS, "leather", replace(FABRICS["leather"], bending=5e-3, drag=0.6))
+    found = load_model(path).fabrics.range
+    np.testing.assert_array_equal(found.factors_of(OWN, "leather"), RANGE.points[0])
+    assert found.other_words(OWN, "leather") == "bending 50, not 2.8, drag 2, not 1"
+    assert found.factors_of(OWN, "silk")[2] == pytest.approx(FABRICS["silk"].bending / OWN.bending)
+    with pytest.raises(SsilkError, match="each preset has five factors within the range"):
+        replace(RANGE, points=((1.0, 1.0, 99.0, 1.0, 1.0),))
+
+
+def test_a_range_of_before_the_presets_were_calibrated_means_those_of_then(tmp_path):
+    shipped = load_model(shipped_path("cape_fabrics"))
+    own, known = shipped.fabric, shipped.fabrics.range
+    then = {"silk": 0.3, "cotton": 1.5, "denim": 10, "wool": 5, "leather": 40}
+    assert {name: float(known.factors_of(own, name)[2]) for name in known.presets} == pytest.approx(then)
+    assert not any(known.beyond(factors_of(own, FABRICS[name])) for name in PRESETS)
+    told = "'silk' is the fabric that its training called so; the preset has other factors now: bending 0.7, not 0.3"
+    file, words = in_fabric(shipped, "cape", "silk", ())
+    assert file.fabric.bending == 3e-6 and any(told in event.text for event in words)
+    assert not any("its training called so" in event.text for event in in_fabric(shipped, "cape", "default", ())[1])
+    save_model(tmp_path / "again.safetensors", shipped)
+    assert load_model(tmp_path / "again.safetensors").fabrics.range == known
+
+
 def test_a_range_of_another_network_is_refused(model, tmp_path):
     file = model_file(model, OWN, {}, RANGE)
     columns = {name: values[:-1] for name, values in file.fabrics.columns.items()}
@@ -337,6 +366,7 @@ def test_a_run_does_not_go_on_with_another_range(scene, toy_motion, tmp_path):
     job = fabrics_job(scene, motion, path)
     assert job.identity()["fabrics"] != replace(job, fabrics=FabricRange.of(OWN, ["2"])).identity()["fabrics"]
     assert "fabrics" not in replace(job, fabrics=None).identity()
+    assert "points" not in replace(job, fabrics=FabricRange.of(OWN, ["2"])).identity()["fabrics"]  # as runs of before
 
 
 def test_after_a_short_training_stiff_cloth_hangs_less_than_soft_cloth(scene, toy_motion, tmp_path):
