@@ -32,6 +32,8 @@ class Skeleton:
         placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
             above the skeleton tilt or scale it; None elsewhere.
         seen: the joints that a network sees in place of these; None for these.
+        scales: by which the space of each joint is scaled in its stage, shape (J,), at rest and in its motions: it
+            moves no point, and is left out here; None where it is 1.
     """
 
     path: str
@@ -42,6 +44,7 @@ class Skeleton:
     hub: int = 0
     placement: Floats | None = None
     seen: SeenJoints | None = None
+    scales: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)

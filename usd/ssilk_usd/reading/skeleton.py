@@ -25,6 +25,7 @@ from ..opening.stage import (
 )
 from ..units import StageUnits
 from .carried import carried_by
+from .joint_scales import SCALE_TOLERANCE, divided, total_scales, uniform_scales, without_scales
 from .mesh import is_body, is_drawn, placement, rendered
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
@@ -114,7 +115,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     names = tuple(source.joints[index] for index in kept)
     binds, world = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
     hub = carrying_joint([moved[kept] for moved in _moved(source)], parents, binds[:, :3, 3])
-    return Skeleton(location(source.prim), names, parents, binds, rest, hub, world)
+    scales = None if (source.scales == 1).all() else source.scales[kept]
+    return Skeleton(location(source.prim), names, parents, binds, rest, hub, world, scales=scales)
 
 
 def _moved(source: SkelSource) -> list[Floats]:
@@ -170,6 +172,13 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
     if bind is None:
         fail(where, "the skeleton has no bindTransforms", "one for each joint is needed", "export the armature again")
     rest = _matrices(prim, "restTransforms", len(joints))
+    totals = np.ones(len(joints))
+    if rest is not None:
+        totals = total_scales(uniform_scales(rest), parents)
+        if not np.isfinite(totals).all() or np.abs(totals - 1).max() <= SCALE_TOLERANCE:
+            totals = np.ones(len(joints))  # what is no scale alone is told where it is no rotation either
+        else:
+            bind, rest = divided(bind, totals), without_scales(rest, totals, parents)
     placed = need_similarity(prim, world_matrix(prim))
     return SkelSource(
         stage=prim.GetStage(),
@@ -182,6 +191,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
         rest=_rest_from_bind(bind, parents) if rest is None else rest,
         placement=placed,
         owners=_owners(root, joints, parents),
+        scales=totals,
     )
 
 
