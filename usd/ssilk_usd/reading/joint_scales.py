@@ -3,8 +3,8 @@
 
 Rigs scale joints once and for all: by -1 where one side is the mirror image of the other, by 3 where an eye was
 modelled in other units. Skinning by joint transforms P and bind transforms B has P B^-1, which stays the same where
-both are divided by one factor from the right. So a factor that is the same in the bind pose and in all frames moves no
-point, and joints without it are rigid: the core knows no others.
+both are divided by one factor from the right. So a factor that is the same in the bind pose and in all frames moves
+no point, and joints without it are rigid: the core knows no others.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def without_scales(local: Floats, totals: Floats, parents: Ints) -> Floats:
 
 
 def spread_out(local: Floats, totals: Floats, parents: Ints) -> Floats:
-    """Return joint-to-parent transforms (..., N, 4, 4) that turn alike, with the bones of parents without `totals`."""
+    """Return joint-to-parent transforms (..., N, 4, 4) that turn alike, with the lengths of parents without scale."""
     result = np.array(local)
     result[..., :3, 3] *= _above(totals, parents)[:, None]
     return result
@@ -60,7 +60,7 @@ def _above(totals: Floats, parents: Ints) -> Floats:
 
 
 def divided(transforms: Floats, totals: Floats) -> Floats:
-    """Return joint-to-bind or joint-to-skeleton transforms (..., N, 4, 4), each divided by its factor from the right."""
+    """Return joint-to-bind or -skeleton transforms (..., N, 4, 4), each divided by its factor from the right."""
     result = np.array(transforms)
     result[..., :3, :3] /= totals[:, None, None]
     return result
