@@ -485,10 +485,13 @@ def dressed(cloth: Mesh):
     return prepare_scene(hero(), Garment(cloth, classes=classes), rig_options=RigOptions(proxies=4))
 
 
-def test_joints_that_cannot_matter():
+def test_joints_that_cannot_matter(monkeypatch):
     found = list(cost.training_cost(dressed(tube()), [still()], PRESETS["draft"]))
     assert [f.code for f in found] == ["memory", "time", "irrelevant-joints"]
     assert found[-1].indices == (2,)  # nothing is skinned to the tail
+    assert "other programs" not in found[1].why
+    monkeypatch.setattr("ssilk_core.devices.busy_cores", lambda: 1.5)
+    assert "other programs keep about 1.5 of" in list(cost.memory(dressed(tube()), PRESETS["draft"], 100))[1].why
 
 
 def test_memory_says_when_the_batch_is_lowered(monkeypatch):
