@@ -205,10 +205,13 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
-    """Return the files that a training reads."""
+    """Return the files that a training reads, with all layers of stages."""
+    from ssilk_usd.opening.stage import used_files
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
     bodies = [options.stage, shared.wardrobe(options)[0], *(options.family or ())]
     named = [file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
-    return [folder / file for file in (*named, *options.over)] + list(motions)
+    stages = [*(folder / file for file in named), *motions]
+    used = [Path(file) for path in stages for file in (used_files(str(path)) if path.is_file() else [path])]
+    return [*dict.fromkeys([*used, *(folder / file for file in options.over)])]

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import pytest
 
-from ssilk_core.cli import main
+from ssilk_core.cli import main, wardrobe
+from ssilk_core.cli.main import parser
 from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
 from ssilk_core.files import sha256
@@ -118,6 +119,10 @@ WRONG = {
         "key 'over': no such garment; it is one of cape",
     ),
     "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"a\"], is needed"),
+    "over itself": (
+        '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b", "a"]\n[b]',
+        "table 'a', key 'over': it names itself; garments beneath it are named; remove its own name",
+    ),
     "over twice": (
         '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
         "key 'over': a, b are worn over one another",
@@ -169,6 +174,22 @@ def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, 
     Path("list.toml").write_text('[defaults]\nstage = "rigged.usda"\nmotions = "clip.usda"\n' + text)
     assert main(["wardrobe", "list.toml", "-o", "out", "--device", "cpu"]) == 2
     assert says in capsys.readouterr().err and not Path("out").exists()
+
+
+def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypatch):
+    """So a training is done again once a body has changed that a stage refers to, as with 'family = true'."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    Path("above.usda").write_text('#usda 1.0\n(\n    defaultPrim = "Hero"\n    subLayers = [@rigged.usda@]\n)\n')
+    (entry,) = listed(tmp_path, '[skirt]\nstage = "above.usda"\nmotions = "clip.usda"\n')
+
+    def asked() -> str:
+        return wardrobe._request(parser(["train"]), entry, tmp_path / "list.toml", "cpu", {})
+
+    before = asked()
+    assert asked() == before
+    with Path("rigged.usda").open("a") as file:
+        file.write("\n")
+    assert asked() != before
 
 
 # --- trainings side by side ---------------------------------------------------------------------------------------
