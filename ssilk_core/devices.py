@@ -45,13 +45,13 @@ BUSY = 0.75  # cores that other programs take, from which on it is told
 
 
 def busy_cores() -> float:
-    """Return how many cores programs kept busy in the last minute; zero where the system does not tell."""
+    """Return how many cores programs kept busy, or would have, in the last minute; 0 where no system tells."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
 
 
 def kept_busy(busy: float) -> str:
-    """Return in words that other programs keep cores busy, of which there are so many; "" where few are."""
-    return f"other programs keep about {busy:.1f} of {os.cpu_count()} cores busy" if busy >= BUSY else ""
+    """Return in words that other programs keep cores busy, or wait for them; "" where few do."""
+    return f"other programs put a load of about {busy:.1f} on {os.cpu_count()} cores" if busy >= BUSY else ""
 
 
 def device_name(device: torch.device) -> str:

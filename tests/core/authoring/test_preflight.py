@@ -491,7 +491,7 @@ def test_joints_that_cannot_matter(monkeypatch):
     assert found[-1].indices == (2,)  # nothing is skinned to the tail
     assert "other programs" not in found[1].why
     monkeypatch.setattr("ssilk_core.devices.busy_cores", lambda: 1.5)
-    assert "other programs keep about 1.5 of" in list(cost.memory(dressed(tube()), PRESETS["draft"], 100))[1].why
+    assert "other programs put a load of about 1.5 on" in list(cost.memory(dressed(tube()), PRESETS["draft"], 100))[1].why
 
 
 def test_memory_says_when_the_batch_is_lowered(monkeypatch):
