@@ -647,10 +647,25 @@ def set_on(path: str, name: str, value):
     return lambda stage: stage.GetPrimAtPath(path).GetAttribute(name).Set(value)
 
 
+def refer(stage: Usd.Stage) -> Usd.Stage:
+    """Let the stage get its character from another layer."""
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.TransferContent(stage.GetRootLayer())
+    stage.GetRootLayer().Clear()
+    stage.GetRootLayer().subLayerPaths.append(layer.identifier)
+    stage.KEPT = layer
+    return stage
+
+
 NAN = float("nan")
 BODY, RIG, WALK = "/Hero/Body", "/Hero/Rig", "/Hero/Rig/Walk"
 BAD_CHARACTERS = {
-    "no skeleton": (lambda stage: stage.RemovePrim(RIG), "no SkelRoot with a Skeleton"),
+    "no skeleton": (lambda stage: stage.RemovePrim(RIG), "no SkelRoot with a Skeleton;.*export the character"),
+    "no root": (lambda stage: stage.GetPrimAtPath("/Hero").SetTypeName("Xform"), "; /Hero/Rig lies beneath none"),
+    "typed over a root": (
+        lambda stage: UsdGeom.Xform.Define(refer(stage), "/Hero"),
+        "; /Hero refers to one and is declared as 'Xform' over it; .*declare it without a type, as in: def \"Hero\"",
+    ),
     "unordered joints": (set_on(RIG, "joints", JOINTS[::-1]), "out of order"),
     "repeated joint": (set_on(RIG, "joints", ("Hips",) * 5), "'Hips' is listed twice"),
     "no joints": (set_on(RIG, "joints", []), "no joints"),

@@ -44,11 +44,12 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | N
     """
     where, found = stage_name(stage), skeletons(stage)
     if not found:
+        lone, todo = _beneath_none(stage)
         fail(
             where,
-            "there is no SkelRoot with a Skeleton",
+            f"there is no SkelRoot with a Skeleton{lone}",
             "a character is a SkelRoot with a Skeleton and meshes bound to it",
-            "export the character with its armature",
+            todo,
         )
     chosen = found if root is None else _pairs_named(found, root)
     chosen = of_bodies(stage, chosen, garment) if len(chosen) > 1 else chosen
@@ -63,6 +64,20 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | N
             f"{_CHOOSE}, by the path of its Skeleton if need be",
         )
     return skeleton_at(*chosen[0])
+
+
+def _beneath_none(stage: Usd.Stage) -> tuple[str, str]:
+    """Return in words why a Skeleton is no character's, where there is one, and what to do."""
+    lone = next((prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdSkel.Skeleton)), None)
+    if lone is None:
+        return "", "export the character with its armature"
+    above = lone.GetParent()
+    while not above.IsPseudoRoot():
+        if above.GetPrimTypeInfo().GetTypeName() and any(spec.typeName == "SkelRoot" for spec in above.GetPrimStack()):
+            text = f"; {above.GetPath()} refers to one and is declared as '{above.GetTypeName()}' over it"
+            return text, f"declare it without a type, as in: def \"{above.GetName()}\""
+        above = above.GetParent()
+    return f"; {lone.GetPath()} lies beneath none", "make a prim above it and its meshes a SkelRoot"
 
 
 def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
