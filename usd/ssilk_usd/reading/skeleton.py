@@ -73,9 +73,11 @@ def _beneath_none(stage: Usd.Stage) -> tuple[str, str]:
         return "", "export the character with its armature"
     above = lone.GetParent()
     while not above.IsPseudoRoot():
-        if above.GetPrimTypeInfo().GetTypeName() and any(spec.typeName == "SkelRoot" for spec in above.GetPrimStack()):
+        if above.GetPrimTypeInfo().GetTypeName() and any(
+            spec.typeName == "SkelRoot" for spec in above.GetPrimStack()
+        ):
             text = f"; {above.GetPath()} refers to one and is declared as '{above.GetTypeName()}' over it"
-            return text, f"declare it without a type, as in: def \"{above.GetName()}\""
+            return text, f'declare it without a type, as in: def "{above.GetName()}"'
         above = above.GetParent()
     return f"; {lone.GetPath()} lies beneath none", "make a prim above it and its meshes a SkelRoot"
 
