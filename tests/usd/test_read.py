@@ -312,6 +312,10 @@ def test_of_several_characters_one_is_chosen():
         read_character(stage)
     assert read_character(stage, root="B").path.endswith("/World/B")
     assert read_character(stage, root="/World/A/Rig").path.endswith("/World/A")
+    for root in ("/World/A", "/World/B"):
+        Sdf.CopySpec(stage.GetRootLayer(), f"{root}/Body", stage.GetRootLayer(), f"{root}/Cape")
+    for root in ("B", "/World/B/Rig"):  # whose garment has the name of another character's
+        assert read_scene(stage, garment="Cape", root=root)[1].mesh.path.endswith("/World/B/Cape")
 
 
 def test_bodies_are_drawn_bound_meshes_that_are_no_garments():
