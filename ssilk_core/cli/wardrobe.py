@@ -32,6 +32,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..devices import default_preset
@@ -69,6 +70,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
+    entries = [_with_bodies(entry, entries, options.list.parent) for entry in entries]
     requests, known = dict[str, str](), dict[str, GarmentTraining]()
     for entry in entries:
         requests[entry.name] = _request(options.parser, entry, options.list, device, requests)
@@ -86,6 +88,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     else:
         print(table(rows), *(f"{t.entry.name}: {t.error}" for t in trainings if t.state == "failed"), sep="\n")
     return max((training.code for training in trainings), key=lambda code: (code not in (EXIT_OK, EXIT_WORSE), code))
+
+
+def _with_bodies(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> WardrobeEntry:
+    """Return an entry whose training names its bodies, where its stage has other garments of the list among them."""
+    bodies = shared.bodies_in_list(entry, entries, folder)
+    return replace(entry, words=(*entry.words, *(word for body in bodies for word in ("--body", body))))
 
 
 def _keep_list(entries: Sequence[WardrobeEntry], path: Path, folder: Path) -> None:

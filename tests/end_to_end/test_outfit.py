@@ -121,7 +121,7 @@ garment = "coat.usda:/Hero/Skirt"
 over = ["skirt"]
 
 [skirt]
-garment = "/Hero/Skirt"
+garment = "Skirt"
 """
 
 

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from pxr import Sdf, Usd
 
 from ssilk_core.cli import main, wardrobe
 from ssilk_core.cli.main import parser
@@ -174,6 +175,23 @@ def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, 
     Path("list.toml").write_text('[defaults]\nstage = "rigged.usda"\nmotions = "clip.usda"\n' + text)
     assert main(["wardrobe", "list.toml", "-o", "out", "--device", "cpu"]) == 2
     assert says in capsys.readouterr().err and not Path("out").exists()
+
+
+def test_garments_of_a_list_that_a_stage_does_not_mark_are_no_bodies_of_each_other(toy, tmp_path, monkeypatch):
+    monkeypatch.chdir(toy.copy(tmp_path))
+    stage = Usd.Stage.Open("rigged.usda")
+    for name in ("Tights", "Cloak", "Boots"):
+        Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), f"/Hero/{name}")
+    stage.GetRootLayer().Export("dressed.usda")
+    text = (
+        '[defaults]\nstage = "dressed.usda"\nmotions = "clip.usda"\n[cloak]\ngarment = "Cloak"\nover = ["tights"]\n'
+    )
+    entries = listed(tmp_path, text + '[tights]\ngarment = "/Hero/Tights"\n[skirt]\ngarment = "Skirt"\n')
+    for entry in entries:
+        named = wardrobe._with_bodies(entry, entries, tmp_path).words[len(entry.words) :]
+        assert named == ("--body", "/Hero/Body", "--body", "/Hero/Boots"), entry.name
+    alone = [entry for entry in entries if entry.name == "cloak"]
+    assert wardrobe._with_bodies(alone[0], alone, tmp_path) == alone[0]
 
 
 def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypatch):
