@@ -92,7 +92,6 @@ def _on_mesh(inputs: PreflightInput) -> Findings:
     yield from meshes.non_manifold_edges(mesh)
     yield from meshes.degenerate_faces(mesh, int((corners == np.roll(corners, 1, axis=1)).any(axis=1).sum()))
     yield from winding.inconsistent_winding(mesh)
-    yield from meshes.two_layers(mesh)
     if surface := inputs.garment.surface:
         told = surface_message(surface, fabric_of_surface(surface))
         yield Finding(severity="info", code="fabric", prim=surface.path, found=told)
@@ -112,6 +111,7 @@ def _on_fit(inputs: PreflightInput) -> Findings:
         yield from fit.penetration(mesh, body)
         yield from worn_over.layers(mesh, inputs.character, inputs.inner)
         yield from winding.inside_out(mesh, body)
+        yield from meshes.two_layers(mesh)  # by millimetres: in other units any sleeve is thin
         yield from pose.rest_pose(inputs.character, mesh)
 
 
