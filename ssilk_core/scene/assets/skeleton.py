@@ -64,6 +64,10 @@ class Skeleton:
             if self.placement.shape != (4, 4):
                 fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
             need_finite(self.placement, self.path, "placement")
+        if self.scales is not None:
+            assign(self, scales=frozen(self.scales, np.float64))
+            if self.scales.shape != (count,) or not (np.isfinite(self.scales) & (self.scales != 0)).all():
+                fail(self.path, f"scales {self.scales} for {count} joints", "one for each joint is needed, none is 0")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))
