@@ -41,9 +41,17 @@ def default_preset(name: str) -> str:
     return "draft" if select_device(name).type == "cpu" else "preview"
 
 
+BUSY = 0.75  # cores that other programs take, from which on it is told
+
+
 def busy_cores() -> float:
-    """Return how many cores programs kept busy in the last minute; zero where the system does not tell."""
+    """Return how many cores programs kept busy, or would have, in the last minute; 0 where no system tells."""
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+
+
+def kept_busy(busy: float) -> str:
+    """Return in words that other programs keep cores busy, or wait for them; "" where few do."""
+    return f"other programs put a load of about {busy:.1f} on {os.cpu_count()} cores" if busy >= BUSY else ""
 
 
 def device_name(device: torch.device) -> str:

@@ -83,6 +83,7 @@ CHECKS: dict[str, Callable[[Mesh], Iterator[Finding]]] = {
     "duplicate-faces": checks.duplicate_faces,
     "non-manifold-edges": checks.non_manifold_edges,
     "degenerate-faces": lambda mesh: checks.degenerate_faces(mesh, 0),
+    "two-layers": checks.two_layers,
     "sliver-faces": lambda mesh: checks.degenerate_faces(mesh, 0),
     HOLES: _holes,
 }  # by code

@@ -12,6 +12,7 @@ from ..errors import fail
 from ..events import Reporter, Result
 from ..files import need_not_input
 from ..training.wardrobe.listing import WardrobeEntry, garment_file, read_list, write_list
+from . import options as shared
 from ._inspected import Inspected
 
 OF_A_GARMENT = ("garment", "root", "body", "over", "family")  # options that a list has no use for
@@ -39,8 +40,9 @@ def inspect_list(
     for entry in entries:
         table = tables[entry.name] = entry.located(folder)
         own = _options_of(entry, table, tables, options)
+        own.body = shared.bodies_in_list(entry, entries, folder)
         if copy:
-            prim = garment_file(table)[1]
+            prim = _garment_in(table)[1]
             own.fix = _copy_in(copy.parent, entry.name)
             table["garment"] = f"{own.fix}:{prim}" if prim else str(own.fix)
         found[entry.name] = inspect(own, report)
@@ -121,5 +123,17 @@ def _model_names(entry: WardrobeEntry, models: Sequence[str]) -> list[str]:
 
 def _location(table: Mapping[str, Any]) -> str:
     """Return "file[:/Prim]" of the garment of a table."""
-    file, prim = garment_file(table)
+    file, prim = _garment_in(table)
     return f"{file}:{prim}" if prim else file
+
+
+def _garment_in(table: Mapping[str, Any]) -> tuple[str, str | None]:
+    """Return what `garment_file` does, with the path of a prim that is named: names stand behind no file."""
+    from ssilk_usd.opening.stage import open_stage
+    from ssilk_usd.reading.garment import find_garment
+
+    file, prim = garment_file(table)
+    if prim is None or prim.startswith("/"):
+        return file, prim
+    stage = open_stage(file)  # prims live as long as it
+    return file, str(find_garment(stage, prim).GetPath())

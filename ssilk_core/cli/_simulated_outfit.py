@@ -49,12 +49,14 @@ def outfit_options(options: argparse.Namespace) -> dict[str, argparse.Namespace]
         if getattr(options, name):
             fail(f"--{name}", f"{options.stage} is a list", "its tables say what each garment is", "leave it out")
     path, found = options.stage, dict[str, argparse.Namespace]()
-    for entry in read_list(path):
+    entries = read_list(path)
+    for entry in entries:
         table = entry.located(path.parent)
         if models := entry.models(table):
             allowed = "an outfit is simulated of the garments of its list"
             fail(f"{path}: table '{entry.name}', key 'over'", f"a model, {models[0]}", allowed, "add its garment")
         found[entry.name] = _options(options, entry, table)
+        found[entry.name].body = shared.bodies_in_list(entry, entries, path.parent)
     stages = {str(each.stage) for each in found.values()}
     if len({Path(stage).resolve() for stage in stages}) > 1:
         allowed = "garments of an outfit are worn by one character"

@@ -129,7 +129,7 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
     known = body_parameters(open_stage(options.stage)).items()
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
-        garment_units=_units(file), locked=repair_lock(file, prim), motions=motions,
+        garment_units=_units(file), locked=repair_lock(file, prim, options.root), motions=motions,
         preset=preset_named(options.preset or "draft"), unread=unread,
         files=[_facts(motion, character.skeleton) for motion in motions],
         inner=_inner(options, character), body_ranges={name: (of.low, of.high) for name, of in known if of.is_marked},

@@ -39,6 +39,7 @@ from ..scene.shape_weights import bodies_within, body_name, body_of, parse_shape
 if TYPE_CHECKING:
     from ..authoring.setup.rig import RigOptions
     from ..scene.assets import Character, Garment, Mesh, Motion, ProxyRig, Scene, SurfaceMaterial
+    from ..training.wardrobe.listing import WardrobeEntry
 
 
 LIST, MODEL = ".toml", ".safetensors"  # suffixes of a list of garments, and of a trained one
@@ -517,6 +518,31 @@ def read_member(options: argparse.Namespace, location: str, report: Reporter, ro
     own = is_same_file(split_body(location)[0], stage) and is_same_file(file, stage)
     root, garment = root or options.root, prim if own else None
     return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
+
+
+def bodies_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> list[str]:
+    """Return the paths of the bodies that a garment of a list meets, where its stage has others of the list as well.
+
+    Garments that a stage does not mark as such count as bodies, and would be met twice: as bodies that move with the
+    skeleton, and as the garments that they are. Nothing where none would.
+
+    Args:
+        folder: that of the list, to which its paths are relative.
+
+    Raises:
+        SsilkError: the stage has no character.
+    """
+    from ssilk_usd.reading.character import bodies_beside
+
+    from ..training.wardrobe.listing import garment_file
+
+    table = entry.located(folder)
+    stage, own = Path(table["stage"]), garment_file(table)[1]
+    if not Path(split_body(str(stage))[0]).is_file():
+        return []  # which is told where it is read
+    others = [garment_file(each.located(folder)) for each in entries if each is not entry]
+    beside = [prim for file, prim in others if prim and Path(file).resolve() == stage.resolve()]
+    return bodies_beside(str(stage), beside, own if garment_file(table)[0] == str(stage) else None) if beside else []
 
 
 def members(options: argparse.Namespace, report: Reporter) -> list[str]:

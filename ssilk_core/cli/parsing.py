@@ -6,7 +6,8 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
+from dataclasses import fields
 from typing import Any, NoReturn
 
 from ..errors import did_you_mean, fail, fail_unknown
@@ -37,7 +38,8 @@ class Parser(argparse.ArgumentParser):
                 break  # what follows is no option, or belongs to the verb's own parser
             name = word.partition("=")[0]
             if re.fullmatch(r"--?[A-Za-z][\w-]*", name) and not {name, name[:2]} & known.keys():
-                fail(self.prog, f"no such option '{name}'", self._help(), did_you_mean(name, known, LIKE))
+                meant = _as_value(name, known) or did_you_mean(name, known, LIKE)
+                fail(self.prog, f"no such option '{name}'", self._help(), meant)
         return super().parse_known_args(words, namespace)
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
@@ -47,3 +49,16 @@ class Parser(argparse.ArgumentParser):
 
     def _help(self) -> str:
         return f"'{self.prog} --help' lists what is allowed"
+
+
+def _as_value(option: str, known: Container[str]) -> str:
+    """Return a question that suggests the option whose values have what was given as an option; "" where none has."""
+    from ..network.settings import ModelConfig
+    from ..scene.fabrics import Fabric
+    from ..training.settings import TrainConfig
+
+    name = option.lstrip("-").replace("-", "_")
+    for of, kinds in (("--material", (Fabric,)), ("--set", (TrainConfig, ModelConfig))):
+        if of in known and any(each.name == name for kind in kinds for each in fields(kind)):
+            return f"did you mean '{of} {name}=VALUE'?"
+    return ""

@@ -78,7 +78,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
             props=props,
             report=report,
         )
-    report(Result("view", {"picture": str(options.output), "frames": count}))
+    kind = "film" if film else "page" if suffix == PAGE else "picture"
+    report(Result("view", {kind: str(options.output), "frames": count}))
     return EXIT_OK
 
 

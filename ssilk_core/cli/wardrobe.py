@@ -32,6 +32,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..devices import default_preset
@@ -69,6 +70,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
+    entries = [_with_bodies(entry, entries, options.list.parent) for entry in entries]
     requests, known = dict[str, str](), dict[str, GarmentTraining]()
     for entry in entries:
         requests[entry.name] = _request(options.parser, entry, options.list, device, requests)
@@ -86,6 +88,12 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     else:
         print(table(rows), *(f"{t.entry.name}: {t.error}" for t in trainings if t.state == "failed"), sep="\n")
     return max((training.code for training in trainings), key=lambda code: (code not in (EXIT_OK, EXIT_WORSE), code))
+
+
+def _with_bodies(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> WardrobeEntry:
+    """Return an entry whose training names its bodies, where its stage has other garments of the list among them."""
+    bodies = shared.bodies_in_list(entry, entries, folder)
+    return replace(entry, words=(*entry.words, *(word for body in bodies for word in ("--body", body))))
 
 
 def _keep_list(entries: Sequence[WardrobeEntry], path: Path, folder: Path) -> None:
@@ -205,10 +213,13 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
-    """Return the files that a training reads."""
+    """Return the files that a training reads, with all layers of stages."""
+    from ssilk_usd.opening.stage import used_files
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
     bodies = [options.stage, shared.wardrobe(options)[0], *(options.family or ())]
     named = [file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
-    return [folder / file for file in (*named, *options.over)] + list(motions)
+    stages = [*(folder / file for file in named), *motions]
+    used = [Path(file) for path in stages for file in (used_files(str(path)) if path.is_file() else [path])]
+    return [*dict.fromkeys([*used, *(folder / file for file in options.over)])]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +14,7 @@ from typing import NoReturn
 import torch
 from torch import Tensor
 
-from ..devices import busy_cores, select_device
+from ..devices import busy_cores, kept_busy, select_device
 from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
 from ..physics import loops
@@ -40,7 +39,6 @@ from .verdict import non_finite_terms, validation_message
 SAVE_INTERVAL = 60.0  # [s] between saved states
 REPORT_INTERVAL = 10.0  # [s] between reports of progress there, where steps are long
 FIRST_MODEL = 60.0  # [s] of steps after which there is a model, if no validation has written one
-BUSY = 0.75  # cores that other programs take, from which on it is told
 RECOVERY_PACE = 0.25  # factor on learning rates after divergence
 
 
@@ -88,9 +86,8 @@ class TrainingRun:
                 "set the iterations instead (--set iterations=...)",
             )
         self.job, self.report, self.device, self.group = job, report, select_device(job.device), group
-        if self.device.type == "cpu" and busy >= BUSY:
-            cores = f"about {busy:.1f} of {os.cpu_count()} cores"
-            report(Message(f"other programs keep {cores} busy: steps take longer meanwhile.", "warning"))
+        if self.device.type == "cpu" and (others := kept_busy(busy)):
+            report(Message(f"{others}: steps take longer meanwhile.", "warning"))
         self.files, identity = RunFiles(job, self.device, group), {**job.identity(), "processes": group.size}
         state, tensors = load_state(self.files.state, identity) if job.resume else (RunState(identity), None)
         self.clock = RunClock(job, state, began)

@@ -38,6 +38,8 @@ def told(capsys, command: str) -> str:
         (f"{TRAIN} --preset draft --set iteratons=3", "iteratons", "'iterations'"),
         (f"{TRAIN} --preset draft --material dragg=3", "dragg", "'drag'"),
         ("completion bsh", "'bsh'", "'bash'"),
+        ("simulate hero.usdc --friction 0.4", "'--friction'", "'--material friction=VALUE'"),
+        (f"{TRAIN} --iterations=300", "'--iterations'", "'--set iterations=VALUE'"),
     ],
 )
 def test_what_was_mistyped_is_named_and_what_was_meant_is_suggested(

@@ -316,6 +316,9 @@ def test_a_body_that_training_never_saw_is_baked_and_one_too_far_off_is_refused(
     assert run(f"{BAKE} --stage bent.usda -o bent_shot.usda") == 2
     assert "from all that the model's family of bodies adds up to" in capsys.readouterr().err
     assert not Path("huge_shot.usda").exists() and not Path("bent_shot.usda").exists()
+    assert run(f"{BAKE} {BODIES} --stage huge.usda -o shots/") == 2  # before any is baked
+    assert "beyond the bodies that the model was trained for" in capsys.readouterr().err
+    assert not Path("shots").exists()
 
 
 def test_a_model_of_one_body_still_refuses_others(world, capsys):

@@ -14,6 +14,7 @@ from ssilk_usd.reading.scene import read_scene
 from ssilk_usd.shots.play import Shot
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake.outfit import stated_over
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.physics.intersections.pairs import intersections_between
@@ -120,7 +121,7 @@ garment = "coat.usda:/Hero/Skirt"
 over = ["skirt"]
 
 [skirt]
-garment = "/Hero/Skirt"
+garment = "Skirt"
 """
 
 
@@ -333,7 +334,11 @@ def test_what_was_refined_over_cloth_that_is_another_now_is_told(copy, capsys):
     assert main(shlex.split(farm)) == 0  # a job without the skirt does not take what is over it
     assert main(shlex.split("task job/job.json -o layers --check")) == 3
     over = f"coat.safetensors --over layers/shots/walk/skirt/anim.usdc {few}"
-    assert not told(baked(capsys, over, "over.usdc"))
+    events = baked(capsys, over, "over.usdc")
+    (figures,) = [each["detail"] for each in events if each["event"] == "result" and "over" in each["detail"]]
+    (in_folder,) = stated_over(Path("layers/shots/walk/shot.usda"))
+    assert not told(events) and (figures["garment"], figures["over"]) == ("over", "skirt")
+    assert figures["triangles that intersect skirt"].startswith(f"{in_folder.mean:.3%}")
     said = read_provenance("over.usdc")["refined"]
     assert said["over"] == {"skirt": "layers/shots/walk/skirt/anim.usdc"} and "skirt" in said["over_sha256"]
     assert gone in warned(capsys, "remove layers walk/skirt")

@@ -17,8 +17,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from pxr import Sdf, Usd
 
-from ssilk_core.cli import main
+from ssilk_core.cli import main, wardrobe
+from ssilk_core.cli.main import parser
 from ssilk_core.errors import EXIT_WORSE, SsilkError
 from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
 from ssilk_core.files import sha256
@@ -118,6 +120,10 @@ WRONG = {
         "key 'over': no such garment; it is one of cape",
     ),
     "over text": ('[cape]\nover = "shirt"', "key 'over': 'shirt'; a list, like [\"a\"], is needed"),
+    "over itself": (
+        '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b", "a"]\n[b]',
+        "table 'a', key 'over': it names itself; garments beneath it are named; remove its own name",
+    ),
     "over twice": (
         '[defaults]\nstage = "a"\nmotions = "b"\n[a]\nover = ["b"]\n[b]\nover = ["a"]',
         "key 'over': a, b are worn over one another",
@@ -169,6 +175,39 @@ def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, 
     Path("list.toml").write_text('[defaults]\nstage = "rigged.usda"\nmotions = "clip.usda"\n' + text)
     assert main(["wardrobe", "list.toml", "-o", "out", "--device", "cpu"]) == 2
     assert says in capsys.readouterr().err and not Path("out").exists()
+
+
+def test_garments_of_a_list_that_a_stage_does_not_mark_are_no_bodies_of_each_other(toy, tmp_path, monkeypatch):
+    monkeypatch.chdir(toy.copy(tmp_path))
+    stage = Usd.Stage.Open("rigged.usda")
+    for name in ("Tights", "Cloak", "Boots"):
+        Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), f"/Hero/{name}")
+    stage.GetRootLayer().Export("dressed.usda")
+    text = (
+        '[defaults]\nstage = "dressed.usda"\nmotions = "clip.usda"\n[cloak]\ngarment = "Cloak"\nover = ["tights"]\n'
+    )
+    entries = listed(tmp_path, text + '[tights]\ngarment = "/Hero/Tights"\n[skirt]\ngarment = "Skirt"\n')
+    for entry in entries:
+        named = wardrobe._with_bodies(entry, entries, tmp_path).words[len(entry.words) :]
+        assert named == ("--body", "/Hero/Body", "--body", "/Hero/Boots"), entry.name
+    alone = [entry for entry in entries if entry.name == "cloak"]
+    assert wardrobe._with_bodies(alone[0], alone, tmp_path) == alone[0]
+
+
+def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypatch):
+    """So a training is done again once a body has changed that a stage refers to, as with 'family = true'."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    Path("above.usda").write_text('#usda 1.0\n(\n    defaultPrim = "Hero"\n    subLayers = [@rigged.usda@]\n)\n')
+    (entry,) = listed(tmp_path, '[skirt]\nstage = "above.usda"\nmotions = "clip.usda"\n')
+
+    def asked() -> str:
+        return wardrobe._request(parser(["train"]), entry, tmp_path / "list.toml", "cpu", {})
+
+    before = asked()
+    assert asked() == before
+    with Path("rigged.usda").open("a") as file:
+        file.write("\n")
+    assert asked() != before
 
 
 # --- trainings side by side ---------------------------------------------------------------------------------------

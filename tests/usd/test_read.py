@@ -87,6 +87,11 @@ class Recipe:
     animation_joints: tuple[str, ...] = JOINTS
     rigid_to: int | None = None
     rest: bool = True
+    scales: np.ndarray = field(default_factory=lambda: np.ones(5))  # of the joints' spaces
+
+    @property
+    def above(self) -> np.ndarray:
+        return np.where(PARENTS < 0, 1.0, self.scales[PARENTS])
 
     @property
     def units(self) -> np.ndarray:
@@ -119,6 +124,9 @@ def author(stage: Usd.Stage, recipe: Recipe = Recipe(), root: str = "/Hero") -> 
 def _author_skeleton(stage, path, recipe, to_skeleton, to_bind) -> UsdSkel.Skeleton:
     bind = to_bind @ without_scale_on_right(TRUTH.bind, to_skeleton)
     rest = kinematics.local_transforms(without_scale(to_skeleton @ TRUTH.bind), PARENTS)
+    bind[:, :3, :3] *= recipe.scales[:, None, None]
+    rest[:, :3, :3] *= (recipe.scales / recipe.above)[:, None, None]
+    rest[:, :3, 3] /= recipe.above[:, None]
     skeleton = UsdSkel.Skeleton.Define(stage, path)
     skeleton.CreateJointsAttr(JOINTS)
     skeleton.CreateBindTransformsAttr([gf(matrix) for matrix in bind])
@@ -138,7 +146,8 @@ def _author_animation(stage, path, recipe, to_skeleton) -> None:
     order = [JOINTS.index(name) for name in recipe.animation_joints]
     animation = UsdSkel.Animation.Define(stage, path)
     animation.CreateJointsAttr(recipe.animation_joints)
-    animation.CreateScalesAttr([Gf.Vec3h(1)] * len(order))
+    local[..., :3, 3] /= recipe.above[:, None]
+    animation.CreateScalesAttr([Gf.Vec3h(scale) for scale in (recipe.scales / recipe.above)[order].tolist()])
     for frame, joints in enumerate(local[:, order]):
         quats = Rotation.from_matrix(joints[:, :3, :3]).as_quat()
         rotations = [Gf.Quatf(float(w), float(x), float(y), float(z)) for x, y, z, w in quats]
@@ -206,6 +215,10 @@ RECIPES = {
     "geomBindTransform": Recipe(geom_bind=turned("z", 30, 2, (0.2, 1, 0)) @ np.diag([1, 1.5, 1, 1])),
     "mesh joints in another order": Recipe(mesh_joints=JOINTS[::-1]),
     "animation joints in another order": Recipe(animation_joints=(*JOINTS[2:], *JOINTS[:2])),
+    "a mirrored leg and a larger head": Recipe(scales=np.array([1, -1, -3, -1, 1.0]), animation_joints=JOINTS[::-1]),
+    "scaled joints under a scale of 0.01, binds in world": Recipe(
+        placements=[turned("y", 20, 0.01, (1, 0, 0))], world_binds=True, scales=np.array([1, 1, 3, -1, -1.0])
+    ),
     "one rigid influence": Recipe(rigid_to=2, geom_bind=turned("x", 40)),
 }
 
@@ -254,6 +267,19 @@ def test_missing_rest_transforms_come_from_the_bind_pose():
     np.testing.assert_allclose(with_rest.skeleton.rest_transforms, without.skeleton.rest_transforms, atol=1e-9)
 
 
+def test_a_clip_that_stands_alone_has_the_scales_of_its_skeleton():
+    plain, scaled = (
+        author(Usd.Stage.CreateInMemory(), Recipe(scales=np.array(scales)))
+        for scales in (np.ones(5), [1, 1, 1, -1, -1])
+    )
+    skeleton, own = read_character(plain).skeleton, read_character(scaled).skeleton
+    expected = read_motion(plain, skeleton)
+    scaled.GetPrimAtPath(RIG).RemoveProperty("skel:animationSource")
+    np.testing.assert_allclose(read_motion(scaled, own).translations, expected.translations, atol=1e-6)
+    with pytest.raises(SsilkError, match="2 joints are scaled otherwise than at rest, Hips/Leg first"):
+        read_motion(scaled, skeleton)
+
+
 def test_payload_variant_and_layer_offset_are_composed(tmp_path):
     author(Usd.Stage.CreateNew(str(tmp_path / "asset.usdc"))).Save()
     stage = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
@@ -286,6 +312,10 @@ def test_of_several_characters_one_is_chosen():
         read_character(stage)
     assert read_character(stage, root="B").path.endswith("/World/B")
     assert read_character(stage, root="/World/A/Rig").path.endswith("/World/A")
+    for root in ("/World/A", "/World/B"):
+        Sdf.CopySpec(stage.GetRootLayer(), f"{root}/Body", stage.GetRootLayer(), f"{root}/Cape")
+    for root in ("B", "/World/B/Rig"):  # whose garment has the name of another character's
+        assert read_scene(stage, garment="Cape", root=root)[1].mesh.path.endswith("/World/B/Cape")
 
 
 def test_bodies_are_drawn_bound_meshes_that_are_no_garments():
@@ -621,10 +651,25 @@ def set_on(path: str, name: str, value):
     return lambda stage: stage.GetPrimAtPath(path).GetAttribute(name).Set(value)
 
 
+def refer(stage: Usd.Stage) -> Usd.Stage:
+    """Let the stage get its character from another layer."""
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.TransferContent(stage.GetRootLayer())
+    stage.GetRootLayer().Clear()
+    stage.GetRootLayer().subLayerPaths.append(layer.identifier)
+    stage.KEPT = layer
+    return stage
+
+
 NAN = float("nan")
 BODY, RIG, WALK = "/Hero/Body", "/Hero/Rig", "/Hero/Rig/Walk"
 BAD_CHARACTERS = {
-    "no skeleton": (lambda stage: stage.RemovePrim(RIG), "no SkelRoot with a Skeleton"),
+    "no skeleton": (lambda stage: stage.RemovePrim(RIG), "no SkelRoot with a Skeleton;.*export the character"),
+    "no root": (lambda stage: stage.GetPrimAtPath("/Hero").SetTypeName("Xform"), "; /Hero/Rig lies beneath none"),
+    "typed over a root": (
+        lambda stage: UsdGeom.Xform.Define(refer(stage), "/Hero"),
+        "; /Hero refers to one and is declared as 'Xform' over it; .*declare it without a type, as in: def \"Hero\"",
+    ),
     "unordered joints": (set_on(RIG, "joints", JOINTS[::-1]), "out of order"),
     "repeated joint": (set_on(RIG, "joints", ("Hips",) * 5), "'Hips' is listed twice"),
     "no joints": (set_on(RIG, "joints", []), "no joints"),
@@ -674,6 +719,12 @@ def test_bad_characters_give_one_sentence(change, message):
     assert "\n" not in str(caught.value)
 
 
+def grow_head(stage: Usd.Stage) -> None:
+    for code in (1, 6):
+        scales = [Gf.Vec3h(1 + 0.01 * code if name.endswith("Head") else 1) for name in JOINTS]
+        stage.GetPrimAtPath(WALK).GetAttribute("scales").Set(scales, code)
+
+
 BAD_MOTIONS = {
     "foreign": (
         clip(("a", "b", "Hips"), {0: 0}),
@@ -681,7 +732,8 @@ BAD_MOTIONS = {
     ),
     "no joints": (clip((), {0: 0}), "another skeleton: 0 of 5"),
     "no animation": (Usd.Stage.CreateInMemory(), "no SkelAnimation"),
-    "scaled": (broken(set_on(WALK, "scales", [Gf.Vec3h(2)] * 5)), "5 joints are scaled"),
+    "scaled": (broken(set_on(WALK, "scales", [Gf.Vec3h(2)] * 5)), "5 joints are scaled otherwise than at rest, Hips"),
+    "growing head": (broken(grow_head), "1 joints are scaled otherwise than at rest, Hips/Spine/Head"),
     "count": (broken(set_on(WALK, "joints", JOINTS[:4])), "rotations for 5 joints; 4 are needed"),
     "no rotations": (broken(lambda s: s.GetPrimAtPath(WALK).RemoveProperty("rotations")), "has no rotations"),
     "units": (broken(lambda s: UsdGeom.SetStageMetersPerUnit(s, 0.01)), "0.01 times as long"),

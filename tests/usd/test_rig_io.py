@@ -185,9 +185,31 @@ def test_garments_with_proxies_are_found(tmp_path):
     assert (read_rigged(source), playback_rate(out)) == ([], 30)
 
 
-@pytest.mark.parametrize("where", ["skelroot", "beside", "own file"])
+def mirrored(rig: Usd.Prim, _: Usd.Prim) -> None:
+    """Mirror the spine, and make what the head carries twice as large in its space: no point moves."""
+    binds = np.array(rig.GetAttribute("bindTransforms").Get())
+    binds[1:, :3, :3] *= np.array([-1, -2])[:, None, None]
+    rig.GetAttribute("bindTransforms").Set([Gf.Matrix4d(each.tolist()) for each in binds])
+    rest = [binds[0], *(binds[joint] @ np.linalg.inv(binds[joint - 1]) for joint in (1, 2))]
+    values = Vt.Matrix4dArray([Gf.Matrix4d(each.tolist()) for each in rest])
+    rig.CreateAttribute("restTransforms", Sdf.ValueTypeNames.Matrix4dArray).Set(values)
+    nod = UsdSkel.Animation(rig.GetChild("Nod"))
+    nod.GetScalesAttr().Set([Gf.Vec3h(-1), Gf.Vec3h(1), Gf.Vec3h(2)])
+    nod.GetTranslationsAttr().Set([(0, 0.4, 0), (0, 1, 0), (-0.4, 0, 0)])
+
+
+@pytest.mark.parametrize("where", ["skelroot", "beside", "own file", "scaled joints"])
 def test_usdskel_deforms_the_written_garment_as_the_core_does(where, tmp_path):
-    scene, _, out = rigged(tmp_path, where, meters=0.1, up="Z")
+    if where == "scaled joints":
+        source, garment = hero(tmp_path, "beside", meters=0.1, up="Z")
+        edited(source, mirrored)
+        scene, out = dress(source, garment), tmp_path / "rigged.usda"
+        write_rigged_stage(source, scene, out)
+        np.testing.assert_allclose(
+            read_proxy_rig(out, scene.character.skeleton).bind_transforms, scene.rig.bind_transforms, atol=1e-9
+        )
+    else:
+        scene, _, out = rigged(tmp_path, where, meters=0.1, up="Z")
     motion = read_motion(out, scene.character.skeleton)
     assert motion.frame_count == 3
     local = kinematics.rigid(kinematics.matrix_from_quaternion(motion.rotations), motion.translations)

@@ -31,7 +31,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
-    from ...devices import select_device
+    from ...devices import busy_cores, kept_busy, select_device
     from ...scene.fabrics import FABRICS
     from ...training.memory import StepMemory, decoded_frames, free_memory
 
@@ -62,6 +62,8 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         "scaled by contact samples and frames from a garment on two CPU threads or several on a shared GPU; "
         "the actual time may differ by half"
     )
+    if device.type == "cpu" and (others := kept_busy(busy_cores())):
+        why += f", and {others} now, so that it takes longer as long as they do"
     long = seconds is not None and seconds > LONG
     yield Finding(
         severity="warning" if long else "info",

@@ -111,6 +111,7 @@ def _on_fit(inputs: PreflightInput) -> Findings:
         yield from fit.penetration(mesh, body)
         yield from worn_over.layers(mesh, inputs.character, inputs.inner)
         yield from winding.inside_out(mesh, body)
+        yield from meshes.two_layers(mesh)  # by millimetres: in other units any sleeve is thin
         yield from pose.rest_pose(inputs.character, mesh)
 
 

@@ -6,9 +6,15 @@ from __future__ import annotations
 import numpy as np
 
 from ...events import format_count
+from ...physics.skin.blocked_rays import NO_TRIANGLE, BlockedRays
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas, merged_places
+from ...scene.mesh.topology import NO_AREA, SLIVER, edge_use, face_areas, islands, merged_places
 from .finding import Finding, Findings, index_tuple
+
+SHELL = (2e-4, 0.015)  # [m] between the layers of cloth with thickness
+SHELL_SHARE, SHELL_SPREAD = 0.8, 3.0  # of its faces that have a layer behind them; between thick and thin places
+LARGE = 0.2  # of a garment's area, from which on an island is cloth, and no button
+BACK_TO_BACK = -0.7  # cosine between the normals of two layers
 
 
 def isolated_vertices(mesh: Mesh) -> Findings:
@@ -121,6 +127,45 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
             elements="faces",
             indices=index_tuple(np.flatnonzero(sliver)),
         )
+
+
+def two_layers(mesh: Mesh) -> Findings:
+    """Yield large islands that are shells: nearly everywhere another layer of them is behind, at about one distance.
+
+    Pleats have layers at many distances. Small islands may be buttons and cords, which are solid.
+    """
+    rays = BlockedRays(mesh.points, mesh.faces)
+    corners, origin = mesh.points[mesh.faces], mesh.points.mean(axis=0)
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = np.linalg.norm(flat, axis=1)
+    flat /= areas.clip(1e-30)[:, None]
+    points, starts = ((each - origin).astype(np.float32) for each in (mesh.points, corners.mean(axis=1)))
+    count, island = len(mesh.faces), islands(mesh.faces, mesh.vertex_count)[mesh.faces[:, 0]]
+    low, high = (np.full(count, reach, np.float32) for reach in SHELL)
+    for side in (-1, 1):  # as it is wound, or inside out
+        directions = (side * flat).astype(np.float32)
+        met, away = rays.find(points, starts, directions, low, high, np.full(count, NO_TRIANGLE))
+        backs = (met != NO_TRIANGLE) & (island[met] == island) & (np.sum(flat * flat[met], axis=1) < BACK_TO_BACK)
+        for number in np.unique(island[backs]):
+            own = island == number
+            thin, thick = np.percentile(away[own & backs], (10, 90))
+            is_large = areas[own].sum() >= LARGE * areas.sum()
+            if not is_large or backs[own].mean() < SHELL_SHARE or thick > SHELL_SPREAD * thin:
+                continue
+            vertices, apart = np.unique(mesh.faces[own]), 1000 * np.median(away[own & backs])
+            yield Finding(
+                severity="warning",
+                code="two-layers",
+                prim=mesh.path,
+                count=len(vertices),
+                found=f"cloth with thickness: one piece whose two layers are {apart:.1f} mm apart",
+                why="each layer is cloth of its own: it weighs and costs twice as much, and one passes through the "
+                "other",
+                fix="delete one layer, and give it thickness on top: in USD let the whole mesh ride on it as a trim "
+                "(ssilk:rideSoft), in Blender put a Solidify modifier below the Armature modifier",
+                elements="vertices",
+                indices=index_tuple(vertices),
+            )
 
 
 def distinct_faces(faces: Ints) -> Ints:

@@ -59,6 +59,13 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
                     report(event)
 
 
+def need_bodies(tasks: Sequence[BakeTask]) -> None:
+    """Raise `SsilkError` where a model does not dress the body of a task, before any is baked."""
+    known = _Known()
+    for request in {_body(task.request): task.request for task in tasks}.values():
+        known.of_body(request)
+
+
 class _Known:
     """Garments on their characters, and frames of shots, each read once for all tasks."""
 

@@ -13,7 +13,8 @@ from ...files import sha256
 from ...network.checkpoint import load_model
 from ...physics.intersections.figures import EVERY, NOT_COUNTED, LayerFigures
 from ...physics.intersections.pairs import can_find
-from ...scene.assets import Floats
+from ...scene.assets import Floats, Mesh
+from .opened import open_shot
 from .record import TaskRecord
 from .shots import STAGE, finished, write_shot_stage
 from .stated_layers import layer_facts, stated_layers, worn_pairs
@@ -21,6 +22,9 @@ from .task import BakeTask
 
 if TYPE_CHECKING:
     from ssilk_usd.shots.play import Shot
+
+    from ...physics.intersections.layers import ClothLayers
+    from ..gltf.play import GlbShot
 
 FRAMES_AT_ONCE = 32
 
@@ -91,6 +95,30 @@ def tell_layers(folder: Path, shot: str, report: Reporter, verb: str = "bake") -
             text = f"{stage}: it says something else of {each.outer} over {each.inner} than was counted in its layers"
             report(Message(f"{text}; bake one of the two again", "warning"))
     return touching
+
+
+def tell_over(path: Path, beneath: Mapping[str, Path], report: Reporter) -> None:
+    """Count how a garment lies over those beneath it, each in a file of its own, and report it.
+
+    Args:
+        path: the garment's file.
+        beneath: files of the others, by their names.
+
+    Raises:
+        SsilkError: a file cannot be read.
+    """
+    if not can_find():
+        report(Message(f"{path}: cloth through other garments is {NOT_COUNTED}", "warning"))
+        return
+    from ...physics.intersections.layers import ClothLayers
+
+    outer = _Layer(open_shot(path))
+    for name, file in beneath.items():
+        inner = _Layer(open_shot(file))
+        cloth = ClothLayers((path.stem, name), outer.rest, inner.rest, _body(outer, inner))
+        if figures := _figures(cloth, outer, inner, path.stem):
+            named = {"shot": str(path), "garment": path.stem, "over": name}
+            report(Result("bake", {**named, **figures.summary("time code")}))
 
 
 def inner_first(tasks: Sequence[BakeTask]) -> list[BakeTask]:
@@ -182,13 +210,11 @@ def _beside(found: Mapping[str, TaskRecord], name: str) -> dict[str, TaskRecord]
 def _counted(folder: Path, shot: str, found: Mapping[str, TaskRecord], one: str, other: str) -> LayerFigures | None:
     """Count in every `EVERY`-th frame that two garments have, as their layers play it; None where they share none."""
     from ssilk_usd.shots.layers import Layout
-    from ssilk_usd.shots.play import Shot
 
     from ...physics.intersections.layers import ClothLayers
-    from ...scene.mesh.joined import joined
 
-    both = {name: _Layer(Shot(Layout(folder, name, shot).animation)) for name in (one, other)}
-    body = joined(both[one].bodies or both[other].bodies)
+    both = {name: _Layer(open_shot(Layout(folder, name, shot).animation)) for name in (one, other)}
+    body = _body(both[one], both[other])
     if _is_over(found[one], found[other]):
         cloth = ClothLayers((one, other), both[one].rest, both[other].rest, body)
     elif _is_over(found[other], found[one]):
@@ -196,6 +222,17 @@ def _counted(folder: Path, shot: str, found: Mapping[str, TaskRecord], one: str,
     else:
         cloth = ClothLayers.by_cover((one, both[one].rest), (other, both[other].rest), body)
     over, under = (both[name] for name in cloth.names)
+    return _figures(cloth, over, under, shot)
+
+
+def _body(one: _Layer, other: _Layer) -> Mesh | None:
+    from ...scene.mesh.joined import joined
+
+    return joined(one.bodies or other.bodies)
+
+
+def _figures(cloth: ClothLayers, over: _Layer, under: _Layer, shot: str) -> LayerFigures | None:
+    """Count in every `EVERY`-th frame that two garments have; None where they share none."""
     shared = set(under.shot.frame_times)
     times = [time for time in over.shot.frame_times if time in shared][::EVERY]
     if not times:
@@ -217,17 +254,22 @@ class _Layer:
 
     Attributes:
         rest: its mesh in the bind pose.
-        bodies: those of its character that are there.
+        bodies: those of its character that are there, of a stage of USD.
     """
 
-    def __init__(self, shot: Shot) -> None:
+    def __init__(self, shot: Shot | GlbShot) -> None:
         from ssilk_usd.shots.read import read_parts
 
-        self.shot, meshes = shot, [part.mesh for part in read_parts(shot)]
-        self._place = next(place for place, mesh in enumerate(shot.meshes) if mesh.is_garment)
-        self.rest = meshes[self._place]
+        from ..gltf.play import GlbShot
+
+        self.shot, self.bodies = shot, list[Mesh]()
+        if isinstance(shot, GlbShot):
+            self.rest = shot.garment_at_rest
+            return
+        meshes = [part.mesh for part in read_parts(shot)]
+        self.rest = next(mesh for mesh, own in zip(meshes, shot.meshes) if own.is_garment)
         self.bodies = [mesh for mesh, own in zip(meshes, shot.meshes) if not (own.is_garment or own.is_rider)]
 
     def points(self, times: Sequence[float]) -> list[Floats]:
         """Return positions of the garment at some frame times [m], each (V, 3)."""
-        return [self.shot.mesh_points(self._place, time) for time in times]
+        return [self.shot.garment_points(time) for time in times]

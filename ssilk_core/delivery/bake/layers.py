@@ -15,6 +15,7 @@ from ...files import FileHashes, need_folder, remove_unfinished_in, replacing, s
 from ...scene.riders import RiderJoints
 from ...work_record import is_file
 from ..targets import check_influences
+from .asked import need_bodies
 from .beneath import tell_left_out
 from .certificate.certified import certified, proven
 from .certificate.requirements import need_certifier
@@ -92,6 +93,8 @@ def bake_layers(
     if any(task.request.meets_beneath for task in tasks):
         tasks = inner_first(tasks)
     layers.need_names(tasks)
+    if len({task.request.stage for task in tasks}) > 1:  # one is asked as it is baked
+        need_bodies([task for task in tasks if again or not layers.is_done(task)])
     report(Started("bake", len(tasks), {"output": str(folder)}))
     try:
         for task in tasks:

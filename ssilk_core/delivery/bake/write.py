@@ -21,6 +21,7 @@ from .counted import state_rollout_counts
 from .glb import warn_of_sets, write_glb_shot
 from .hiding import hidden_polygons_of
 from .latents import solved
+from .layered import tell_over
 from .origin import shot_metadata
 from .refinement import refined
 from .request import BakeRequest, need_body, split_start
@@ -92,6 +93,8 @@ def bake(
     result = result_of(rollout, path, summary, counts, verification, hidden)
     rollout.warn(report)
     report(Result("bake", result.figures()))
+    if beneath and not place:
+        tell_over(path, beneath, report)
     return result
 
 

@@ -32,6 +32,8 @@ class Skeleton:
         placement: skeleton space in its stage's units to world [m], a similarity, shape (4, 4), where the xforms
             above the skeleton tilt or scale it; None elsewhere.
         seen: the joints that a network sees in place of these; None for these.
+        scales: by which the space of each joint is scaled in its stage, shape (J,), at rest and in its motions: it
+            moves no point, and is left out here; None where it is 1.
     """
 
     path: str
@@ -42,6 +44,7 @@ class Skeleton:
     hub: int = 0
     placement: Floats | None = None
     seen: SeenJoints | None = None
+    scales: Floats | None = None
 
     def __post_init__(self) -> None:
         count = len(self.joint_names)
@@ -61,6 +64,10 @@ class Skeleton:
             if self.placement.shape != (4, 4):
                 fail(self.path, f"a placement of shape {self.placement.shape}", "(4, 4) is needed")
             need_finite(self.placement, self.path, "placement")
+        if self.scales is not None:
+            assign(self, scales=frozen(self.scales, np.float64))
+            if self.scales.shape != (count,) or not (np.isfinite(self.scales) & (self.scales != 0)).all():
+                fail(self.path, f"scales {self.scales} for {count} joints", "one for each joint is needed, none is 0")
         if self.parents.shape != (count,):
             fail(self.path, f"{len(self.parents)} parents for {count} joints", "one parent for each joint is needed")
         bad = np.flatnonzero((self.parents >= np.arange(count)) | (self.parents < -1))

@@ -109,6 +109,10 @@ def read_list(path: Path) -> list[WardrobeEntry]:
     defaults = tables.pop(DEFAULTS, {})
     if not tables:
         fail(str(path), "no garment in it", "a list holds one table for each garment", "add [name]")
+    for name, table in tables.items():
+        if name in table.get("over", ()):  # in [defaults], which all inherit, it stands for all but itself
+            found, allowed = "it names itself", "garments beneath it are named"
+            fail(f"{path}: table '{name}', key 'over'", found, allowed, "remove its own name")
     entries = [_entry(path, name, _joined(defaults, table)) for name, table in tables.items()]
     for entry in entries:
         for inner in entry.over:

@@ -97,6 +97,23 @@ def codes(findings: list[Finding]) -> set[str]:
 # The mesh by itself
 
 
+def test_cloth_with_thickness_is_told_and_other_cloth_is_not():
+    sheet = tube()
+    count, rows = sheet.vertex_count, sheet.vertex_count // 32
+    outer = sheet.points * [1.03, 1, 1.03]  # 5 mm further out
+    rim = [(a, (a + 1) % 32) for a in range(32)]
+    joined = [[(a, b, b + count), (a, b + count, a + count)] for a, b in rim]
+    top = [[(a + low, b + low + count, b + low), (a + low, a + low + count, b + low + count)]
+           for low in [32 * (rows - 1)] for a, b in rim]  # fmt: skip
+    faces = np.concatenate([sheet.faces[:, ::-1], sheet.faces + count, *joined, *top])
+    shell = Mesh(sheet.path, np.concatenate([sheet.points, outer]), faces)
+    for mesh in (shell, replace(shell, faces=faces[:, ::-1])):  # inside out, too
+        found = only(meshes.two_layers(mesh))
+        assert found.count == 2 * count and "two layers are 5.1 mm apart" in found.found
+    for mesh in (sheet, grid(), replace(shell, faces=faces[: 2 * len(sheet.faces)])):
+        assert not list(meshes.two_layers(mesh))
+
+
 def test_isolated_vertices():
     sheet = grid()
     with_lone = Mesh(
@@ -485,10 +502,16 @@ def dressed(cloth: Mesh):
     return prepare_scene(hero(), Garment(cloth, classes=classes), rig_options=RigOptions(proxies=4))
 
 
-def test_joints_that_cannot_matter():
+def test_joints_that_cannot_matter(monkeypatch):
     found = list(cost.training_cost(dressed(tube()), [still()], PRESETS["draft"]))
     assert [f.code for f in found] == ["memory", "time", "irrelevant-joints"]
     assert found[-1].indices == (2,)  # nothing is skinned to the tail
+    assert "other programs" not in found[1].why
+    monkeypatch.setattr("ssilk_core.devices.busy_cores", lambda: 1.5)
+    assert (
+        "other programs put a load of about 1.5 on"
+        in list(cost.memory(dressed(tube()), PRESETS["draft"], 100))[1].why
+    )
 
 
 def test_memory_says_when_the_batch_is_lowered(monkeypatch):

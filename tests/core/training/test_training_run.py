@@ -893,7 +893,7 @@ def test_cores_that_other_programs_take_are_told(job, monkeypatch, load, is_told
     heard: list[Event] = []
     train(job(f"busy_{is_told}", replace(SHORT, iterations=1, static_fraction=0)), heard.append)
     said = [event.text for event in heard if isinstance(event, Message) and "other programs" in event.text]
-    assert len(said) == is_told and all("about 2.5 of" in text for text in said)
+    assert len(said) == is_told and all("about 2.5 on" in text for text in said)
 
 
 def test_a_training_that_is_stopped_inside_a_step_says_from_where_it_goes_on(job, monkeypatch):

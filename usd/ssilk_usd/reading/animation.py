@@ -12,10 +12,10 @@ from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import column_matrix, inherited, value
 from .bindings import unapplied
+from .joint_scales import SCALE_TOLERANCE, uniform_scales
 
 SOURCE = "skel:animationSource"
 NEEDED = ("translations", "rotations", "scales")  # without one of these UsdSkel poses no joint
-_RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -64,25 +64,29 @@ class PosedJoints:
     Attributes:
         names: UsdSkel joint paths of the skeleton, length N.
         source: index of each joint in the animation, -1 where it stays at rest, shape (N,).
-        rest: joint to parent at rest in stage units, shape (N, 4, 4).
+        rest: joint to parent at rest in stage units, but for its scale, shape (N, 4, 4).
+        factors: by which each is scaled there, shape (N,).
     """
 
     names: tuple[str, ...]
     source: Ints
     rest: Floats
+    factors: Floats
 
 
 def posed_joints(animated: tuple[str, ...], skeleton: Usd.Prim) -> PosedJoints | None:
     """Return which joints of a skeleton an animation of the joints `animated` poses.
 
-    None where that skeleton says no rest pose that joints without scale can have.
+    None where that skeleton says no rest pose that joints can have.
     """
     names = tuple(str(name) for name in value(skeleton, "joints") or ())
     rest = column_matrix(value(skeleton, "restTransforms") or np.zeros((0, 4, 4)))
     if not names or rest.shape != (len(names), 4, 4):
         return None
-    turns = rest[:, :3, :3]
-    if not np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max() < _RIGID_TOLERANCE:
+    factors = uniform_scales(rest)
+    if not np.isfinite(factors).all() or not factors.all():
         return None
+    factors = np.where(np.abs(factors - 1) <= SCALE_TOLERANCE, 1.0, factors)
+    rest[:, :3, :3] /= factors[:, None, None]
     among = {name: index for index, name in enumerate(animated)}
-    return PosedJoints(names, np.array([among.get(name, -1) for name in names]), rest)
+    return PosedJoints(names, np.array([among.get(name, -1) for name in names]), rest, factors)

@@ -73,7 +73,7 @@ def _joint_transforms(skel: SkelSource, codes: list[float]) -> Floats:
     cache = UsdSkel.Cache()
     cache.Populate(UsdSkel.Root(skel.root), PRIMS)
     query = cache.GetSkelQuery(UsdSkel.Skeleton(skel.prim))
-    return np.stack([column_matrix(query.ComputeJointSkelTransforms(code)) for code in codes])
+    return skel.unscaled(np.stack([column_matrix(query.ComputeJointSkelTransforms(code)) for code in codes]))
 
 
 def _corners(prim: Usd.Prim) -> Floats:

@@ -76,6 +76,25 @@ def read_character(
     )
 
 
+def bodies_beside(source: StageLike, garments: Sequence[str], own: str | None = None) -> list[str]:
+    """Return the paths of a character's bodies where some of its meshes, which count as such, are garments.
+
+    Args:
+        garments: other garments than `own`, by path or name; none of them may be marked as one.
+        own: the garment that is meant, by path or name.
+
+    Returns:
+        Nothing where none of the garments counts as a body, so that none has to be named.
+
+    Raises:
+        SsilkError: as `read_character` does.
+    """
+    skel = find_skeleton(open_stage(source), garment=own)  # which keeps the stage, on which prims live
+    every = rendered(_body_prims(skel, (), own))
+    worn = {prim.GetPath() for name in garments for prim in named(every, name)}
+    return [str(prim.GetPath()) for prim in every if prim.GetPath() not in worn] if worn else []
+
+
 def has_meshes(stage: Usd.Stage, root: str | None, names: Sequence[str]) -> bool:
     """Return whether meshes of all these names lie beneath a character's SkelRoot; raise as `read_character` does."""
     beneath = Usd.PrimRange(find_skeleton(stage, root=root).root, PRIMS)

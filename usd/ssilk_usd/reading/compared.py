@@ -135,7 +135,7 @@ class Compared:
         What is compared is the garment, however its proxies are posed.
         """
         local = np.array(at_rest[self.skeleton.joint_count :])
-        posed = column_matrix(self.query.ComputeJointSkelTransforms(Usd.TimeCode(code)))
+        posed = self.there.unscaled(column_matrix(self.query.ComputeJointSkelTransforms(Usd.TimeCode(code))))
         for proxy, joint in enumerate(match_joints(rig.joint_names, self.there.joints)):
             if joint >= 0 and self.there.parents[joint] >= 0:
                 local[proxy] = np.linalg.inv(posed[self.there.parents[joint]]) @ posed[joint]

@@ -70,7 +70,7 @@ def read_garment(
         SsilkError: there is no garment or several, or the data is malformed.
     """
     stage = open_stage(source)
-    prim = find_garment(stage, garment)
+    prim = find_garment(stage, garment, root)
     skel = fitted_skeleton(prim, root)
     place = garment_place(prim, skel, skeleton)
     mesh = read_mesh(prim, place.to_core, shape_offsets(prim, skel) if skel and shaped else None)
@@ -98,8 +98,10 @@ def with_stiffness(mesh: Mesh, prim: Usd.Prim) -> Mesh:
     return replace(mesh, stiffness=_per_point(prim, STIFFNESS))
 
 
-def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
+def find_garment(stage: Usd.Stage, garment: str | None = None, root: str | None = None) -> Usd.Prim:
     """Find the garment mesh of a stage: the named one, the only marked one, or the only mesh without a character.
+
+    Of several, it is the one beneath the SkelRoot that `root` names, itself or by its Skeleton.
 
     Raises:
         SsilkError: there is no such mesh, or no unique one; the message lists the meshes.
@@ -121,6 +123,9 @@ def find_garment(stage: Usd.Stage, garment: str | None = None) -> Usd.Prim:
                 "name it with --garment",
             )
         found = rendered(found)
+    if len(found) > 1 and root is not None:
+        tops = [top.GetPath() for top, skeleton in skeletons(stage) if named([top, skeleton], root)]
+        found = [prim for prim in found if any(prim.GetPath().HasPrefix(top) for top in tops)] or found
     if len(found) != 1:
         fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
     return found[0]

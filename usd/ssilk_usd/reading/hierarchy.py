@@ -32,7 +32,7 @@ def to_parents_of(
         alone: no skeleton says that what has no parents by its path has none. Names without paths may be short for
             joints with them, then; the lengths of bones tell.
     """
-    found, above = authored[:, match], _parents(names)
+    found, above = authored[:, match], parents_by_path(names)
     moved = np.flatnonzero(match >= 0)
     nearest = np.array([_nearest(joint, skeleton, match) for joint in range(len(match))])
     known = np.where(nearest < 0, -1, match[nearest])
@@ -94,7 +94,7 @@ def _rigid(similarity: Floats) -> Floats:
     return rigid(similarity[..., :3, :3] / scale, similarity[..., :3, 3])
 
 
-def _parents(names: tuple[str, ...]) -> Ints:
+def parents_by_path(names: tuple[str, ...]) -> Ints:
     """Return the nearest joint above each one by their paths, as UsdSkel has it, -1 for none, shape (N,)."""
     place = {name: index for index, name in enumerate(names)}
     found = np.full(len(names), -1)

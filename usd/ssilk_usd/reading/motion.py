@@ -29,12 +29,12 @@ from ..opening.times import change_times, xform_attributes
 from ..units import StageUnits
 from .animation import PosedJoints, animation_source, posed_joints
 from .clips import LOOKED_AT, ClipSpace, Posture, clip_space, spread
-from .hierarchy import beneath_rest, placed_at_rest, to_parents_of
+from .hierarchy import beneath_rest, parents_by_path, placed_at_rest, to_parents_of
+from .joint_scales import SCALE_TOLERANCE, spread_out, total_scales
 from .skeleton import of_bodies, skeletons
 from .skin import match_joints, need_unique
 from .spaces import joints_to_core, need_similarity, similarity_scale
 
-_SCALE_TOLERANCE = 1e-3
 _FRAMES_AT_ONCE = 1024  # while reading: 4 MB for each array of matrices of 30 joints
 FARTHEST = 100_000.0  # [m] that a joint may be from its parent, or a root from the origin: damage lies beyond
 _MOST_TIME_CODES = 1e9  # in a second; some programs count in ticks
@@ -129,11 +129,7 @@ def read_motion(
     rotations, translations = (np.empty((len(codes), skeleton.joint_count, width)) for width in (4, 3))
     for first in range(0, len(codes), _FRAMES_AT_ONCE):
         part = slice(first, first + _FRAMES_AT_ONCE)
-        turned, moved = read_samples(animation, codes[part], len(joints), where)
-        authored = rigid(matrix_from_quaternion(turned), moved)
-        if posed:
-            at_rest = np.broadcast_to(posed.rest, (len(authored), *posed.rest.shape))
-            authored = np.where((posed.source < 0)[:, None, None], at_rest, authored[:, posed.source])
+        authored = _rigid_joints(animation, joints, codes[part], posed, skeleton, match)
         names, metres = posed.names if posed else joints, scale * units.meters_per_unit
         authored = to_parents_of(skeleton, authored, names, match, metres, alone=placed is None)
         placement = placements[part] if placed else placements
@@ -171,12 +167,51 @@ def _space(animation: Usd.Prim, joints: tuple[str, ...], match: Ints, codes: Flo
     """Return the space of an animation that stands alone, of a character whose Xforms place it."""
     assert skeleton.placement is not None
     stage = animation.GetStage()
-    turns, places = read_samples(animation, spread(codes, LOOKED_AT), len(joints), location(animation))
     metres = similarity_scale(skeleton.placement)
-    authored = rigid(matrix_from_quaternion(turns), places)
+    authored = _rigid_joints(animation, joints, spread(codes, LOOKED_AT), None, skeleton, match)
     local = to_parents_of(skeleton, authored, joints, match, metres, alone=True)
     says_axis = stage.HasAuthoredMetadata(UsdGeom.Tokens.upAxis)
     return clip_space(local, match, StageUnits.of(stage), skeleton, says_axis=says_axis)
+
+
+def _rigid_joints(
+    animation: Usd.Prim,
+    joints: tuple[str, ...],
+    codes: Floats,
+    posed: PosedJoints | None,
+    skeleton: Skeleton,
+    match: Ints,
+) -> Floats:
+    """Return the joint-to-parent transforms of an animation, of the joints `posed` if given, without their scales.
+
+    They are in its stage's units, shape (F, N, 4, 4).
+
+    Raises:
+        SsilkError: joints of the skeleton are scaled otherwise than at rest; also as `read_samples`.
+    """
+    where = location(animation)
+    turns, places, factors = _scaled_samples(animation, codes, len(joints), where)
+    local, names, kept = rigid(matrix_from_quaternion(turns), places), joints, np.flatnonzero(match >= 0)
+    expected = np.ones(len(kept)) if skeleton.scales is None else skeleton.scales[kept]
+    if posed:
+        still, names = posed.source < 0, posed.names
+        at_rest = np.broadcast_to(posed.rest, (len(local), *posed.rest.shape))
+        local = np.array(np.where(still[:, None, None], at_rest, local[:, posed.source]))
+        factors = np.where(still, posed.factors, factors[posed.source])
+        expected = total_scales(posed.factors, parents_by_path(names))[match[kept]]
+    parents = parents_by_path(names)
+    totals = total_scales(factors, parents)
+    off = ~(np.abs(totals[match[kept]] / expected - 1) <= SCALE_TOLERANCE)  # NaN is off, too
+    if off.any():
+        first = skeleton.joint_names[kept[off.argmax()]]
+        fail(
+            where,
+            f"{np.count_nonzero(off)} joints are scaled otherwise than at rest, {first} first",
+            "joints may only rotate and move, and keep the scale of their rest pose",
+            "remove the scale",
+        )
+    totals = np.where(np.isfinite(totals) & (totals != 0), totals, 1.0)  # of joints that the skeleton lacks
+    return spread_out(local, totals, parents)
 
 
 def find_animation(stage: Usd.Stage, prim: str | None, root: str | None) -> tuple[Usd.Prim, Usd.Prim | None]:
@@ -295,17 +330,28 @@ def _changes(attribute: Usd.Attribute, times: list[float]) -> bool:
 
 def read_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats]:
     """Return rotations (F, N, 4) as (w, x, y, z) and translations (F, N, 3) in stage units."""
+    rotations, translations, factors = _scaled_samples(animation, codes, count, where)
+    scaled = int(np.count_nonzero(factors != 1))
+    if scaled:
+        fail(where, f"{scaled} joints are scaled", "joints may only rotate and move", "remove the scale")
+    return rotations, translations
+
+
+def _scaled_samples(animation: Usd.Prim, codes: Floats, count: int, where: str) -> tuple[Floats, Floats, Floats]:
+    """Return also the one factor by which each joint is scaled, shape (N,): NaN where it differs by time or axis."""
     rotations = _sampled(animation, "rotations", codes, (count, 4), where)
     translations = _sampled(animation, "translations", codes, (count, 3), where)
+    factors = np.ones(count)
     if animation.GetAttribute("scales").HasAuthoredValue():
-        scales = _sampled(animation, "scales", codes, (count, 3), where)
-        scaled = int(np.count_nonzero((np.abs(scales - 1) > _SCALE_TOLERANCE).any(axis=(0, 2))))
-        if scaled:
-            fail(where, f"{scaled} joints are scaled", "joints may only rotate and move", "remove the scale")
+        scales = np.moveaxis(_sampled(animation, "scales", codes, (count, 3), where), 1, 0).reshape(count, -1)
+        first = scales[:, :1]
+        even = (np.abs(scales - first) <= SCALE_TOLERANCE * np.abs(first)).all(axis=1) & (first[:, 0] != 0)
+        near_one = (np.abs(scales - 1) <= SCALE_TOLERANCE).all(axis=1)
+        factors = np.where(near_one, 1.0, np.where(even, first[:, 0], np.nan))
     norms = np.linalg.norm(rotations, axis=-1, keepdims=True)
     if norms.min() <= 1e-6:
         fail(where, "a rotation is the zero quaternion", "rotations are unit quaternions", "repair it")
-    return np.roll(rotations / norms, 1, axis=-1), translations
+    return np.roll(rotations / norms, 1, axis=-1), translations, factors
 
 
 def _sampled(animation: Usd.Prim, name: str, codes: Floats, shape: tuple[int, int], where: str) -> Floats:

@@ -137,5 +137,5 @@ def _shown(source: SkelSource, query: UsdSkel.SkeletonQuery | None, time: Usd.Ti
     posed = world_transforms(source.rest, source.parents)
     if query:
         found = query.ComputeJointSkelTransforms(time)
-        posed = column_matrix(found) if found else posed
+        posed = source.unscaled(column_matrix(found)) if found else posed
     return source.units.matrix @ source.placement @ posed @ scaling(1 / source.joint_scale)

@@ -42,7 +42,7 @@ def read_proxy_rig(
         SsilkError: a proxy hangs from another garment's, or vertices have no weights left and no LBS weights.
     """
     stage = open_stage(source)
-    prim = find_garment(stage, garment)
+    prim = find_garment(stage, garment, root)
     if not has_value(prim, PROXIES):
         return None
     where, skel = location(prim), fitted_skeleton(prim, root)

@@ -25,6 +25,7 @@ from ..opening.stage import (
 )
 from ..units import StageUnits
 from .carried import carried_by
+from .joint_scales import SCALE_TOLERANCE, divided, total_scales, uniform_scales, without_scales
 from .mesh import is_body, is_drawn, placement, rendered
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
@@ -43,11 +44,12 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | N
     """
     where, found = stage_name(stage), skeletons(stage)
     if not found:
+        lone, todo = _beneath_none(stage)
         fail(
             where,
-            "there is no SkelRoot with a Skeleton",
+            f"there is no SkelRoot with a Skeleton{lone}",
             "a character is a SkelRoot with a Skeleton and meshes bound to it",
-            "export the character with its armature",
+            todo,
         )
     chosen = found if root is None else _pairs_named(found, root)
     chosen = of_bodies(stage, chosen, garment) if len(chosen) > 1 else chosen
@@ -62,6 +64,22 @@ def find_skeleton(stage: Usd.Stage, *, root: str | None = None, garment: str | N
             f"{_CHOOSE}, by the path of its Skeleton if need be",
         )
     return skeleton_at(*chosen[0])
+
+
+def _beneath_none(stage: Usd.Stage) -> tuple[str, str]:
+    """Return in words why a Skeleton is no character's, where there is one, and what to do."""
+    lone = next((prim for prim in Usd.PrimRange.Stage(stage, PRIMS) if prim.IsA(UsdSkel.Skeleton)), None)
+    if lone is None:
+        return "", "export the character with its armature"
+    above = lone.GetParent()
+    while not above.IsPseudoRoot():
+        if above.GetPrimTypeInfo().GetTypeName() and any(
+            spec.typeName == "SkelRoot" for spec in above.GetPrimStack()
+        ):
+            text = f"; {above.GetPath()} refers to one and is declared as '{above.GetTypeName()}' over it"
+            return text, f'declare it without a type, as in: def "{above.GetName()}"'
+        above = above.GetParent()
+    return f"; {lone.GetPath()} lies beneath none", "make a prim above it and its meshes a SkelRoot"
 
 
 def _pairs_named(pairs: list[tuple[Usd.Prim, Usd.Prim]], name: str) -> list[tuple[Usd.Prim, Usd.Prim]]:
@@ -114,7 +132,8 @@ def character_skeleton(source: SkelSource) -> Skeleton:
     names = tuple(source.joints[index] for index in kept)
     binds, world = source.binds_to_core(source.bind[kept]), source.skeleton_to_world
     hub = carrying_joint([moved[kept] for moved in _moved(source)], parents, binds[:, :3, 3])
-    return Skeleton(location(source.prim), names, parents, binds, rest, hub, world)
+    scales = None if (source.scales == 1).all() else source.scales[kept]
+    return Skeleton(location(source.prim), names, parents, binds, rest, hub, world, scales=scales)
 
 
 def _moved(source: SkelSource) -> list[Floats]:
@@ -170,6 +189,13 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
     if bind is None:
         fail(where, "the skeleton has no bindTransforms", "one for each joint is needed", "export the armature again")
     rest = _matrices(prim, "restTransforms", len(joints))
+    totals = np.ones(len(joints))
+    if rest is not None:
+        totals = total_scales(uniform_scales(rest), parents)
+        if not np.isfinite(totals).all() or np.abs(totals - 1).max() <= SCALE_TOLERANCE:
+            totals = np.ones(len(joints))  # what is no scale alone is told where it is no rotation either
+        else:
+            bind, rest = divided(bind, totals), without_scales(rest, totals, parents)
     placed = need_similarity(prim, world_matrix(prim))
     return SkelSource(
         stage=prim.GetStage(),
@@ -182,6 +208,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
         rest=_rest_from_bind(bind, parents) if rest is None else rest,
         placement=placed,
         owners=_owners(root, joints, parents),
+        scales=totals,
     )
 
 

@@ -19,6 +19,7 @@ from ssilk_core.scene.kinematics import world_transforms
 
 from ..opening.stage import location
 from ..units import StageUnits, scaling
+from .joint_scales import divided
 
 _RIGID_TOLERANCE = 1e-3
 _TILTED = 0.5  # cosine between the up axes of skeleton and stage below which they differ
@@ -36,6 +37,7 @@ class SkelSource:
         bind, rest: joint to bind space, joint to parent; stage units, column vectors, shape (N, 4, 4).
         placement: skeleton space to world at the earliest time, a similarity, shape (4, 4).
         owners: path of the garment mesh that each joint is a proxy of; empty for the character's own joints.
+        scales: by which each joint's space is scaled in the stage, shape (N,); `bind` and `rest` are without it.
     """
 
     stage: Usd.Stage
@@ -48,6 +50,7 @@ class SkelSource:
     rest: Floats
     placement: Floats
     owners: tuple[str, ...]
+    scales: Floats
 
     @property
     def character_joints(self) -> Ints:
@@ -58,6 +61,10 @@ class SkelSource:
     def joint_scale(self) -> float:
         """Metres per unit of length in joint and skeleton space [m]."""
         return similarity_scale(self.placement) * self.units.meters_per_unit
+
+    def unscaled(self, posed: Floats) -> Floats:
+        """Return joints as USD poses them (..., N, 4, 4), without the scale of their spaces."""
+        return divided(posed, self.scales)
 
     @property
     def bind_to_core(self) -> Floats:

@@ -27,10 +27,10 @@ _LOCKS = {
 }
 
 
-def repair_lock(source: str | Path, garment: str | None = None) -> str:
+def repair_lock(source: str | Path, garment: str | None = None, root: str | None = None) -> str:
     """Return the reason why a garment's vertices and faces cannot be removed; empty if they can."""
     stage = open_stage(source)  # prims live only as long as their stage
-    prim = find_garment(stage, garment)
+    prim = find_garment(stage, garment, root)
     held = [words for name, words in _LOCKS.items() if _has(prim, name)]
     held += ["edge sets"] if any(_is_edge_set(child) for child in prim.GetChildren()) else []
     return " and ".join(held)
@@ -76,7 +76,7 @@ def write_repaired(
         SsilkError: the output cannot be written, or a primvar does not match the mesh.
     """
     stage = open_stage(source)
-    prim = find_garment(stage, garment)
+    prim = find_garment(stage, garment, root)
     place = garment_place(prim, fitted_skeleton(prim, root), skeleton)
     stage.SetEditTarget(stage.GetSessionLayer())
     for prefix in prim.GetPath().GetPrefixes():  # what is instanced cannot be edited

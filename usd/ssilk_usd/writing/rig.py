@@ -29,6 +29,7 @@ from ..opening.stage import (
 )
 from ..reading.carried import carried_by
 from ..reading.garment import fitted_skeleton, garment_place
+from ..reading.joint_scales import divided, without_scales
 from ..reading.mesh import is_garment
 from ..reading.shapes import shape_offsets
 from ..reading.skeleton import find_skeleton
@@ -258,13 +259,15 @@ def _append_proxies(skel: SkelSource, garment: str, scene: Scene) -> tuple[str, 
     joints = tuple(skel.joints[index] for index in kept)
     proxies = _proxy_paths(scene, joints)
     binds = skel.binds_from_core(scene.rig.bind_transforms)
-    bind = np.concatenate([skel.bind[kept], binds])
-    combined = np.concatenate([skel.binds_from_core(scene.character.skeleton.bind_transforms), binds])
+    bind = np.concatenate([divided(skel.bind, 1 / skel.scales)[kept], binds])
+    own = skel.binds_from_core(scene.character.skeleton.bind_transforms)
+    combined = np.concatenate([divided(own, 1 / skel.scales[skel.character_joints]), binds])
     rest = np.linalg.inv(combined[scene.rig.parents]) @ binds
+    rest = np.concatenate([without_scales(skel.rest, 1 / skel.scales, skel.parents)[kept], rest])
     skeleton = UsdSkel.Skeleton(skel.prim)
     skeleton.CreateJointsAttr(Vt.TokenArray((*joints, *proxies)))
     skeleton.CreateBindTransformsAttr(matrix_array(bind))
-    skeleton.CreateRestTransformsAttr(matrix_array(np.concatenate([skel.rest[kept], rest])))
+    skeleton.CreateRestTransformsAttr(matrix_array(rest))
     names = value(skel.prim, "jointNames")
     if names:
         short = [*(names[index] for index in kept), *map(leaf, proxies)]
