@@ -118,11 +118,17 @@ def _figure(rows: Sequence[Sequence[ChartPanel]], size: tuple[float, float]) -> 
         for number, row in enumerate(rows):
             for axes, panel in zip(grid[number], row):
                 _draw(axes, panel, looks, bottom=not shared or number == len(rows) - 1)
-        figure.draw_without_rendering()  # room for words can be told once the axes have their places
-        for axes, panel in zip(grid.flat, (panel for row in rows for panel in row)):
-            _name_points(axes, panel)
+        panels = [panel for row in rows for panel in row]
+        if any(panel.points for panel in panels):
+            figure.draw_without_rendering()  # room for words can be told once the axes have their places
+            for axes, panel in zip(grid.flat, panels):
+                _name_points(axes, panel)
         if any(names):
-            _legend(figure, looks, lines=any(panel.curves for row in rows for panel in row))
+            _legend(figure, looks, lines=any(panel.curves for panel in panels))
+        # Places are found once; a file with a layout still to be found would be drawn twice.
+        if layout := figure.get_layout_engine():
+            layout.execute(figure)
+        figure.set_layout_engine("none")
     return figure
 
 
