@@ -119,6 +119,14 @@ def read_at_once() -> Iterator[None]:
     trial._within.reset(token)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def pages_have_no_charts() -> Iterator[None]:
+    """Charts take most of the time of a page. `test_report` draws them as ever."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ssilk_core.delivery.report.shots.svg_chart", lambda *_, **__: "")
+        yield
+
+
 @pytest.fixture(scope="session")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
     """hero.usda, clip.usda, rigged.usda, model.safetensors (with its state) and shot.usda in one folder.

@@ -55,7 +55,7 @@ def wardrobe() -> dict[str, Garment]:
 
 @contextmanager
 def briefly() -> Iterator[None]:
-    """A wardrobe that is built once, a shot of six frames instead of 225, small pictures, and two short motions."""
+    """A wardrobe that is built once, a shot of four frames instead of 225, small pictures, and two short motions."""
     built, every, shot = wardrobe(), motions.training_motions, motions.demo_shot
 
     def few(skeleton: Skeleton) -> list[Motion]:
@@ -64,7 +64,7 @@ def briefly() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(garments, "build_garment", lambda name, character: built[name])
         patch.setattr(motions, "training_motions", few)
-        patch.setattr(motions, "demo_shot", lambda skeleton: shot(skeleton).clip(60, 66))
+        patch.setattr(motions, "demo_shot", lambda skeleton: shot(skeleton).clip(60, 64))
         patch.setattr(view, "_look", lambda options, film: Look(width=96, height=128, samples=1))
         yield
 
@@ -85,13 +85,16 @@ def drafted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 
 def rigged(garment: str, folder: Path) -> Scene:
-    """Return the scene of the stage that the demo's own command rigs, unless a demo has rigged it already."""
+    """Return the scene of the stage that the demo's own command rigs, unless a demo has rigged it already.
+
+    It has few proxies then: what is looked at is the garment.
+    """
     chosen = Namespace(output=folder, garment=garment, settings=[], pretrained=True)
     rig = demo._shipped(chosen)[0]
     assert rig[0] == "rig"
     if not Path(rig[-1]).exists():
         write_garment(folder / "wardrobe" / f"{garment}.usdc", wardrobe()[garment].mesh)
-        assert main(rig) == 0
+        assert main([*rig, "--proxies", "4"]) == 0
     return load_scene(parser().parse_args(["rig", rig[-1], "-o", "unused"]), silent)
 
 

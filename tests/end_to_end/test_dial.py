@@ -32,7 +32,7 @@ def world(toy, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def script(world) -> Callable[[str], None]:
-    """Run the benchmark in the world, with its options."""
+    """Run the benchmark in the world, with its options; few frames are timed."""
 
     def run(options: str) -> None:
         with pytest.MonkeyPatch.context() as patch:
@@ -42,6 +42,9 @@ def script(world) -> Callable[[str], None]:
             dial = __import__("dial")
             brief = partial(play_time, seconds=0.01)
             patch.setattr("helpers.dial_places.play_time", brief)
+            patch.setattr("helpers.dial_places.TIMED", 4)
+            patch.setattr(dial, "SHOT", 5)
+            patch.setattr("ssilk_core.network.latent_solver.elements.EQUATIONS", 128)  # enough for a toy
             dial.main()
 
     return run
@@ -99,14 +102,14 @@ def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measure
 def test_times_are_kept_beside_the_errors(measured, script, world):
     path = world / "times.json"
     path.write_text(json.dumps(measured))
-    script(f"times {OPTIONS} --shots 3 --output {path.name}")
+    script(f"times {OPTIONS} --shots 2 --output {path.name}")
     found = json.loads(path.read_text())
     assert found["figures"] == measured["figures"] and found["command"] == measured["command"]
     times = {time["place"]: time for time in found["times"]}
     assert set(times) == {row["place"] for row in measured["figures"]} - {"simulator, 1 mm off"}
     assert {time["device"] for time in found["times"]} == {"cpu"}
     assert all(time["milliseconds"] > 0 for time in found["times"])
-    assert {place for place, time in times.items() if time["shots"] != 3} == {"refine 4"}
+    assert {place for place, time in times.items() if time["shots"] != 2} == {"refine 4"}
 
 
 @pytest.mark.parametrize(

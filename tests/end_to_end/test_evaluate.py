@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shlex
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 
 import pytest
@@ -14,12 +15,19 @@ from pxr import Usd
 from ssilk_core.cli import main
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model, save_model
+from ssilk_core.quality.evaluation import asked
 from ssilk_core.quality.evaluation.kept_parts import KeptParts
 from ssilk_core.quality.evaluation.record import recorded
 
 WORLD = "--stage rigged.usda --motions clips"
 QUICK = f"{WORLD} --no-probes"
 INDEX = [{"clip": "brief", "split": "valid", "tags": ["inertia"]}, {"clip": "turn", "split": "flips", "tags": []}]
+
+
+@pytest.fixture(autouse=True)
+def loops_are_brief(monkeypatch):
+    """Two seconds of them show what a minute would."""
+    monkeypatch.setattr(asked, "EvaluationOptions", partial(asked.EvaluationOptions, loop=60))
 
 
 @pytest.fixture

@@ -16,6 +16,11 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 SIZE = 900, 1200  # [pixels]
 
 
+@pytest.fixture(autouse=True, scope="module")
+def pages_have_no_charts() -> None:
+    """They have them here."""
+
+
 @pytest.fixture(scope="module")
 def pages(toy, tmp_path_factory) -> Path:
     """A folder with shot.html, with figures, and model.html, with a shot of its own."""
