@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`ssilk live` on the toy world: a process that is fed with poses answers as a bake does, and ends with its pipe."""
+"""`ssilk live` on the toy world: fed with poses it answers as a bake does, and its process ends with its pipe.
+
+What is answered is asked of the service in a thread, at the ends of two pipes; a process takes seconds to begin.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -74,12 +79,36 @@ def start(there) -> Iterator[Callable[..., subprocess.Popen]]:
                 stream.close()
 
 
-def say(process: subprocess.Popen, number: int, motion: Motion) -> None:
+@dataclass(frozen=True)
+class Served:
+    """The other ends of the pipes of a service, under the names that a process has for them."""
+
+    stdin: BinaryIO
+    stdout: BinaryIO
+
+
+@contextmanager
+def served(**options: object) -> Iterator[Served]:
+    """A service in a thread, with some fields of the request; it ends when its pipe does."""
+    garment = load_garment(replace(REQUEST, motion=OVER_PIPE, **options))
+    (asked, stdin), (stdout, told) = os.pipe(), os.pipe()
+    with ExitStack() as stack:
+        incoming, outgoing = (stack.enter_context(open(*end, buffering=0)) for end in ((asked, "rb"), (told, "wb")))
+        thread = threading.Thread(target=serve, args=(garment, incoming, outgoing), daemon=True)
+        thread.start()
+        with open(stdout, "rb") as heard, open(stdin, "wb") as said:
+            yield Served(said, heard)
+            said.close()
+            thread.join(PATIENCE)
+        assert not thread.is_alive()
+
+
+def say(process: subprocess.Popen | Served, number: int, motion: Motion) -> None:
     process.stdin.write(LiveMessage.of_motion(number, motion).to_bytes())
     process.stdin.flush()
 
 
-def heard(process: subprocess.Popen, number: int) -> tuple[GarmentPose, LiveMessage]:
+def heard(process: subprocess.Popen | Served, number: int) -> tuple[GarmentPose, LiveMessage]:
     """All frames of a motion, in order, and what is said at its end."""
     poses: list[GarmentPose] = []
     while (message := read_message(process.stdout)) is not None:
@@ -89,7 +118,7 @@ def heard(process: subprocess.Popen, number: int) -> tuple[GarmentPose, LiveMess
             assert [pose.start for pose in poses] == list(np.cumsum([0, *(p.frame_count for p in poses[:-1])]))
             return GarmentPose.joined(poses), message
         poses.append(message.pose())
-    raise AssertionError(process.stderr.read().decode())
+    raise AssertionError(process.stderr.read().decode() if isinstance(process, subprocess.Popen) else "it ended")
 
 
 def motion_of(path: str) -> Motion:
@@ -102,9 +131,19 @@ def same(found: GarmentPose, wanted: GarmentPose, tolerance: float) -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=0, atol=tolerance)
 
 
-@pytest.mark.parametrize("clip", ["brief.usda", "film.usda"])
-def test_it_answers_with_what_a_bake_writes(start, clip):
+def test_it_answers_with_what_a_bake_writes(start):
     process = start("--latent-iterations", str(ITERATIONS))
+    check_answer(process, "brief.usda")
+    process.stdin.close()
+    assert process.wait(PATIENCE) == 0 and process.stderr.read() == b""
+
+
+def test_it_answers_a_motion_at_another_rate(there):
+    with served() as service:
+        check_answer(service, "film.usda")
+
+
+def check_answer(process: subprocess.Popen | Served, clip: str) -> None:
     ready = read_message(process.stdout)
     assert ready.kind == "ready" and ready.numbers == {"joints": 3, "proxies": 4, "shapes": 5}
     say(process, 3, motion_of(clip))
@@ -118,40 +157,39 @@ def test_it_answers_with_what_a_bake_writes(start, clip):
     assert np.ptp(found.rotations, axis=0).max() > 1e-3
     told = baking.latents.summary
     assert (done.numbers["frames"], done.numbers["failed"]) == (told.frames, told.failed)
-    process.stdin.close()
-    assert process.wait(PATIENCE) == 0 and process.stderr.read() == b""
 
 
-def test_a_motion_that_changes_takes_the_place_of_the_one_before(start):
-    process, motion = start(), motion_of("brief.usda")
+def test_a_motion_that_changes_takes_the_place_of_the_one_before(there):
+    motion = motion_of("brief.usda")
     translations = motion.translations.copy()
     translations[5:, 0, 0] += 0.1
     other = replace(motion, translations=translations)
-    say(process, 0, motion)
-    say(process, 1, other)  # before the first one is solved
-    overtaken, _ = heard(process, 1)
-    say(process, 2, motion)
-    before, _ = heard(process, 2)
+    with served() as process:
+        say(process, 0, motion)
+        say(process, 1, other)  # before the first one is solved
+        overtaken, _ = heard(process, 1)
+        say(process, 2, motion)
+        before, _ = heard(process, 2)
     assert np.abs(before.rotations - overtaken.rotations)[5:].max() > 1e-4
     same(before.part(slice(5)), overtaken.part(slice(5)), 1e-7)
     same(before, GarmentPose.joined(solved(load_rollout(REQUEST)).latents.poses), 1e-6)
-    fresh = start()
-    say(fresh, 0, other)
-    same(overtaken, heard(fresh, 0)[0], 1e-6)
+    with served() as fresh:
+        say(fresh, 0, other)
+        same(overtaken, heard(fresh, 0)[0], 1e-6)
 
 
-def test_few_elements_are_chosen_for_the_first_motion(start):
-    process = start("--latent-elements", "few")
-    say(process, 0, motion_of("brief.usda"))
-    found, _ = heard(process, 0)
+def test_few_elements_are_chosen_for_the_first_motion(there):
+    with served(latent_elements="few") as process:
+        say(process, 0, motion_of("brief.usda"))
+        found, _ = heard(process, 0)
     same(found, GarmentPose.joined(solved(load_rollout(replace(REQUEST, latent_elements="few"))).latents.poses), 1e-6)
 
 
 def test_it_ends_with_its_pipes_at_any_time(start):
     motion = motion_of("brief.usda")
-    early, late, deaf = start(), start(), start()
-    early.stdin.close()
-    assert early.wait(PATIENCE) == 0
+    with served():
+        pass  # before it has said or heard anything
+    late, deaf = start(), start()
     for process in (late, deaf):
         assert read_message(process.stdout).kind == "ready"
         say(process, 0, motion)
