@@ -137,15 +137,19 @@ def write_outfit(toy) -> None:
     Path("outfit.toml").write_text(LIST.format(settings=", ".join(words)))
 
 
-def write_dented_coat() -> None:
-    """A coat around the toy's skirt with a dent, which comes through the skirt in the middle of its front."""
+def write_dented_coat(dent: float = 0.07) -> None:
+    """A coat around the toy's skirt with a dent, which comes through the skirt in the middle of its front.
+
+    Args:
+        dent: how far it comes, in shares of the radius; the coat is 4 % wider than the skirt elsewhere.
+    """
     stage = Usd.Stage.Open("rigged.usda")
     attribute = UsdGeom.Mesh(stage.GetPrimAtPath("/Hero/Skirt")).GetPointsAttr()
     points = np.array(attribute.Get(), dtype=float)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     tip = points[np.argmin(np.abs(points - middle)[:, :2].sum(axis=1) - 0.01 * (points[:, 2] > middle[2]))]
     near = np.exp(-((points - tip) ** 2).sum(axis=1) / (0.25 * np.ptp(points[:, 1])) ** 2)
-    points[:, [0, 2]] *= (1.04 - 0.07 * near)[:, None]
+    points[:, [0, 2]] *= (1.04 - dent * near)[:, None]
     attribute.Set(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
     stage.Export("coat.usda")
 
