@@ -26,12 +26,14 @@ test: $(STAMP)
 # One process more than there are cores, since many tests wait for processes of their own; each of them computes with
 # one thread. Files begin in the order of tests/conftest.py.
 # The first files compile nearly all loops, two of them beside the other check, and numba keeps these for the rest:
-# processes that came to a loop at once would each compile it.
+# processes that came to a loop at once would each compile it. What pytest makes of the assertions in all files takes
+# longer than to read it: one process does so before that. What it cannot collect, the others tell.
 WORKERS = $(shell $(PYTHON) -c "import os; print(os.cpu_count() + 1)")
 FIRST := $(addprefix tests/core/,physics/test_loops.py physics/test_simulate_solver.py physics/test_clearing.py \
 	network/test_runtime.py network/test_latent_solver.py)
 pytest: export OMP_NUM_THREADS := 1
 pytest: $(STAMP)
+	$(BIN)/python -m pytest --collect-only -qq > /dev/null || true
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(FIRST)
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(addprefix --ignore=,$(FIRST))
 
