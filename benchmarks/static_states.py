@@ -5,7 +5,8 @@
 
 In the first pose of clips of `valid`, the energy of P's state is compared with the least energy that the latents
 reach from there, with the least that blendshape activations and proxy transforms reach from there, and with the
-solver's minima, from P's state and from linear blend skinning. Distances are RMS, from P's state.
+solver's minima, from P's state, from linear blend skinning and from the bind pose, from which `ssilk simulate` carries
+the garment into its first pose. Distances are RMS, from P's state.
 """
 
 from __future__ import annotations
@@ -126,6 +127,7 @@ def _pose(subject: Subject, options: Namespace, clip: str) -> dict[str, dict[str
         poses = simulator.poser.pose(first.rotations, first.translations)
         for name, start in (("solver, from P", states["P"]), ("solver, from LBS", still.lbs)):
             states[name] = simulator.quasi_static(poses, simulator.apply_pins(start, poses)).x
+        states["solver, from the bind pose"] = simulator.at_rest(first.rotations, first.translations)[1].x
         return {
             name: {
                 "energy": float(total(x)),
