@@ -267,6 +267,16 @@ def test_missing_rest_transforms_come_from_the_bind_pose():
     np.testing.assert_allclose(with_rest.skeleton.rest_transforms, without.skeleton.rest_transforms, atol=1e-9)
 
 
+def test_what_rounding_scales_along_a_chain_of_joints_does_not_add_up():
+    stage = author(Usd.Stage.CreateInMemory())
+    rest = np.array(stage.GetPrimAtPath(RIG).GetAttribute("restTransforms").Get())
+    rest[:, :3, :3] *= 1 - 4.5e-4  # 1.3e-3 at the head
+    stage.GetPrimAtPath(RIG).GetAttribute("restTransforms").Set([gf(matrix.T) for matrix in rest])
+    found, expected = read_character(stage).skeleton, SKELETON
+    assert found.scales is None
+    np.testing.assert_allclose(found.bind_transforms, expected.bind_transforms, atol=1e-9)
+
+
 def test_a_clip_that_stands_alone_has_the_scales_of_its_skeleton():
     plain, scaled = (
         author(Usd.Stage.CreateInMemory(), Recipe(scales=np.array(scales)))
@@ -725,6 +735,14 @@ def grow_head(stage: Usd.Stage) -> None:
         stage.GetPrimAtPath(WALK).GetAttribute("scales").Set(scales, code)
 
 
+def grown_at_rest() -> Usd.Stage:
+    """Return a shot whose head is larger at rest and in its motion, and not in the bind pose: its points move."""
+    stage = author(Usd.Stage.CreateInMemory(), Recipe(scales=np.array([1, 1, 2, 1, 1.0])))
+    plain = author(Usd.Stage.CreateInMemory())  # prims live as long as it
+    set_on(RIG, "bindTransforms", plain.GetPrimAtPath(RIG).GetAttribute("bindTransforms").Get())(stage)
+    return stage
+
+
 BAD_MOTIONS = {
     "foreign": (
         clip(("a", "b", "Hips"), {0: 0}),
@@ -733,6 +751,7 @@ BAD_MOTIONS = {
     "no joints": (clip((), {0: 0}), "another skeleton: 0 of 5"),
     "no animation": (Usd.Stage.CreateInMemory(), "no SkelAnimation"),
     "scaled": (broken(set_on(WALK, "scales", [Gf.Vec3h(2)] * 5)), "5 joints are scaled otherwise than at rest, Hips"),
+    "head that is larger at rest than bound": (grown_at_rest(), "1 joints are scaled .*, Hips/Spine/Head first"),
     "growing head": (broken(grow_head), "1 joints are scaled otherwise than at rest, Hips/Spine/Head"),
     "count": (broken(set_on(WALK, "joints", JOINTS[:4])), "rotations for 5 joints; 4 are needed"),
     "no rotations": (broken(lambda s: s.GetPrimAtPath(WALK).RemoveProperty("rotations")), "has no rotations"),

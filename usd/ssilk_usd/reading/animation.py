@@ -12,7 +12,8 @@ from ssilk_core.scene.assets import Floats, Ints
 
 from ..opening.stage import column_matrix, inherited, value
 from .bindings import unapplied
-from .joint_scales import SCALE_TOLERANCE, uniform_scales
+from .hierarchy import parents_by_path
+from .joint_scales import SCALE_TOLERANCE, total_scales, uniform_scales
 
 SOURCE = "skel:animationSource"
 NEEDED = ("translations", "rotations", "scales")  # without one of these UsdSkel poses no joint
@@ -77,7 +78,8 @@ class PosedJoints:
 def posed_joints(animated: tuple[str, ...], skeleton: Usd.Prim) -> PosedJoints | None:
     """Return which joints of a skeleton an animation of the joints `animated` poses.
 
-    None where that skeleton says no rest pose that joints can have.
+    None where that skeleton says no rest pose that joints can have, or one that is scaled otherwise than its bind
+    pose, so that scales would move points.
     """
     names = tuple(str(name) for name in value(skeleton, "joints") or ())
     rest = column_matrix(value(skeleton, "restTransforms") or np.zeros((0, 4, 4)))
@@ -86,7 +88,13 @@ def posed_joints(animated: tuple[str, ...], skeleton: Usd.Prim) -> PosedJoints |
     factors = uniform_scales(rest)
     if not np.isfinite(factors).all() or not factors.all():
         return None
-    factors = np.where(np.abs(factors - 1) <= SCALE_TOLERANCE, 1.0, factors)
+    if (factors != 1).any():
+        binds = column_matrix(value(skeleton, "bindTransforms") or np.zeros((0, 4, 4)))
+        if len(binds) != len(names):
+            return None
+        moved = uniform_scales(binds) / total_scales(factors, parents_by_path(names))
+        if not (np.abs(moved / moved[0] - 1) <= 2 * SCALE_TOLERANCE).all():  # NaN is refused, too
+            return None
     rest[:, :3, :3] /= factors[:, None, None]
     among = {name: index for index, name in enumerate(animated)}
     return PosedJoints(names, np.array([among.get(name, -1) for name in names]), rest, factors)

@@ -19,11 +19,13 @@ SCALE_TOLERANCE = 1e-3  # relative; animations hold scales in half precision
 def uniform_scales(local: Floats) -> Floats:
     """Return the factor of each joint-to-parent transform (..., 4, 4), negative where it mirrors, shape (...).
 
-    NaN where it is not one factor in all directions.
+    NaN where it is not one factor in all directions. What is within the tolerance of 1 is 1, so that rounding does
+    not add up along chains of joints.
     """
     linear = local[..., :3, :3]
     factors = np.cbrt(np.linalg.det(linear))
     off = np.abs(linear @ np.swapaxes(linear, -1, -2) - np.square(factors)[..., None, None] * np.eye(3))
+    factors = np.where(np.abs(factors - 1) <= SCALE_TOLERANCE, 1.0, factors)
     return np.where(off.max(axis=(-1, -2)) <= 2 * SCALE_TOLERANCE * np.square(factors), factors, np.nan)
 
 

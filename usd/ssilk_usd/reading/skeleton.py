@@ -25,7 +25,7 @@ from ..opening.stage import (
 )
 from ..units import StageUnits
 from .carried import carried_by
-from .joint_scales import SCALE_TOLERANCE, divided, total_scales, uniform_scales, without_scales
+from .joint_scales import divided, total_scales, uniform_scales, without_scales
 from .mesh import is_body, is_drawn, placement, rendered
 from .skin import match_joints, need_unique, read_influences
 from .spaces import SkelSource, joints_to_core, need_similarity
@@ -192,7 +192,7 @@ def skeleton_at(root: Usd.Prim, prim: Usd.Prim) -> SkelSource:
     totals = np.ones(len(joints))
     if rest is not None:
         totals = total_scales(uniform_scales(rest), parents)
-        if not np.isfinite(totals).all() or np.abs(totals - 1).max() <= SCALE_TOLERANCE:
+        if not np.isfinite(totals).all() or (totals == 1).all():
             totals = np.ones(len(joints))  # what is no scale alone is told where it is no rotation either
         else:
             bind, rest = divided(bind, totals), without_scales(rest, totals, parents)
