@@ -213,13 +213,17 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
 
 def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
-    """Return the files that a training reads, with all layers of stages."""
+    """Return the files that a training reads, and after them the layers that stages and motions consist of.
+
+    Where these are single files, a training has the key that it had before layers counted, and is not done again.
+    """
     from ssilk_usd.opening.stage import used_files
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
     bodies = [options.stage, shared.wardrobe(options)[0], *(options.family or ())]
-    named = [file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
-    stages = [*(folder / file for file in named), *motions]
-    used = [Path(file) for path in stages for file in (used_files(str(path)) if path.is_file() else [path])]
-    return [*dict.fromkeys([*used, *(folder / file for file in options.over)])]
+    named = [folder / file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
+    own = {path.resolve() for path in (*named, *motions)}
+    layers = {Path(file).resolve() for path in own if path.is_file() for file in used_files(str(path))} - own
+    ordered = sorted(layers, key=lambda path: (path.name, path))
+    return [*named, *(folder / file for file in options.over), *motions, *ordered]

@@ -205,6 +205,10 @@ def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypat
 
     before = asked()
     assert asked() == before
+    (single,) = listed(tmp_path, '[skirt]\nstage = "rigged.usda"\nmotions = "clip.usda"\n')
+    options = parser(["train"]).parse_args(["train", *single.words, "-o", "skirt.safetensors"])
+    names = [path.name for path in wardrobe._inputs(options, tmp_path)]
+    assert names == ["rigged.usda", "rigged.usda", "clip.usda"]  # stage, garment, motion: keys of finished trainings
     with Path("rigged.usda").open("a") as file:
         file.write("\n")
     assert asked() != before
