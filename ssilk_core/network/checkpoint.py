@@ -41,7 +41,7 @@ HEADER_NAME = "ssilk"  # of the JSON document in the metadata
 # The header's lists and tables, as empty values of their types (tuples for JSON lists).
 HEADER: dict[str, Any] = {
     "joint_names": (), "proxy_names": (), "paths": {}, "config": {}, "fabric": {}, "provenance": {}, "hub": 0,
-    "family": (), "body_meshes": (), "graded": False, "fabrics": {},
+    "family": (), "body_meshes": (), "graded": False, "fabrics": {}, "scales": (),
 }  # fmt: skip
 WEIGHTS = ("scene.plain.weights", "scene.rig.weights")
 ONE_FABRIC = (  # what is allowed, and what to do, where another fabric is asked of a model that knows none
@@ -189,6 +189,7 @@ def _document(model: ModelFile) -> dict[str, Any]:
         **({} if model.bodies is None else _names(model.bodies.family.bodies)),
         **({} if model.fabrics is None else {"fabrics": model.fabrics.document()}),
         **({} if skeleton.placement is None else {"placement": skeleton.placement.tolist()}),
+        **({} if skeleton.scales is None else {"scales": skeleton.scales.tolist()}),
     }
 
 
@@ -340,6 +341,7 @@ def _scene_of(tensors: dict[str, np.ndarray], document: dict[str, Any]) -> Scene
         tensors["scene.skeleton.rest_transforms"],
         document.get("hub", 0),
         np.array(document["placement"], np.float64) if "placement" in document else None,
+        scales=np.array(document["scales"], np.float64) if "scales" in document else None,
     )
     mesh = Mesh(
         paths["garment"],

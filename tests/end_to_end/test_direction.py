@@ -314,6 +314,36 @@ def test_a_proxy_is_where_it_was_posed_by_hand_and_yields_as_it_is_keyed(stage):
     np.testing.assert_allclose(
         rollout.direction.parts.hand[:, 0], np.tile(wanted.reshape(4, 4).T, (FRAMES, 1, 1)), atol=1e-5
     )
+    before = baked("before.usdc")
+    for path in ("rigged.usda", "clip.usda"):  # clips that stand alone have the scales of the stage's joints
+        scale_joints(path)
+    np.testing.assert_allclose(baked("scaled.usdc"), before, atol=1e-5)
+
+
+def scale_joints(path: str) -> None:
+    """Mirror the space of the character's second joint and double that of its third: no point moves."""
+    stage = Usd.Stage.Open(path)
+    for prim in stage.Traverse():
+        if not (prim.IsA(UsdSkel.Skeleton) or prim.IsA(UsdSkel.Animation)):
+            continue
+        names = list(prim.GetAttribute("joints").Get())
+        above = [*UsdSkel.Topology(names).GetParentIndices()]
+        totals = np.array([{1: -1.0, 2: 2.0}.get(joint, 1.0) for joint in range(len(names))])
+        outer = np.array([totals[joint] if joint >= 0 else 1.0 for joint in above])
+        if prim.IsA(UsdSkel.Animation):
+            prim.GetAttribute("scales").Set([Gf.Vec3h(float(scale)) for scale in totals / outer])
+            moved = prim.GetAttribute("translations")
+            for code in moved.GetTimeSamples():
+                moved.Set([Gf.Vec3f(each / scale) for each, scale in zip(moved.Get(code), outer.tolist())], code)
+            continue
+        rig = UsdSkel.Skeleton(prim)
+        binds, rest = (np.array(each.Get()) for each in (rig.GetBindTransformsAttr(), rig.GetRestTransformsAttr()))
+        binds[:, :3, :3] *= totals[:, None, None]
+        rest[:, :3, :3] *= (totals / outer)[:, None, None]
+        rest[:, 3, :3] /= outer[:, None]
+        rig.GetBindTransformsAttr().Set([Gf.Matrix4d(each.tolist()) for each in binds])
+        rig.GetRestTransformsAttr().Set([Gf.Matrix4d(each.tolist()) for each in rest])
+    stage.GetRootLayer().Save()
 
 
 @pytest.mark.parametrize(

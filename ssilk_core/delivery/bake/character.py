@@ -43,7 +43,9 @@ def in_order_of(trained: Skeleton, character: Character, *, moved: bool = False)
         )
         for some in (character.bodies, character.stand_ins)
     )
-    skeleton = replace(trained, placement=character.skeleton.placement)
+    own = character.skeleton
+    scales = None if own.scales is None else own.scales[order]
+    skeleton = replace(trained, placement=own.placement, scales=scales)
     return replace(character, skeleton=skeleton, bodies=bodies, stand_ins=stand_ins)
 
 

@@ -77,6 +77,18 @@ def test_a_model_knows_the_colour_of_its_garment(path, tmp_path):
     assert load_model(tmp_path / "dyed.safetensors").scene.garment.colour == (0.25, 0.5, 1.0)
 
 
+def test_a_model_knows_the_scales_of_its_joints(path, tmp_path):
+    """Clips that stand alone have them, also where no stage is at hand, as in 'ssilk reduce'."""
+    file = load_model(path)
+    assert file.scene.character.skeleton.scales is None and "scales" not in header_of(path)
+    skeleton = replace(file.scene.character.skeleton, scales=np.array([1.0, -1.0, 2.0]))
+    scene = replace(file.scene, character=replace(file.scene.character, skeleton=skeleton))
+    save_model(tmp_path / "scaled.safetensors", replace(file, scene=scene))
+    np.testing.assert_array_equal(
+        load_model(tmp_path / "scaled.safetensors").scene.character.skeleton.scales, [1, -1, 2]
+    )
+
+
 @pytest.mark.parametrize("colour", [[float("nan"), 0.0, 0.0], "123", [0.1, 0.2], {"0": 1.0, "1": 1.0, "2": 1.0}, 0.5])
 def test_a_damaged_colour_is_refused(path, colour):
     rewrite(path, lambda tensors, document: document.update(colour=colour))
@@ -280,6 +292,8 @@ DAMAGE = {
     "no points": (drop("scene.mesh.points"), "incomplete.*scene.mesh.points"),
     "no joints": (drop("joints"), "incomplete.*joints"),
     "no config": (drop("config"), "incomplete.*config"),
+    "scales of other joints": (set_header("scales", [1.0, 2.0]), "for 3 joints"),
+    "scales in words": (set_header("scales", ["a", "b", "c"]), "incomplete"),
     "no paths": (drop("paths"), "incomplete.*paths"),
     "paths are a number": (set_header("paths", 3), "incomplete"),
     "a parameter missing": (drop("model.output.0.bias"), "do not fit its header"),

@@ -143,6 +143,7 @@ def read_hand_pose(
         parents=scene.parents,
         bind_transforms=scene.bind_transforms,
         rest_transforms=np.concatenate([skeleton.rest_transforms, rest]),
+        scales=None if skeleton.scales is None else np.append(skeleton.scales, np.ones(len(rest))),
     )
     every = read_motion(source, whole, root=root)
     at = (motion.start + np.arange(motion.frame_count)) / motion.fps * every.fps - every.start
