@@ -7,7 +7,6 @@ import argparse
 import re
 import sys
 from collections.abc import Container, Sequence
-from dataclasses import fields
 from typing import Any, NoReturn
 
 from ..errors import did_you_mean, fail, fail_unknown
@@ -53,12 +52,12 @@ class Parser(argparse.ArgumentParser):
 
 def _as_value(option: str, known: Container[str]) -> str:
     """Return a question that suggests the option whose values have what was given as an option; "" where none has."""
-    from ..network.settings import ModelConfig
+    from ..network.settings import ModelConfig, setting_names
     from ..scene.fabrics import Fabric
     from ..training.settings import TrainConfig
 
     name = option.lstrip("-").replace("-", "_")
     for of, kinds in (("--material", (Fabric,)), ("--set", (TrainConfig, ModelConfig))):
-        if of in known and any(each.name == name for kind in kinds for each in fields(kind)):
+        if of in known and any(name in setting_names(kind) for kind in kinds):
             return f"did you mean '{of} {name}=VALUE'?"
     return ""

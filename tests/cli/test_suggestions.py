@@ -57,6 +57,7 @@ def test_names_that_resemble_none_get_no_suggestion(capsys):
     assert told(capsys, "bake --xyzzy") == (
         "error: ssilk bake: no such option '--xyzzy'; 'ssilk bake --help' lists what is allowed."
     )
+    assert "did you mean" not in told(capsys, f"{TRAIN} --name=x")  # a fabric's is no property of it
     line = told(capsys, f"{BAKE} --quality q")
     assert "'q'; it is one of crowd, game, film, latent, hero" in line and "did you mean" not in line
 
