@@ -14,7 +14,8 @@ from ..errors import fail
 from ..events import Message, Reporter
 from ..physics.simulate import WornGarment
 from ..training.wardrobe.listing import WardrobeEntry, read_list
-from . import options as shared
+from .options.fabric import garment_fabric
+from .options.scene import load_scene
 
 if TYPE_CHECKING:
     from ..physics.intersections.layers import ClothLayers, LayerCounts
@@ -82,8 +83,8 @@ def garments_of(every: Mapping[str, argparse.Namespace], report: Reporter) -> li
     """
     found = list[SimulatedGarment]()
     for name, options in every.items():
-        scene = shared.load_scene(options, report)
-        fabric = shared.fabric(options, scene.garment, report)
+        scene = load_scene(options, report)
+        fabric = garment_fabric(options, scene.garment, report)
         over = getattr(options, "over", ())
         names = set(over)
         for each in reversed(found):  # and what these are worn over

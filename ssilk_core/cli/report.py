@@ -23,7 +23,7 @@ from ..physics.intersections.figures import LAYERS, LayerFigures, SelfIntersecti
 from ..physics.skin.figures import ShownSkin
 from ..physics.world.sunk import SunkCloth
 from ..scene.fabrics import Fabric
-from .options import check_output
+from .options.files import check_output
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
