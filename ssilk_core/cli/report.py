@@ -230,5 +230,5 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
         rollout.warn(report)
         state_rollout_counts(shot, rollout)
         world = rollout.around.seen
-        props = ShotProps(world, rollout.seconds) if world else None
+        props = ShotProps(world, rollout.samples.seconds) if world else None
         return _shot(shot, report, props, load_model(model))[:-1]
