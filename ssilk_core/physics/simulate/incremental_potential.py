@@ -233,8 +233,9 @@ class IncrementalPotential:
         inputs = self.with_contacts(x, inputs, moved=True)
         arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
         for _ in range(ROUNDS):
-            assert inputs.contacts is not None
-            step = inputs.contacts.without_passing(x, target - x)
+            assert inputs.neighbours is not None
+            neighbours, step, met = self.self_contact.ahead(target - x, inputs.neighbours)
+            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, step)
             arrived = arrived | (step.norm(dim=1).amax(0) < ARRIVED)
             if bool(arrived.all()):
                 break

@@ -29,7 +29,7 @@ from ...errors import fail
 from .. import kernels
 from ..collision import SmoothedDistance
 from ..framed import Framed
-from ..self_contact import ClothContacts, ClothNeighbours
+from ..self_contact import ClothNeighbours
 from .blocks import BlockMatrix
 from .incremental_potential import IncrementalPotential, StepInputs
 
@@ -280,8 +280,9 @@ class Search:
         step, count = newton_step(
             potential, self.state, inputs, gradient, self.options.cg_iterations, course.fixed, exact_hessian
         )
-        if inputs.contacts is not None:
-            step = self._without_passing(inputs.contacts, step)
+        if inputs.neighbours is not None:
+            step = self._without_passing(inputs.neighbours, step)
+            inputs = self.inputs
         self.state, length, obstructing = line_search(potential, self.state, inputs, gradient, step)
         misled = exact_hessian & (length < MISLED_BELOW)
         new = obstructing & ~course.fixed & ~misled
@@ -295,8 +296,10 @@ class Search:
         )
         self._evaluate()
 
-    def _without_passing(self, contacts: ClothContacts, step: Tensor) -> Tensor:
+    def _without_passing(self, known: ClothNeighbours, step: Tensor) -> Tensor:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
+        known, step, contacts = self.potential.self_contact.ahead(step, known)
+        self.inputs = replace(self.inputs, neighbours=known)
         slowed = contacts.without_passing(self.state.x, step, YIELDING)
         steep = (self.gradient * slowed).sum((0, 1)) < DOWNHILL * (self.gradient * step).sum((0, 1))
         return torch.where(steep, slowed, contacts.allowed(self.state.x, step, YIELDING).amin(0) * step)
