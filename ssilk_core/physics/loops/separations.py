@@ -4,27 +4,77 @@
 from __future__ import annotations
 
 from math import inf, sqrt
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .compiling import compiled
 from .running import array, run_parts
 
+if TYPE_CHECKING:
+    from ..self_contact.neighbours import Grid
+
+SPACE = 16  # pairs of each point for which there is room at first
 TINY = 1e-24
 
 
-def distances_loop(x: Tensor, first: Tensor, second: Tensor, frame: Tensor, one: Tensor, other: Tensor) -> Tensor:
-    """Return the distance of each pair at positions (V, 3, N), infinite with a common vertex, shape (P,).
+def near_loop(
+    x: Tensor,
+    first: Tensor,
+    second: Tensor,
+    middles: tuple[Tensor, Tensor],
+    reaches: tuple[Tensor, Tensor],
+    grid: Grid,
+    groups: tuple[Tensor, Tensor] | None,
+    ascending: bool,
+    reach: float,
+) -> tuple[Tensor, ...]:
+    """Return what `PairKind.near` does: frame, first, second and distance of each pair, by frame and first.
 
     Args:
         first, second: vertices of what comes first in pairs, and second, shapes (A, 1) and (B, 3), or both (A, 2).
-        frame, one, other: of each pair, shape (P,).
+        middles, reaches: of both; pairs whose middles are further apart than the sum of their reaches are not near.
+        grid: of the second ones' middles.
+        groups: numbers (A,) and (B,); what has the same one is no pair.
+        ascending: whether what comes second in a pair has the greater index.
     """
-    found = x.new_empty(len(frame))
-    tables = array(x.permute(2, 0, 1)), array(first), array(second)
-    run_parts(_distances, len(frame), *tables, array(frame), array(one), array(other), found.numpy())
-    return found
+    count, number = len(first), grid.order % len(second)
+    none = number.new_zeros(1)
+    own, theirs = (none, none) if groups is None else (groups[0], groups[1][number])
+    given = (
+        array(x.permute(2, 0, 1)),
+        array(first),
+        array(second),
+        array(middles[0].permute(2, 0, 1).reshape(-1, 3)),
+        array(reaches[0]),
+        array(middles[1].permute(2, 0, 1).reshape(-1, 3)[grid.order]),
+        array(reaches[1][number]),
+        array(number),
+        array(grid.first.flatten(0, 1)),
+        array(grid.last.flatten(0, 1)),
+        array(own),
+        array(theirs),
+        groups is not None,
+        ascending,
+        reach,
+    )
+    found: list[tuple[int, np.ndarray, np.ndarray]] = []
+
+    def part(start: int, stop: int) -> None:
+        size = SPACE * (stop - start)
+        while start < stop:
+            pairs, distance = np.empty((3, size), dtype=np.int64), np.empty(size, dtype=given[0].dtype)
+            held, after = _near(*given, pairs, distance, start, stop)
+            found.append((start, pairs[:, :held], distance[:held]))
+            size = size if after > start else 2 * size
+            start = after
+
+    run_parts(part, x.shape[-1] * count)
+    found.sort(key=lambda each: each[0])
+    pairs = np.concatenate([each for _, each, _ in found], axis=1)
+    return *torch.from_numpy(pairs), torch.from_numpy(np.concatenate([each for *_, each in found]))
 
 
 def close_loop(
@@ -40,7 +90,15 @@ def close_loop(
     step: Tensor | None,
     closing: float,
 ) -> Tensor:
-    """Return which pairs `PairKind.close` keeps, bool (P,); the other arguments are those of `distances_loop`."""
+    """Return which pairs `PairKind.close` keeps, bool (P,).
+
+    Args:
+        first, second: as `near_loop` takes them.
+        frame, one, other, known: of each pair, and its distance where it was found, shape (P,).
+        moves: how much nearer what comes first, and second, may bring it, shapes (A, N) and (B, N).
+        near, step: as `PairKind.close` takes them.
+        closing: share of the distance by which pairs may come nearer in the step.
+    """
     found = torch.empty(len(frame), dtype=torch.bool)
     pairs = array(frame), array(one), array(other), array(known)
     own = array(x.permute(2, 0, 1))
@@ -102,16 +160,40 @@ def _between_edges(x, i, j, k, l):  # noqa: E741
 
 
 @compiled
-def _distances(x, first, second, frame, one, other, found, start, stop):
-    for pair in range(start, stop):
-        i, j, k, l = _four(first, second, one[pair], other[pair])  # noqa: E741
-        faces = first.shape[1] == 1
-        if i == k or i == l or (i == j if faces else (j == k or j == l)):
-            found[pair] = inf
-            continue
-        at = x[frame[pair]]
-        dx, dy, dz = _over_face(at, i, j, k, l) if faces else _between_edges(at, i, j, k, l)
-        found[pair] = sqrt(dx * dx + dy * dy + dz * dz)
+def _near(
+    x, first, second, points, limits, others, other_limits, number, starts, ends, own, theirs, grouped, ascending,
+    reach, pairs, distance, start, stop,
+):  # fmt: skip
+    """Write the near pairs of points from `start` on; return how many, and the point that there was no room for."""
+    count, held, faces = len(first), 0, first.shape[1] == 1
+    for q in range(start, stop):
+        point, begun = q % count, held
+        px, py, pz, most = points[q, 0], points[q, 1], points[q, 2], limits[point]
+        for row in range(starts.shape[1]):
+            for at in range(starts[q, row], ends[q, row]):
+                other = number[at]
+                if ascending and other <= point:
+                    continue
+                if grouped and own[point] == theirs[at]:
+                    continue
+                dx, dy, dz = px - others[at, 0], py - others[at, 1], pz - others[at, 2]
+                limit = most + other_limits[at]
+                if dx * dx + dy * dy + dz * dz > limit * limit:
+                    continue
+                i, j, k, l = _four(first, second, point, other)  # noqa: E741
+                if i == k or i == l or (i == j if faces else (j == k or j == l)):
+                    continue
+                frame = x[q // count]
+                dx, dy, dz = _over_face(frame, i, j, k, l) if faces else _between_edges(frame, i, j, k, l)
+                far = dx * dx + dy * dy + dz * dz
+                if far >= reach * reach:
+                    continue
+                if held == len(distance):
+                    return begun, q
+                pairs[0, held], pairs[1, held], pairs[2, held] = q // count, point, other
+                distance[held] = sqrt(far)
+                held += 1
+    return held, stop
 
 
 @compiled

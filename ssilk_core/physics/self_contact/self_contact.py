@@ -34,7 +34,7 @@ from ..energy.collision import ContactLaw
 from ..framed import consecutive
 from .cloth import TouchingCloth
 from .contacts import CLOSING, SLACK, TINY, ClothContacts
-from .neighbours import near_pairs, places_among
+from .neighbours import Grid, near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
 
 REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
@@ -176,33 +176,27 @@ class PairKind:
         Args:
             garment: of each vertex, where only those of two garments are pairs, shape (V,).
         """
-        middles = at[self.first].mean(1), at[self.second].mean(1)
+        middles, ascending = (at[self.first].mean(1), at[self.second].mean(1)), self.first is self.second
+        groups = None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]])
+        reaches = self.first_reach + reach, self.second_reach
+        if loops.available(at.device):
+            from ..loops.separations import near_loop
+
+            grid = Grid.of(middles[1], middles[0], float(reaches[0].max() + reaches[1].max()))
+            found = near_loop(at, self.first, self.second, middles, reaches, grid, groups, ascending, reach)
+            return KnownPairs(*found, torch.zeros_like(found[-1]))
         frame, first, second = near_pairs(
-            middles[0],
-            self.first_reach + reach,
-            middles[1],
-            self.second_reach,
-            groups=None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]]),
-            ascending=self.first is self.second,
+            middles[0], reaches[0], middles[1], reaches[1], groups=groups, ascending=ascending
         )
-        distance = self._distances(at, frame, first, second)
-        return KnownPairs(frame, first, second, distance, torch.zeros_like(distance)).kept(distance < reach)
-
-    def _distances(self, x: Tensor, frame: Tensor, first: Tensor, second: Tensor) -> Tensor:
-        """Return the distances of pairs (P,) at positions (V, 3, N), infinite with a common vertex, shape (P,)."""
-        if loops.available(x.device):
-            from ..loops.separations import distances_loop
-
-            return distances_loop(x, self.first, self.second, frame, first, second)
-        vertices = torch.cat([self.first[first].T, self.second[second].T])
-        one, other = vertices.split(list(self.first.shape[1:] + self.second.shape[1:]))
-        common = (one[:, None] == other).flatten(0, 1).any(0)
-        return self.measure(x[vertices, :, frame].movedim(-1, 1)).distance.masked_fill(common, torch.inf)
+        one, other = self.first[first].T, self.second[second].T
+        distance = self.measure(at[torch.cat([one, other]), :, frame].movedim(-1, 1)).distance
+        kept = (distance < reach) & (one[:, None] != other).flatten(0, 1).all(0)
+        return KnownPairs(frame, first, second, distance, torch.zeros_like(distance)).kept(kept)
 
     def close(
         self, x: Tensor, pairs: KnownPairs, moved: Tensor, near: float, step: Tensor | None = None
-    ) -> tuple[Tensor, KnownPairs, Separations]:
-        """Return the rows of pairs that are close at positions x (V, 3, N), with these pairs, and how they lie.
+    ) -> Tensor:
+        """Return the rows of pairs that are close at positions x (V, 3, N).
 
         Close are those nearer than `near` [m], and those which come nearer in a step (V, 3, N), or in one in which
         some vertices are slower, by more than `CLOSING` of their distance.
@@ -217,42 +211,37 @@ class PairKind:
             from ..loops.separations import close_loop
 
             given = pairs.frame, pairs.first, pairs.second, pairs.distance, moves, near, step, CLOSING
-            rows = close_loop(x, self.first, self.second, *given).nonzero()[:, 0]
-            found = pairs.kept(rows)
-            return rows, found, self.at(x, found)
+            return close_loop(x, self.first, self.second, *given).nonzero()[:, 0]
         bound = pairs.distance - moves[0][pairs.first, pairs.frame] - moves[1][pairs.second, pairs.frame]
         rows = (bound < near).nonzero()[:, 0]
         found = pairs.kept(rows)
-        now = self.at(x, found)
+        (now,) = self.at([x], found)
         kept = now.distance < near
         if step is not None:
             along = (now.direction * step[self.vertices(found), :, found.frame].movedim(-1, 1)).sum(1)
             count = self.first.shape[1]
             closing = along[count:].clamp_min(0).amax(0) - along[:count].clamp_max(0).amin(0)
             kept |= closing > CLOSING * now.distance
-        return rows[kept], found.kept(kept), now.kept(kept)
+        return rows[kept]
 
     def vertices(self, pairs: KnownPairs) -> Tensor:
         """Return the vertices of each pair, shape (4, P)."""
         return torch.cat([self.first[pairs.first].T, self.second[pairs.second].T])
 
-    def at(self, x: Tensor, pairs: KnownPairs) -> Separations:
-        """Return how pairs are separated at positions (V, 3, N), or at (V, 3, 1) for all frames."""
-        frame = pairs.frame if x.shape[-1] > 1 else torch.zeros_like(pairs.frame)
-        return self.measure(x[self.vertices(pairs), :, frame].movedim(-1, 1))
+    def at(self, places: Sequence[Tensor], pairs: KnownPairs) -> list[Separations]:
+        """Return how pairs are separated at several positions (V, 3, N), or at (V, 3, 1) for all frames."""
+        vertices, none = self.vertices(pairs), torch.zeros_like(pairs.frame)
+        corners = [x[vertices, :, pairs.frame if x.shape[-1] > 1 else none] for x in places]
+        found, count = self.measure(torch.cat(corners, dim=1).movedim(-1, 1)), len(none)
+        return [found.kept(slice(number * count, (number + 1) * count)) for number in range(len(places))]
 
-    def sides(self, last: Tensor, pairs: KnownPairs) -> Tensor:
-        """Return the sides of pairs that were at positions (V, 3, N) last, 0 where they have none, shape (P,)."""
-        then = self.at(last, pairs)
-        return torch.where(pairs.side == 0, torch.where(then.facing, then.height.sign(), 0), pairs.side)
-
-    def contacts(self, now: Separations, pairs: KnownPairs, side: Tensor, rest: Tensor) -> tuple[Tensor, ...]:
-        """Return what `ClothContacts` holds of pairs on sides (P,) as they lie `now`, and of cloth at rest (V, 3, 1)."""
+    def contacts(self, now: Separations, pairs: KnownPairs, side: Tensor, rest: Separations) -> tuple[Tensor, ...]:
+        """Return what `ClothContacts` holds of pairs on sides (P,) as they lie `now`, and in the bind pose."""
         gap, direction = now.gaps(side)
         vertices = self.vertices(pairs)
         second = (torch.arange(4, device=gap.device) >= self.first.shape[1])[:, None].expand_as(vertices)
         most = _mean(self.first_start, self.second_start, pairs)
-        start = torch.minimum(CLOSER * self.at(rest, pairs).distance, most)
+        start = torch.minimum(CLOSER * rest.distance, most)
         area = torch.minimum(self.first_area[pairs.first], self.second_area[pairs.second])
         if self.first_stiffness is not None and self.second_stiffness is not None:
             area = area * _mean(self.first_stiffness, self.second_stiffness, pairs)
@@ -336,40 +325,46 @@ class SelfContact:
         known = self.around(x, known)
         drift, parts, pairs = _drift(x, known), [], []
         for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            rows, close, now = kind.close(x, own, drift, self.law.start)
-            side = kind.sides(known.last, close)
+            rows = kind.close(x, own, drift, self.law.start)
+            close = own.kept(rows)
+            now, last, rest = kind.at((x, known.last, self.rest), close)
+            side = _sides(close, last)
             wrong = now.facing & (side * now.height < 0) & (side * now.height >= -self.law.start)
             side = torch.where(wrong, side, 0)
             pairs.append(replace(own, side=torch.zeros_like(own.side).index_copy_(0, rows, side)))
-            parts.append(kind.contacts(now, close, side, self.rest))
+            parts.append(kind.contacts(now, close, side, rest))
         return ClothNeighbours(x, known.at, *pairs), self._joined(x, parts).pressing(x)
 
     def contacts(self, x: Tensor, known: ClothNeighbours) -> ClothContacts:
         """Return the contacts at positions x, among pairs that are known around them."""
         drift, parts = _drift(x, known), []
         for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            _, close, now = kind.close(x, own, drift, self.law.start + DEEPER)
-            parts.append(kind.contacts(now, close, kind.sides(known.last, close), self.rest))
+            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER))
+            now, last, rest = kind.at((x, known.last, self.rest), close)
+            parts.append(kind.contacts(now, close, _sides(close, last), rest))
         return self._joined(x, parts).pressing(x)
 
     def ahead(self, step: Tensor, known: ClothNeighbours) -> tuple[ClothNeighbours, Tensor, ClothContacts]:
-        """Return what may touch ahead of a step (V, 3, N) from the last positions, and which contacts may slow it.
-
-        The step is first cut so short that pairs which are not known cannot meet, whatever the whole garment does.
-        """
-        x, lengths = known.last, (step - step.mean(0)).norm(dim=1)
-        longest = lengths.amax(0).clamp_min(TINY)
+        """Return what may touch ahead of a step (V, 3, N) from the last positions, which share of it each vertex may
+        move so that no pairs meet that are not known (V, N), and which contacts may slow the step further."""
+        x, longest = known.last, (step - step.mean(0)).norm(dim=1).amax(0)
         drift = _drift(x, known).amax(0)
-        cut = longest > 0.5 * CLOSING * (self.reach - 2 * drift)
+        cut = longest > self._unknown(drift)
         known = self._anew(x, known, cut & (drift > MOVED * REACH))
         drift = _drift(x, known)
-        share = (0.5 * CLOSING * (self.reach - 2 * drift.amax(0)) / longest).clamp_max(1)
-        step = share * step
-        parts = []
+        most = self._unknown(drift.amax(0))
+        share = torch.where(longest > most, (most / step.norm(dim=1).clamp_min(TINY)).clamp_max(1), 1.0)
+        step, parts = share[:, None] * step, []
         for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            _, close, now = kind.close(x, own, drift, self.law.start + DEEPER, step)
-            parts.append(kind.contacts(now, close, close.side, self.rest))
-        return known, step, self._joined(x, parts)
+            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER, step))
+            now, rest = kind.at((x, self.rest), close)
+            parts.append(kind.contacts(now, close, close.side, rest))
+        return known, share, self._joined(x, parts)
+
+    def _unknown(self, drift: Tensor) -> Tensor:
+        """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, and not so
+        far that pairs must be looked for there, in a step that is only tried."""
+        return torch.minimum(0.5 * CLOSING * (self.reach - 2 * drift), LEFT * REACH - drift)
 
     def _joined(self, x: Tensor, parts: Sequence[tuple[Tensor, ...]]) -> ClothContacts:
         """Return contacts of both kinds, by ascending frame."""
@@ -396,20 +391,25 @@ class SelfContact:
 
     def _can_touch(self, kind: PairKind, pairs: KnownPairs) -> Tensor:
         """Tell which pairs of a kind may touch at all, bool (P,)."""
-        vertices = kind.vertices(pairs)
-        loose = self._loose[vertices].any(0)
+        loose = self._loose[kind.first].any(1)[pairs.first] | self._loose[kind.second].any(1)[pairs.second]
         if self._garment is None:
             return loose
+        vertices = kind.vertices(pairs)
         other = self._garment[vertices[0]] != self._garment[vertices[-1]]
         beside = other & ~loose & ~self._pinned[vertices].all(0)
         rows = beside.nonzero()[:, 0]
-        beside[rows] = kind.at(self.rest, pairs.kept(rows)).distance < self.reach
+        beside[rows] = kind.at([self.rest], pairs.kept(rows))[0].distance < self.reach
         return loose | beside  # of one garment alone, none is known where it may not touch itself
 
 
 def _mean(first: Tensor, second: Tensor, pairs: KnownPairs) -> Tensor:
     """Return the means of what both of each pair have, shape (P,)."""
     return 0.5 * (first[pairs.first] + second[pairs.second])
+
+
+def _sides(pairs: KnownPairs, last: Separations) -> Tensor:
+    """Return the sides of pairs that lay as they did `last`, 0 where they have none, shape (P,)."""
+    return torch.where(pairs.side == 0, torch.where(last.facing, last.height.sign(), 0), pairs.side)
 
 
 def _drift(x: Tensor, known: ClothNeighbours) -> Tensor:

@@ -298,11 +298,12 @@ class Search:
 
     def _without_passing(self, known: ClothNeighbours, step: Tensor) -> Tensor:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
-        known, step, contacts = self.potential.self_contact.ahead(step, known)
+        x, gradient = self.state.x, self.gradient
+        known, share, contacts = self.potential.self_contact.ahead(step, known)
         self.inputs = replace(self.inputs, neighbours=known)
-        slowed = contacts.without_passing(self.state.x, step, YIELDING)
-        steep = (self.gradient * slowed).sum((0, 1)) < DOWNHILL * (self.gradient * step).sum((0, 1))
-        return torch.where(steep, slowed, contacts.allowed(self.state.x, step, YIELDING).amin(0) * step)
+        slowed, whole = contacts.without_passing(x, share[:, None] * step, YIELDING), share.amin(0) * step
+        steep = (gradient * slowed).sum((0, 1)) < DOWNHILL * (gradient * whole).sum((0, 1))
+        return torch.where(steep, slowed, contacts.allowed(x, whole, YIELDING).amin(0) * whole)
 
     def _release_fixed(self, may: Tensor) -> None:
         """Release the fixed vertices of frames (N,) that may, and whose other vertices have converged, once."""

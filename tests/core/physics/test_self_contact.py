@@ -198,8 +198,8 @@ def test_no_step_passes_through_folds(scene, toy_grid):
 
 def kept_apart(contact: SelfContact, step: torch.Tensor, known: ClothNeighbours) -> torch.Tensor:
     """A step from the last positions, in which no cloth passes through cloth."""
-    known, step, met = contact.ahead(step, known)
-    return met.without_passing(known.last, step)
+    known, share, met = contact.ahead(step, known)
+    return met.without_passing(known.last, share[:, None] * step)
 
 
 def test_layers_that_are_not_known_to_be_near_do_not_meet_in_a_step(layers):
