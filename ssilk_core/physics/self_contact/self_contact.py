@@ -38,7 +38,7 @@ from .neighbours import Grid, near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
 
 REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
-LEFT, MOVED = 0.5, 0.1  # of that, by which vertices may be elsewhere, and where they are when a step is cut short
+LEFT, MOVED = 0.5, 0.2  # of that, by which vertices may be elsewhere, and where they are when a step is cut short
 DEEPER = 2e-3  # [m] by which cloth may have passed further through cloth than contact reaches, where it is only tried
 STRETCH = 1.3  # by which faces and edges may be longer than at rest
 CLOSER = 0.7  # of the distance at rest: pairs that are nearer there touch at this, as along seams and slits

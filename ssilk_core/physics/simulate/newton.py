@@ -115,8 +115,9 @@ class State(Framed):
     def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
         if potential.replays(x, inputs):
-            energy, *planes = potential.captured.state(x, inputs)
-            return cls(x, SmoothedDistance(*planes) if planes else None, energy)
+            energy, *planes = potential.captured.state(x, inputs.alone)
+            energy = sum((part.energy(x) for part in inputs.touching), energy)
+            return cls(x, SmoothedDistance(*planes) if planes else None, energy, inputs.neighbours)
         body_distance = potential.body_distance(x, inputs)
         return cls(x, body_distance, potential.energy(x, inputs, body_distance), inputs.neighbours)
 
@@ -318,11 +319,12 @@ class Search:
         if self.inputs.neighbours is not None:
             around = replace(self.inputs, neighbours=self.state.neighbours)
             self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
-        given = self.state.x, self.inputs, self.state.body_distance
-        if self.potential.replays(self.state.x, self.inputs):
-            (gradient,) = self.potential.captured.gradient(*given)
+        x, inputs, distance = self.state.x, self.inputs, self.state.body_distance
+        if self.potential.replays(x, inputs):
+            (gradient,) = self.potential.captured.gradient(x, inputs.alone, distance)
+            gradient = sum((part.gradient(x) for part in inputs.touching), gradient)
         else:
-            gradient = self.potential.gradient(*given)
+            gradient = self.potential.gradient(x, inputs, distance)
         self.gradient = gradient.masked_fill(self.course.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)
 
@@ -343,12 +345,13 @@ def newton_step(
     solved until its residual has fallen to `reduction`.
     """
     right = -gradient[potential.free].float()
-    given = state.x, inputs, state.body_distance, fixed, exact_hessian
-    if potential.replays(state.x, inputs):
-        blocks, inverse = potential.captured.hessian(*given)
-        matrix = BlockMatrix(potential.block_pattern, blocks, inverse=inverse)
+    x, others = state.x, (state.body_distance, fixed, exact_hessian)
+    if potential.replays(x, inputs):
+        blocks, inverse = potential.captured.hessian(x, inputs.alone, *others)
+        touching = potential.touching_stiffness(x, inputs)
+        matrix = BlockMatrix(potential.block_pattern, blocks, touching, None if touching else inverse)
     else:
-        matrix = potential.hessian(*given)
+        matrix = potential.hessian(x, inputs, *others)
     z, count = matrix.solve(right, reduction, cg_iterations)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)

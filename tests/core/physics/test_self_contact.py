@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
@@ -19,8 +20,9 @@ from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.blocks import BlockMatrix, BlockPattern
 from ssilk_core.physics.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
 from ssilk_core.physics.simulate.contact_stiffness import ContactStiffness
+from ssilk_core.physics.simulate.friction import Friction
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
+from ssilk_core.physics.simulate.newton import Search, SolverOptions, minimise_from, newton_step
 from ssilk_core.scene.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, SkinWeights
 from ssilk_core.scene.fabrics import Fabric
 
@@ -61,10 +63,7 @@ def stacked(height: float) -> torch.Tensor:
     return frames(np.concatenate([first, second]))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
-    if not compiled:
-        monkeypatch.setattr("ssilk_core.physics.loops.available", lambda device: False)
+def test_near_pairs_are_those_of_all_distances():
     points, others = random(40, 3, 3), random(60, 3, 3, seed=1)
     reach, other_reach = 0.2 * random(40, seed=2), 0.2 * random(60, seed=3)
     far = (points[:, None] - others[None]).square().sum(2).sqrt()
@@ -75,6 +74,50 @@ def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
     kept = expected[:, (groups[0][expected[1]] != groups[1][expected[2]]) & (expected[1] < expected[2])]
     found = near_pairs(points, reach, others, other_reach, groups=groups, ascending=True)
     assert 10 < len(kept[0]) < len(expected[0]) and torch.equal(found, kept)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_compiled_loops_find_the_pairs_that_the_reference_finds(scene, toy_grid, monkeypatch, name):
+    contact, x, _ = crumpled(toy_grid, scene, 3)
+    kind, x = getattr(contact, name), 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    step, moved = 0.02 * (random(*x.shape, seed=3) - 0.5), torch.full_like(x[:, 0], 0.004)
+    half = (torch.arange(len(x)) < len(x) // 2).long()
+
+    def found() -> list[torch.Tensor]:
+        pairs = kind.near(x, contact.reach)
+        others = kind.near(x, contact.reach, half)
+        nearer = x + 0.004 * torch.nn.functional.normalize(random(*x.shape, seed=4) - 0.5, dim=1)
+        rows = [kind.close(nearer, pairs, moved, START, ahead) for ahead in (None, step)]
+        return [pairs.frame, pairs.first, pairs.second, pairs.distance, others.first, others.second, *rows]
+
+    compiled = found()
+    monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
+    expected = found()
+    lengths = [len(each) for each in expected]
+    assert lengths[0] > lengths[4] > 10 and lengths[0] > lengths[7] > lengths[6] > 10
+    order = (compiled[0] * 10**4 + compiled[1]) * 10**4 + compiled[2]
+    by_key = order.argsort()
+    compiled[:4] = [each[by_key] for each in compiled[:4]]
+    places = by_key.argsort()
+    compiled[6:] = [places[rows].sort()[0] for rows in compiled[6:]]
+    assert {*zip(*(each.tolist() for each in compiled[4:6]))} == {*zip(*(each.tolist() for each in expected[4:6]))}
+    for own, other in zip([*compiled[:4], *compiled[6:]], [*expected[:4], *expected[6:]]):
+        torch.testing.assert_close(own, other, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_close_pairs_are_all_that_are_close_or_meet(scene, toy_grid, name):
+    contact, x, _ = crumpled(toy_grid, scene, 2)
+    kind, x, step = getattr(contact, name), 0.4 * x, 0.01 * (random(*x.shape, seed=3) - 0.5)
+    pairs, moved = kind.near(x, contact.reach), 0.002 * random(*x.shape, seed=4)
+    (now,) = kind.at([x + moved], pairs)
+    close = torch.zeros(len(now.distance), dtype=torch.bool)
+    close[kind.close(x + moved, pairs, moved.norm(dim=1), START, step)] = True
+    along = (now.direction * step[kind.vertices(pairs), :, pairs.frame].movedim(-1, 1)).sum(1)
+    count = kind.first.shape[1]
+    meets = along[count:].amax(0) - along[:count].amin(0) > 0.8 * now.distance
+    assert meets.any() and not close.all()
+    assert close[meets | (now.distance < START)].all()
 
 
 @pytest.mark.parametrize("shape", [over_faces, between_edges])
@@ -359,6 +402,31 @@ def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
     apart = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=True)]
     assert sum(through) > 10
     assert apart == [0] * 10
+
+
+def test_what_touches_is_added_to_what_a_graph_gives(scene, toy_grid, monkeypatch):
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    potential = IncrementalPotential(
+        dressed(scene, points, faces, points[:, 1] > -1e-9), replace(FABRIC, friction=0.3), device=CPU
+    )
+    _, x, _ = crumpled(toy_grid, scene, 2)
+    x = 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    known = potential.self_contact.neighbours(x, x)
+    friction = Friction.of_contacts(potential.self_contact.contacts(x, known), x, 0.3, 1 / 30)
+    still = torch.zeros(3, 2, dtype=torch.float64)
+    inputs = StepInputs(None, still, x, x, 1 / 30, neighbours=known, friction=friction)
+
+    def found() -> list[torch.Tensor]:
+        search = Search(potential, x + 1e-4 * random(*x.shape, seed=5), inputs, SolverOptions())
+        step, _ = newton_step(potential, search.state, search.inputs, search.gradient, 50)
+        return [search.state.energy, search.gradient, step]
+
+    expected = found()
+    monkeypatch.setattr(potential, "replays", lambda x, inputs: inputs.is_plain)
+    monkeypatch.setattr(Captured, "__call__", lambda self, *given: self._function(*given))
+    for own, other in zip(found(), expected):
+        torch.testing.assert_close(own, other)
+    assert len(potential.self_contact.contacts(x, known).frame) > 10 and expected[1].abs().max() > 1e-3
 
 
 def test_pairs_are_looked_for_once_at_the_same_positions(scene, toy_grid, monkeypatch):
