@@ -122,11 +122,11 @@ def _clamped(value):
 
 
 @compiled
-def _over_face(x, i, j, k, l):  # noqa: E741
-    """Return the vector from the nearest point of the face j, k, l to the vertex i."""
+def _over_face(x, i, j, k, o):
+    """Return the vector from the nearest point of the face j, k, o to the vertex i."""
     px, py, pz = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
     ux, uy, uz = x[k, 0] - x[j, 0], x[k, 1] - x[j, 1], x[k, 2] - x[j, 2]
-    vx, vy, vz = x[l, 0] - x[j, 0], x[l, 1] - x[j, 1], x[l, 2] - x[j, 2]
+    vx, vy, vz = x[o, 0] - x[j, 0], x[o, 1] - x[j, 1], x[o, 2] - x[j, 2]
     d1, d2 = ux * px + uy * py + uz * pz, vx * px + vy * py + vz * pz
     a, b, c = ux * ux + uy * uy + uz * uz, ux * vx + uy * vy + uz * vz, vx * vx + vy * vy + vz * vz
     determinant = max(a * c - b * b, TINY)
@@ -144,10 +144,10 @@ def _over_face(x, i, j, k, l):  # noqa: E741
 
 
 @compiled
-def _between_edges(x, i, j, k, l):  # noqa: E741
-    """Return the vector from the nearest point of the edge k, l to that of the edge i, j."""
+def _between_edges(x, i, j, k, o):
+    """Return the vector from the nearest point of the edge k, o to that of the edge i, j."""
     ux, uy, uz = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-    vx, vy, vz = x[l, 0] - x[k, 0], x[l, 1] - x[k, 1], x[l, 2] - x[k, 2]
+    vx, vy, vz = x[o, 0] - x[k, 0], x[o, 1] - x[k, 1], x[o, 2] - x[k, 2]
     ax, ay, az = x[i, 0] - x[k, 0], x[i, 1] - x[k, 1], x[i, 2] - x[k, 2]
     ff, ss, fs = ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz, ux * vx + uy * vy + uz * vz
     fa, sa = ux * ax + uy * ay + uz * az, vx * ax + vy * ay + vz * az
@@ -180,11 +180,11 @@ def _near(
                 limit = most + other_limits[at]
                 if dx * dx + dy * dy + dz * dz > limit * limit:
                     continue
-                i, j, k, l = _four(first, second, point, other)  # noqa: E741
-                if i == k or i == l or (i == j if faces else (j == k or j == l)):
+                i, j, k, o = _four(first, second, point, other)
+                if i in (k, o) or (i == j if faces else j in (k, o)):
                     continue
                 frame = x[q // count]
-                dx, dy, dz = _over_face(frame, i, j, k, l) if faces else _between_edges(frame, i, j, k, l)
+                dx, dy, dz = _over_face(frame, i, j, k, o) if faces else _between_edges(frame, i, j, k, o)
                 far = dx * dx + dy * dy + dz * dz
                 if far >= reach * reach:
                     continue
@@ -206,15 +206,15 @@ def _close(
         found[pair] = False
         if known[pair] - moves[p, f] - other_moves[q, f] >= near:
             continue
-        i, j, k, l = _four(first, second, p, q)  # noqa: E741
-        dx, dy, dz = _over_face(x[f], i, j, k, l) if faces else _between_edges(x[f], i, j, k, l)
+        i, j, k, o = _four(first, second, p, q)
+        dx, dy, dz = _over_face(x[f], i, j, k, o) if faces else _between_edges(x[f], i, j, k, o)
         far = sqrt(dx * dx + dy * dy + dz * dz)
         if far < near:
             found[pair] = True
         elif steps:
             lowest, highest = 0.0, 0.0
             for number in range(4):
-                v = i if number == 0 else (j if number == 1 else (k if number == 2 else l))
+                v = i if number == 0 else (j if number == 1 else (k if number == 2 else o))
                 along = dx * step[f, v, 0] + dy * step[f, v, 1] + dz * step[f, v, 2]
                 if number < (1 if faces else 2):
                     lowest = min(lowest, along)

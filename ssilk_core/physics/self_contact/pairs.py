@@ -47,7 +47,7 @@ class Separations:
         """1 or -1, or 0 where the pair is seen at too flat an angle to have one, shape (P,)."""
         return torch.where(self.height.abs() > SEEN_FROM * self.distance, self.height.sign(), 0)
 
-    def kept(self, kept: Tensor) -> Separations:
+    def kept(self, kept: Tensor | slice) -> Separations:
         """Return the separations of the pairs that `kept` names."""
         return Separations(*(getattr(self, each.name)[..., kept] for each in fields(self)))
 

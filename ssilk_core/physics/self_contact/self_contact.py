@@ -48,7 +48,7 @@ EDGE_SHARE = 0.25  # of an edge's area: it makes the smaller part of the pressur
 
 @dataclass(frozen=True, eq=False)
 class KnownPairs:
-    """Pairs of one kind in N frames, by ascending frame, first and second.
+    """Pairs of one kind in N frames, by ascending frame.
 
     Attributes:
         frame: shape (P,).
@@ -75,15 +75,14 @@ class KnownPairs:
 
     def sides_of(self, other: KnownPairs) -> Tensor:
         """Return the sides of other pairs as far as they are kept here, 0 elsewhere."""
-        found, own = torch.zeros_like(other.side), self.kept(self.side != 0)
+        own = self.kept(self.side != 0)
         if not len(own.frame) or not len(other.frame):
-            return found
+            return torch.zeros_like(other.side)
         size = 1 + int(max(pairs.max() for pairs in (own.first, own.second, other.first, other.second)))
-        asked, there = ((pairs.frame * size + pairs.first) * size + pairs.second for pairs in (own, other))
-        at = torch.searchsorted(there, asked).clamp_max(len(there) - 1)
-        same = there[at] == asked
-        found[at[same]] = own.side[same]
-        return found
+        keys, asked = ((pairs.frame * size + pairs.first) * size + pairs.second for pairs in (own, other))
+        keys, order = keys.sort()
+        at = torch.searchsorted(keys, asked).clamp_max(len(keys) - 1)
+        return torch.where(keys[at] == asked, own.side[order[at]], 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +183,8 @@ class PairKind:
 
             grid = Grid.of(middles[1], middles[0], float(reaches[0].max() + reaches[1].max()))
             found = near_loop(at, self.first, self.second, middles, reaches, grid, groups, ascending, reach)
-            return KnownPairs(*found, torch.zeros_like(found[-1]))
+            frame, first, second, distance = found
+            return KnownPairs(frame, first, second, distance, torch.zeros_like(distance))
         frame, first, second = near_pairs(
             middles[0], reaches[0], middles[1], reaches[1], groups=groups, ascending=ascending
         )
@@ -193,9 +193,7 @@ class PairKind:
         kept = (distance < reach) & (one[:, None] != other).flatten(0, 1).all(0)
         return KnownPairs(frame, first, second, distance, torch.zeros_like(distance)).kept(kept)
 
-    def close(
-        self, x: Tensor, pairs: KnownPairs, moved: Tensor, near: float, step: Tensor | None = None
-    ) -> Tensor:
+    def close(self, x: Tensor, pairs: KnownPairs, moved: Tensor, near: float, step: Tensor | None = None) -> Tensor:
         """Return the rows of pairs that are close at positions x (V, 3, N).
 
         Close are those nearer than `near` [m], and those which come nearer in a step (V, 3, N), or in one in which
@@ -362,8 +360,8 @@ class SelfContact:
         return known, share, self._joined(x, parts)
 
     def _unknown(self, drift: Tensor) -> Tensor:
-        """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, and not so
-        far that pairs must be looked for there, in a step that is only tried."""
+        """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, nor so
+        far that pairs must be looked for where a step is only tried."""
         return torch.minimum(0.5 * CLOSING * (self.reach - 2 * drift), LEFT * REACH - drift)
 
     def _joined(self, x: Tensor, parts: Sequence[tuple[Tensor, ...]]) -> ClothContacts:

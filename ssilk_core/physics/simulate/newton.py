@@ -301,7 +301,7 @@ class Search:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
         x, gradient = self.state.x, self.gradient
         known, share, contacts = self.potential.self_contact.ahead(step, known)
-        self.inputs = replace(self.inputs, neighbours=known)
+        self.inputs, self.state = replace(self.inputs, neighbours=known), replace(self.state, neighbours=known)
         slowed, whole = contacts.without_passing(x, share[:, None] * step, YIELDING), share.amin(0) * step
         steep = (gradient * slowed).sum((0, 1)) < DOWNHILL * (gradient * whole).sum((0, 1))
         return torch.where(steep, slowed, contacts.allowed(x, whole, YIELDING).amin(0) * whole)

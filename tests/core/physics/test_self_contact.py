@@ -199,6 +199,15 @@ def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
     assert contact.contacts(nearer, there).gap(nearer).min().item() == pytest.approx(START - 0.001)
 
 
+def test_sides_are_found_again_whatever_the_order_of_pairs(scene, toy_grid):
+    contact, x, _ = crumpled(toy_grid, scene, 2)
+    pairs = contact.neighbours(x, x).edges
+    side = random(len(pairs.frame), seed=3).mul(8).floor().sub(1).clamp_max(1) * (random(len(pairs.frame)) < 0.1)
+    order, other = random(len(side), seed=4).argsort(), random(len(side), seed=5).argsort()[: len(side) // 2]
+    assert {*side.tolist()} == {-1, 0, 1}
+    assert torch.equal(replace(pairs, side=side).kept(order).sides_of(pairs.kept(other)), side[other])
+
+
 def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
     worn, _ = layers
     held = dressed(worn, worn.garment.mesh.points, worn.garment.mesh.faces, np.ones(6, dtype=bool))
