@@ -245,7 +245,7 @@ class IncrementalPotential:
             assert inputs.neighbours is not None
             step = target - x
             neighbours, share, met = self.self_contact.ahead(step, inputs.neighbours)
-            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, share[:, None] * step)
+            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, share.amin(0) * step)
             arrived = arrived | (step.norm(dim=1).amax(0) < ARRIVED)
             if bool(arrived.all()):
                 break
