@@ -5,8 +5,8 @@
 
 In the first pose of clips of `valid`, the energy of P's state is compared with the least energy that the latents
 reach from there, with the least that blendshape activations and proxy transforms reach from there, and with the
-solver's minima, from P's state, from linear blend skinning and from the bind pose, from which `ssilk simulate` carries
-the garment into its first pose. Distances are RMS, from P's state.
+solver's minima: from P's state, from linear blend skinning, and from the bind pose, as `ssilk simulate` carries the
+garment into its first pose. Distances are RMS, from P's state.
 """
 
 from __future__ import annotations

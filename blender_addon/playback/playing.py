@@ -18,7 +18,8 @@ from ssilk_core.errors import SsilkError
 from ..motions.keys import is_baked
 from ..outside.jobs import MODEL, read_state
 from ..scene import overlay
-from .live import Live, remove_live_keys
+from .dressed import remove_live_keys
+from .live import Live
 from .models import job_of, model_of
 
 PATIENCE = 0.3  # seconds after an edit before the motion is read again
@@ -70,7 +71,7 @@ def stop(garment: bpy.types.Object) -> None:
 def play_otherwise(garment: bpy.types.Object) -> None:
     """Play a garment at the level of quality that was chosen for it, where it is played."""
     played = live(garment)
-    if played and played.level != garment.ssilk.live_quality:
+    if played and played.solver.level != garment.ssilk.live_quality:
         _attempt(garment.session_uid, played.choose, garment.ssilk.live_quality)
         _read_soon(0.0)
 
@@ -93,7 +94,7 @@ def refresh(garment: bpy.types.Object) -> None:
 def take_up_models() -> None:
     """Switch to the newest models of trainings that are played."""
     for uid, played in list(_played.items()):
-        if played.renewed and played.done is None and _attempt(uid, played.ready):
+        if played.renewed and played.done is None and _attempt(uid, played.dressed.ready):
             _attempt(uid, played.take_up)
             _read_soon(0.0)
 
@@ -135,7 +136,7 @@ def _let_go(uid: int) -> Live | None:
     """Play a garment no longer; return what played it."""
     played = _played.pop(uid, None)
     if played:
-        played.close()
+        played.solver.close()
     return played
 
 
@@ -219,7 +220,7 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
     except SsilkError as error:
         played = _let_go(uid)
         _reasons[uid] = str(error)
-        if played and played.playback and not _rendering:  # else a file's own keys stay, as where it lacks its model
+        if played and played.rolled and not _rendering:  # else a file's own keys stay, as where it lacks its model
             for garment in (thing for thing in bpy.data.objects if thing.session_uid == uid):
                 remove_live_keys(garment)
         return None
@@ -227,10 +228,10 @@ def _attempt(uid: int, call, *arguments: object) -> object:  # type: ignore[no-u
 
 def _show_all(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     for uid, played in list(_played.items()):
-        waits, known = played.done is None, played.noticed
+        waits, known = played.done is None, played.solver.noticed
         _attempt(uid, played.show, scene, depsgraph)
         lost_shapes = waits and played.done is not None  # and is dressed again
-        if lost_shapes or (played.noticed and not known and not bpy.app.background):
+        if lost_shapes or (played.solver.noticed and not known and not bpy.app.background):
             _read_soon(PATIENCE)
 
 
@@ -247,7 +248,7 @@ def _compare(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
     """Say where a rendered frame shows another motion than the one that the garment follows."""
     for uid, played in list(_played.items()):
         if _attempt(uid, played.disagrees, scene, depsgraph):
-            garment, armature = played.objects()
+            garment, armature = played.dressed.objects()
             told = (
                 f"Frame {scene.frame_current} was rendered with another pose of '{armature.name}' than "
                 f"'{garment.name}' follows; bake it over the frames that you render."
@@ -282,7 +283,7 @@ def _look_at_times(scene: bpy.types.Scene) -> None:
 
 def _read_again(scene: bpy.types.Scene) -> None:
     for uid, played in list(_played.items()):
-        if _attempt(uid, played.is_in, scene):
+        if _attempt(uid, played.dressed.is_in, scene):
             _outdate(uid, played)
 
 
@@ -298,14 +299,14 @@ def _outdate(uid: int, played: Live) -> None:
 def _undone(*_: object) -> None:
     """Play no longer what was not played by then, and dress again what lost its shapes or keys."""
     for uid, played in list(_played.items()):
-        found = _attempt(uid, played.objects)
+        found = _attempt(uid, played.dressed.objects)
         if not found:
             continue
         if not found[0].ssilk.live:
             _let_go(uid)
         elif played.done is not None or _attempt(uid, played.missing):
             _attempt(uid, played.dress_again)
-        elif played.level != found[0].ssilk.live_quality:
+        elif played.solver.level != found[0].ssilk.live_quality:
             _attempt(uid, played.choose, found[0].ssilk.live_quality)
         elif played.in_other_fabric:
             _attempt(uid, played.change_fabric)
@@ -329,7 +330,7 @@ def _render_began(scene: bpy.types.Scene, *_: object) -> None:
     global _rendering
     for uid, played in list(_played.items()):
         _warnings.pop(uid, None)
-        if _attempt(uid, played.is_in, scene):
+        if _attempt(uid, played.dressed.is_in, scene):
             _outdated.add(uid)
     if threading.current_thread() is threading.main_thread():
         _read_all()
@@ -343,7 +344,7 @@ def _render_began(scene: bpy.types.Scene, *_: object) -> None:
         if played.unkeyed:
             print(f"SSILK: The render lacks what is played live. {played.unkeyed}")
         if played.wrong:
-            name = played.objects()[0].name
+            name = played.dressed.objects()[0].name
             _warnings[uid] = f"The render shows the network's motion of '{name}': {played.wrong}"
             print(f"SSILK: {_warnings[uid]}")
 

@@ -3,7 +3,7 @@
 
 In: words. Out: files, events for people or as JSON, an exit code.
 Open `main.py` first: `VERBS` lists the verbs, and a new one is added there. `train.py` is an example of one:
-`add_arguments` declares its options and `run` carries it out. `options.py` holds what several verbs share.
+`add_arguments` declares its options and `run` carries it out. `options/` holds what several verbs share.
 Public: `main`, which runs a command.
 """
 

@@ -12,8 +12,8 @@ from ..errors import fail
 from ..events import Reporter, Result
 from ..files import need_not_input
 from ..training.wardrobe.listing import WardrobeEntry, garment_file, read_list, write_list
-from . import options as shared
 from ._inspected import Inspected
+from .options.bodies import bodies_in_list
 
 OF_A_GARMENT = ("garment", "root", "body", "over", "family")  # options that a list has no use for
 
@@ -40,7 +40,7 @@ def inspect_list(
     for entry in entries:
         table = tables[entry.name] = entry.located(folder)
         own = _options_of(entry, table, tables, options)
-        own.body = shared.bodies_in_list(entry, entries, folder)
+        own.body = bodies_in_list(entry, entries, folder)
         if copy:
             prim = _garment_in(table)[1]
             own.fix = _copy_in(copy.parent, entry.name)

@@ -14,7 +14,9 @@ from ..errors import fail
 from ..events import Message, Reporter
 from ..physics.simulate import WornGarment
 from ..training.wardrobe.listing import WardrobeEntry, read_list
-from . import options as shared
+from .options.bodies import bodies_in_list
+from .options.fabric import garment_fabric
+from .options.scene import load_scene
 
 if TYPE_CHECKING:
     from ..physics.intersections.layers import ClothLayers, LayerCounts
@@ -56,7 +58,7 @@ def outfit_options(options: argparse.Namespace) -> dict[str, argparse.Namespace]
             allowed = "an outfit is simulated of the garments of its list"
             fail(f"{path}: table '{entry.name}', key 'over'", f"a model, {models[0]}", allowed, "add its garment")
         found[entry.name] = _options(options, entry, table)
-        found[entry.name].body = shared.bodies_in_list(entry, entries, path.parent)
+        found[entry.name].body = bodies_in_list(entry, entries, path.parent)
     stages = {str(each.stage) for each in found.values()}
     if len({Path(stage).resolve() for stage in stages}) > 1:
         allowed = "garments of an outfit are worn by one character"
@@ -84,8 +86,8 @@ def garments_of(every: Mapping[str, argparse.Namespace], report: Reporter) -> li
     """
     found = list[SimulatedGarment]()
     for name, options in every.items():
-        scene = shared.load_scene(options, report)
-        fabric = shared.fabric(options, scene.garment, report)
+        scene = load_scene(options, report)
+        fabric = garment_fabric(options, scene.garment, report)
         over = getattr(options, "over", ())
         names = set(over)
         for each in reversed(found):  # and what these are worn over

@@ -43,7 +43,9 @@ from ..errors import EXIT_OK, fail
 from ..events import Reporter
 from ..files import need_not_input
 from ..quality.levels import quality_named
-from .options import add_bake, add_level, is_folder, layer_options, requests_of
+from .options.bake import add_bake, add_level
+from .options.files import is_folder
+from .options.requests import layer_options, requests_of
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:

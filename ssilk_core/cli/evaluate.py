@@ -32,7 +32,9 @@ from typing import TYPE_CHECKING
 from ..delivery.bake.fabrics import need_fabric
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
-from . import options as shared
+from .options.bodies import BODIES, named_bodies
+from .options.fabric import add_known_fabric
+from .options.files import check_output
 
 if TYPE_CHECKING:
     import torch
@@ -49,7 +51,7 @@ COLUMNS = 118  # of a terminal, which tables fit
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="files written by 'ssilk train'")
-    verb.add_argument("--stage", type=Path, action="append", required=True, help=shared.BODIES)
+    verb.add_argument("--stage", type=Path, action="append", required=True, help=BODIES)
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER", help="folder of motion files")
     verb.add_argument("--index", type=Path, metavar="JSON",
@@ -58,7 +60,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--clips", nargs="+", default=[], metavar="NAME", help="only these clips")
     verb.add_argument("--reference", type=Path, metavar="FOLDER",
                       help="shots of 'ssilk simulate --points' to compare with")  # fmt: skip
-    shared.add_known_fabric(verb)
+    add_known_fabric(verb)
     verb.add_argument("--no-probes", action="store_true", help="measure clips alone, without probes")
     verb.add_argument("--solver", action="store_true",
                       help="simulate from the garment's own states, and single steps (long on a CPU)")  # fmt: skip
@@ -75,7 +77,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.output:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
-        shared.check_output(options.output, *options.models, *options.stage, options.index)
+        check_output(options.output, *options.models, *options.stage, options.index)
     need_fabric(options.fabric, options.material)
     asked = EvaluationOptions(stops=0, loop=0, linearised=0) if options.no_probes else EvaluationOptions()
     asked = replace(asked, solver=options.solver)
@@ -162,7 +164,7 @@ def evaluated(
 
     need_predicates()
     device = select_device(options.device)
-    bodies, listed = shared.bodies(options.stage), _listed(options)
+    bodies, listed = named_bodies(options.stage), _listed(options)
     opened = {body: [opener(path, stage, device) for path in options.models] for body, stage in bodies.items()}
     results = _results(options, asked, [one for each in opened.values() for one in each], listed)
     known = results.known(report)
@@ -326,7 +328,7 @@ def _results(
     garments = dict.fromkeys(one.prim for one in opened) if options.reference else ()
     simulated = {
         f"{body}/{name}" if body else name: shots(options.reference / body, name)
-        for body in shared.bodies(options.stage)
+        for body in named_bodies(options.stage)
         for name in garments
     }
     settings = {**asdict(asked), "clips": options.clips, "root": options.root}

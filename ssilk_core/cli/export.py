@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING
 from ..delivery.bake.fabrics import need_fabric
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result
-from . import options as shared
+from .options.fabric import add_known_fabric
+from .options.files import check_output
 
 if TYPE_CHECKING:
     from ..network.checkpoint import ModelFile
@@ -39,7 +40,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="USD file with the body to export it for (default: the first of its family)",
     )
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
-    shared.add_known_fabric(verb)
+    add_known_fabric(verb)
 
 
 def run(options: argparse.Namespace, report: Reporter) -> int:
@@ -55,7 +56,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         fail(str(output), f"a file that ends in '{output.suffix}'", "ONNX files end in .onnx")
     if options.root and not options.stage:
         fail("--root", "a SkelRoot without a stage", "it says which character of --stage is meant", "give --stage")
-    shared.check_output(output, options.model)
+    check_output(output, options.model)
     need_fabric(options.fabric, options.material)
     file = load_model(options.model)
     if options.stage:

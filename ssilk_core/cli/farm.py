@@ -23,7 +23,9 @@ from ..delivery.farm.job import NAME, FarmJob, is_job, submitted
 from ..delivery.farm.openjd import TEMPLATE, BundleOptions, write_bundle
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Countdown, Failed, GarmentEvent, Message, Reporter, Result, Started
-from .options import NumberRange, add_bake, layer_options, requests_of
+from .options.bake import add_bake
+from .options.numbers import NumberRange
+from .options.requests import layer_options, requests_of
 
 if TYPE_CHECKING:
     from ..delivery.farm.cluster import TaskOutcome

@@ -27,8 +27,11 @@ from ..events import Reporter, Result, format_count, silent
 from ..files import replacing, split_location
 from ..scene.shape_weights import bodies_within
 from ..training.settings import PRESETS, preset_named
-from . import options as shared
 from ._inspected import Inspected
+from .options.bodies import members, need_onto, read_member, read_onto
+from .options.files import LIST, MODEL, check_output
+from .options.motions import tell_shapes
+from .options.scene import STAGE, add_garment, garment_location, read_stage
 
 if TYPE_CHECKING:
     from ssilk_usd.units import StageUnits
@@ -42,8 +45,8 @@ if TYPE_CHECKING:
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=shared.STAGE + ", or a list of garments (.toml)")
-    shared.add_garment(verb)
+    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=STAGE + ", or a list of garments (.toml)")
+    add_garment(verb)
     verb.add_argument(
         "--over", action="append", default=[], metavar="FILE[:/PRIM]|PRIM|MODEL",
         help="a garment that is worn beneath this one (repeatable): a file of its own, a mesh of the stage, or a "
@@ -81,7 +84,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     """Inspect; return 0, or 2 when there are errors."""
     from ._inspect_list import inspect_list
 
-    if options.stage.suffix == shared.LIST:
+    if options.stage.suffix == LIST:
         return inspect_list(options, report, _inspect)
     found = _inspect(options, report)
     if options.json:
@@ -122,10 +125,10 @@ def _read_inputs(options: argparse.Namespace, report: Reporter) -> PreflightInpu
 
     from ..authoring.preflight.inspection import PreflightInput
 
-    character, garment, rig = shared.read(options, report)
-    file, prim = shared.wardrobe(options)
+    character, garment, rig = read_stage(options, report)
+    file, prim = garment_location(options)
     motions, unread = _readable(options.motion, character.skeleton)
-    shared.tell_shapes(options, motions, report, trained=character)
+    tell_shapes(options, motions, report, trained=character)
     known = body_parameters(open_stage(options.stage)).items()
     return PreflightInput(
         character=character, garment=garment, rig=rig, character_units=_units(options.stage),
@@ -146,7 +149,7 @@ def _inner(options: argparse.Namespace, character: Character) -> dict[str, Mesh]
 
     found: dict[str, Mesh] = {}
     for name, location in zip(options.over_names or options.over, options.over, strict=True):
-        if location.endswith(shared.MODEL):
+        if location.endswith(MODEL):
             from ..network.checkpoint import load_model
             from ..training.inner_garments import other_character
 
@@ -169,7 +172,7 @@ def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Repo
         return _parameters(inputs)
     from ..authoring.bodies.differences import family_findings
 
-    others = [shared.read_member(options, member, report) for member in shared.members(options, report)]
+    others = [read_member(options, member, report) for member in members(options, report)]
     return list(family_findings([inputs.character, *others]))
 
 
@@ -189,19 +192,19 @@ def _parameters(inputs: PreflightInput) -> list[Finding]:
 
 def _on_skeleton(options: argparse.Namespace, inputs: PreflightInput, report: Reporter) -> list[Finding]:
     """Return what there is to say of the joints of --onto; write the map of --joints where there is none yet."""
-    shared.need_onto(options)
+    need_onto(options)
     if not options.onto:
         return []
     from ..authoring.bodies.joint_findings import joint_findings
     from ..authoring.bodies.joint_names import propose
     from ..scene.joint_map import read_joint_map, write_joint_map
 
-    other = shared.read_onto(options, report)
+    other = read_onto(options, report)
     if options.joints and options.joints.exists():
         return list(joint_findings(read_joint_map(options.joints), inputs.character, other, inputs.garment))
     found = propose(inputs.character.skeleton, other.skeleton, str(options.joints or options.onto))
     if options.joints:
-        shared.check_output(options.joints, options.stage, split_location(str(options.onto))[0])
+        check_output(options.joints, options.stage, split_location(str(options.onto))[0])
         write_joint_map(options.joints, found, _about_map(options))
     return list(joint_findings(found, inputs.character, other, inputs.garment))
 
@@ -269,11 +272,11 @@ def _fix(options: argparse.Namespace, inputs: PreflightInput) -> list[str]:
 
     from ..authoring.preflight.repair import plan_repair
 
-    file, prim = shared.wardrobe(options)
+    file, prim = garment_location(options)
     units, stated = _corrected_units(inputs)
     if options.fix.exists() and options.fix.samefile(file):
         fail(str(options.fix), "this is the file to repair", "--fix writes a copy", "name another file")
-    shared.check_output(options.fix, options.stage)
+    check_output(options.fix, options.stage)
     with replacing(options.fix) as half_done:
         # Units first: everything else is measured in them.
         write_with_units(file, half_done, units)
@@ -308,6 +311,6 @@ def _corrected_units(inputs: PreflightInput) -> tuple[StageUnits, list[str]]:
 
 def _moved(options: argparse.Namespace, copy: Path) -> argparse.Namespace:
     """Return the options with a repaired copy in place of the file that it was made from."""
-    file, prim = shared.wardrobe(options)
+    file, prim = garment_location(options)
     own: dict[str, object] = {} if file == options.stage else {"garment": f"{copy}:{prim}" if prim else str(copy)}
     return argparse.Namespace(**{**vars(options), **(own or {"stage": copy})})

@@ -17,7 +17,8 @@ from ..delivery.bake.request import ALL_ELEMENTS, LATENT_ELEMENTS, MAX_PRE_ROLL,
 from ..errors import EXIT_OK, fail
 from ..events import Reporter
 from ..quality.levels import QUALITIES
-from .options import NumberRange, add_known_fabric
+from .options.fabric import add_known_fabric
+from .options.numbers import NumberRange
 
 OVER_PIPE = "-"  # in place of the motion's file
 

@@ -19,7 +19,9 @@ from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result
 from ..files import split_location
 from ..quality.levels import SizeReduction, size_at, spend
-from . import options as shared
+from .options.bake import add_level
+from .options.files import check_output
+from .options.numbers import NumberRange
 
 NUMBERS = ("shapes", "joints", "influences")
 
@@ -35,9 +37,9 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("-o", "--output", type=Path, required=True, help="model to write (.safetensors)")
     for name, what in zip(NUMBERS, ("blendshapes", "proxy joints", "joints that move one vertex")):
         verb.add_argument(
-            f"--{name}", type=shared.NumberRange(0, 10**6, int), metavar="N", help=f"{what} to keep (default: all)"
+            f"--{name}", type=NumberRange(0, 10**6, int), metavar="N", help=f"{what} to keep (default: all)"
         )
-    shared.add_level(verb, "6MB for the file")
+    add_level(verb, "6MB for the file")
     verb.add_argument("--motions", type=Path, nargs="+", default=[], metavar="PATH",
                       help="motion files or folders to keep exact (default: the training's)")  # fmt: skip
 
@@ -51,7 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
-    shared.check_output(options.output, options.model, *motion_files(options.motions))
+    check_output(options.output, options.model, *motion_files(options.motions))
     file = load_model(options.model)
     if file.bodies:
         text = "a model of a family of bodies: what is kept is the best for the first of them, and is kept for all"

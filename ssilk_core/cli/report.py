@@ -23,7 +23,7 @@ from ..physics.intersections.figures import LAYERS, LayerFigures, SelfIntersecti
 from ..physics.skin.figures import ShownSkin
 from ..physics.world.sunk import SunkCloth
 from ..scene.fabrics import Fabric
-from .options import check_output
+from .options.files import check_output
 
 if TYPE_CHECKING:
     from ssilk_usd.opening.garment_api import GarmentRecord
@@ -230,5 +230,5 @@ def _baked(options: argparse.Namespace, report: Reporter) -> list[Section]:
         rollout.warn(report)
         state_rollout_counts(shot, rollout)
         world = rollout.around.seen
-        props = ShotProps(world, rollout.seconds) if world else None
+        props = ShotProps(world, rollout.samples.seconds) if world else None
         return _shot(shot, report, props, load_model(model))[:-1]

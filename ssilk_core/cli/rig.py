@@ -21,7 +21,11 @@ from ..authoring.setup.rig import RigOptions
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
 from ..files import split_body, split_location
-from . import options as shared
+from .options.bodies import need_onto, onto_place, read_member, read_onto
+from .options.fabric import stated_fabric
+from .options.files import check_output
+from .options.numbers import NumberRange
+from .options.scene import add_scene, garment_location, read_stage
 
 if TYPE_CHECKING:
     from ..scene.assets import Character, Garment, Mesh, Scene
@@ -29,21 +33,21 @@ if TYPE_CHECKING:
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    shared.add_scene(verb)
+    add_scene(verb)
     verb.add_argument("-o", "--output", type=Path, required=True, help="stage to write (.usdc, .usd or .usda)")
     verb.add_argument(
-        "--tightness", type=shared.NumberRange(0, 1), metavar="SHARE",
+        "--tightness", type=NumberRange(0, 1), metavar="SHARE",
         help="how much is tight: 0 nothing, 1 all that is not pinned (default: the classes that the garment has, "
              f"else {USUAL:g}). Classes are made again by primvars:ssilk:tightness, with their proxies",
     )  # fmt: skip
     verb.add_argument(
         "--proxies",
-        type=shared.NumberRange(0, 1000, int),
+        type=NumberRange(0, 1000, int),
         default=RigOptions.proxies,
         help="proxy joints on the loose part (default %(default)s)",
     )
     verb.add_argument(
-        "--roots", type=shared.NumberRange(1, 1000, int), default=RigOptions.roots_per_cluster, metavar="N",
+        "--roots", type=NumberRange(1, 1000, int), default=RigOptions.roots_per_cluster, metavar="N",
         help="proxies of each connected loose part that hang from the character itself (default %(default)s)",
     )  # fmt: skip
     verb.add_argument(
@@ -71,13 +75,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ..authoring.setup.prepare import prepare_scene
     from ..scene.assets import CLASS_NAMES
 
-    onto = shared.onto(options)[0] if options.onto else None
-    shared.check_output(options.output, options.stage, shared.wardrobe(options)[0], onto)
+    onto = onto_place(options)[0] if options.onto else None
+    check_output(options.output, options.stage, garment_location(options)[0], onto)
     report(Started("rig", options.proxies))
-    shared.need_onto(options)
-    character, garment, rig = shared.read(options, report)
+    need_onto(options)
+    character, garment, rig = read_stage(options, report)
     if garment.surface is not None:
-        shared.stated_fabric(garment.surface, report)
+        stated_fabric(garment.surface, report)
     settled = None if options.keep_shape else settled_garment(character, garment, report)
     scene = prepare_scene(
         character,
@@ -138,8 +142,8 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
     from ..authoring.preflight.fit import describe_left, describe_move
 
     path = scene.garment.mesh.path
-    file, root = shared.onto(options)
-    other = shared.read_member(options, file, report, root)
+    file, root = onto_place(options)
+    other = read_member(options, file, report, root)
     if found := differences(scene.character, other):
         _need_map(options, scene, other, found)
     family = need_family([scene.character, other])
@@ -178,7 +182,7 @@ def _on_skeleton(options: argparse.Namespace, scene: Scene, report: Reporter) ->
     from ..scene.joint_map import read_joint_map
 
     names = read_joint_map(options.joints)
-    other = shared.read_onto(options, report)
+    other = read_onto(options, report)
     own, skeleton = scene.character.skeleton, other.skeleton
     images = names.images(own, skeleton)
     carried = carry_onto(scene, other, images)

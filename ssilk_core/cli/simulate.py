@@ -34,7 +34,12 @@ from ..events import Countdown, Message, Reporter, Result, Started
 from ..files import replacing, split_location
 from ..scene.assets.reshaped import reshaped
 from ..scene.fabrics import Fabric
-from . import options as shared
+from .options.fabric import add_fabric, asked_fabric
+from .options.files import LIST, check_output
+from .options.motions import add_range, tell_shapes, with_shapes
+from .options.numbers import RATE, NumberRange
+from .options.scene import STAGE, add_garment, garment_location, garment_under_riders
+from .options.world import add_world
 
 if TYPE_CHECKING:
     import torch
@@ -55,8 +60,8 @@ if TYPE_CHECKING:
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=shared.STAGE + ", or a list of garments (.toml)")
-    shared.add_garment(verb)
+    verb.add_argument("stage", type=Path, metavar="STAGE|LIST", help=STAGE + ", or a list of garments (.toml)")
+    add_garment(verb)
     verb.add_argument(
         "--motion", type=Path, nargs="+", required=True, metavar="SHOT[:/PRIM]", help="USD files with motions"
     )
@@ -67,25 +72,23 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--shot-name", metavar="PATTERN",
                       help="name of each file in a folder, such as '{parent}_{stem}' (default: the motion file's, "
                            f"and the prim's where one is named); {naming.FIELDS}")  # fmt: skip
-    shared.add_range(verb, "frames to simulate", "all")
-    shared.add_fabric(verb)
-    shared.add_world(verb, "in the simulation")
-    verb.add_argument(
-        "--fps", type=shared.RATE, default=30.0, help="frames per second (default 30, as models are trained)"
-    )
-    verb.add_argument("--tolerance", type=shared.NumberRange(1e-9, 1e3), default=1e-2, metavar="G",
+    add_range(verb, "frames to simulate", "all")
+    add_fabric(verb)
+    add_world(verb, "in the simulation")
+    verb.add_argument("--fps", type=RATE, default=30.0, help="frames per second (default 30, as models are trained)")
+    verb.add_argument("--tolerance", type=NumberRange(1e-9, 1e3), default=1e-2, metavar="G",
                       help="RMS acceleration that may be left in the cloth, in g (default 0.01)")  # fmt: skip
-    verb.add_argument("--iterations", type=shared.NumberRange(1, 10**6, int), default=100, metavar="N",
+    verb.add_argument("--iterations", type=NumberRange(1, 10**6, int), default=100, metavar="N",
                       help="most iterations of the solver in each frame, or part of one (default 100)")  # fmt: skip
     verb.add_argument("--self-contact", action="store_true",
                       help="keep loose cloth from passing through its own garment; takes longer")  # fmt: skip
     verb.add_argument(
         "--batch",
-        type=shared.NumberRange(1, 10**6, int),
+        type=NumberRange(1, 10**6, int),
         default=64,
         help="motions that advance together (default 64)",
     )
-    verb.add_argument("--sequence", type=shared.NumberRange(1, 10**6, int), metavar="FRAMES",
+    verb.add_argument("--sequence", type=NumberRange(1, 10**6, int), metavar="FRAMES",
                       help="restart from rest after so many frames (paper: 512; default: never)")  # fmt: skip
     verb.add_argument(
         "--points", action="store_true", help="write time-sampled points instead of joints and blendshapes"
@@ -106,17 +109,17 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     frames = parse_range(options.range or "all")
     asked = asked_world(options.collider, options.wind, options.gusts, options.gravity)
-    is_list = options.stage.suffix == shared.LIST
+    is_list = options.stage.suffix == LIST
     every = outfit_options(options) if is_list else {"": options}
     outputs = {
         name: _outputs(options.output, list(map(str, options.motion)), options.shot_name, name) for name in every
     }
-    stage, worn = next(iter(every.values())).stage, [shared.wardrobe(own)[0] for own in every.values()]
+    stage, worn = next(iter(every.values())).stage, [garment_location(own)[0] for own in every.values()]
     for output in (output for each in outputs.values() for output in each):
-        shared.check_output(output, stage, *worn, *motion_files(options.motion))
+        check_output(output, stage, *worn, *motion_files(options.motion))
     device = select_device(options.device)
     for own in every.values():
-        shared.asked_fabric(own)
+        asked_fabric(own)
     garments = garments_of(every, report)
     settings = SimulationOptions(
         fps=options.fps,
@@ -128,8 +131,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     )
     character, first = garments[0].worn.scene.character, garments[0].options
     read = [read_in_range(str(path), character.skeleton, frames) for path in options.motion]
-    shared.tell_shapes(first, read, report)
-    motions = [shared.with_shapes(first, each, path, character) for each, path in zip(read, options.motion)]
+    tell_shapes(first, read, report)
+    motions = [with_shapes(first, each, path, character) for each, path in zip(read, options.motion)]
     for motion in motions:
         if moved := reshaped(character, motion):
             report(Message(f"{motion.path}: {'; '.join(map(str, moved))}; cloth meets it so, and it is written so"))
@@ -277,7 +280,7 @@ class _Caches:
         self.worlds = worlds
         stage, mesh = open_stage(options.stage), scene.garment.mesh
         self.units = StageUnits.of(stage)
-        self.riders = riders_of(stage, mesh, options.root, report, shared.laid(options, mesh))
+        self.riders = riders_of(stage, mesh, options.root, report, garment_under_riders(options, mesh))
         if self.riders and options.points:
             report(
                 Message(f"{options.stage}: --points writes the garment alone, without what rides on it", "warning")
@@ -417,7 +420,7 @@ def _provenance(options: argparse.Namespace, motion: Path, fabric: Fabric) -> di
     """Return everything that decides what a shot's file holds."""
     from ..delivery.bake.inputs import stage_contents
 
-    garment, _ = shared.wardrobe(options)
+    garment, _ = garment_location(options)
     names = ("fps", "tolerance", "iterations", "points", "no_body")
     lists = ("material", "body")
     return {
@@ -444,7 +447,7 @@ def _together(garments: Sequence[SimulatedGarment]) -> dict[str, str | float]:
     if len(garments) == 1:
         return {}
     told = [
-        f"{each.name} {stage_contents(str(shared.wardrobe(each.options)[0])).digest} {each.worn.fabric} "
+        f"{each.name} {stage_contents(str(garment_location(each.options)[0])).digest} {each.worn.fabric} "
         f"over {','.join(each.over)}"
         for each in garments
     ]

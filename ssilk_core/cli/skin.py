@@ -19,7 +19,10 @@ from ..delivery.targets import TARGETS
 from ..errors import EXIT_OK, fail
 from ..events import Message, Reporter, Result, Started
 from ..files import split_location
-from . import options as shared
+from .options.files import check_output
+from .options.motions import tell_shapes, with_shapes
+from .options.numbers import NumberRange
+from .options.scene import STAGE, add_garment, garment_under_riders, load_scene
 
 if TYPE_CHECKING:
     from ..delivery.bake.counted import MetWorld
@@ -32,14 +35,14 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
     verb.add_argument("cache", metavar="CACHE[:/PRIM]", help="USD file with the garment's points at each frame; PRIM "
                       "is its mesh, where several have as many points")  # fmt: skip
-    verb.add_argument("--stage", type=Path, required=True, help=shared.STAGE)
-    shared.add_garment(verb)
+    verb.add_argument("--stage", type=Path, required=True, help=STAGE)
+    add_garment(verb)
     verb.add_argument("--model", type=Path, help="model written by 'ssilk train', whose weights are used")
     verb.add_argument("--motion", metavar="SHOT[:/PRIM]",
                       help="USD file with the character's motion (default: the cache itself)")  # fmt: skip
     verb.add_argument("-o", "--output", type=Path, required=True,
                       help="shot to write (.usdc, .usd, .usda, .usdz or .glb)")  # fmt: skip
-    verb.add_argument("--tolerance", type=shared.NumberRange(1e-3, 1e3), default=1.0, metavar="MM",
+    verb.add_argument("--tolerance", type=NumberRange(1e-3, 1e3), default=1.0, metavar="MM",
                       help=f"RMS distance from the cache in millimetres; any vertex may be {LARGEST} times as far "
                            "off (default 1)")  # fmt: skip
     verb.add_argument("--target", choices=TARGETS, default="usd", help="who receives it (default usd)")
@@ -65,7 +68,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         suffix, allowed = options.output.suffix, ", ".join(target.suffixes)
         fail(str(options.output), f"the suffix is '{suffix}'", f"{options.target} takes {allowed}")
     inputs = (options.stage, options.model, split_location(options.cache)[0], split_location(where)[0])
-    shared.check_output(options.output, *inputs)
+    check_output(options.output, *inputs)
     deformer = _deformer(options, report)
     if (names := joint_names(deformer.scene, target)).renamed:
         report(Message(f"--target {options.target}: {names}", "warning"))
@@ -74,8 +77,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     points = MeshTrajectories(options.cache, mesh.vertex_count, mesh.faces)
     skeleton = deformer.scene.character.skeleton
     motion = motion_at(read_motion(where, skeleton, root=options.root), skeleton, points, options.cache)
-    motion = shared.with_shapes(options, motion, where, deformer.scene.character)
-    shared.tell_shapes(options, [motion], report)
+    motion = with_shapes(options, motion, where, deformer.scene.character)
+    tell_shapes(options, [motion], report)
     report(Started("skin", motion.frame_count, {"output": str(options.output)}))
     stage = open_stage(options.stage)
     own = StageUnits.of(stage)
@@ -86,7 +89,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         options.output,
         units=StageUnits(target.meters_per_unit or own.meters_per_unit, target.up_axis or own.up_axis),
         origin=cache_origin(options.cache, points.mesh, options.output),
-        riders=riders_of(stage, mesh, options.root, report, shared.laid(options, mesh)),
+        riders=riders_of(stage, mesh, options.root, report, garment_under_riders(options, mesh)),
         met=_met(str(where), options, deformer, motion, report),
         hidden=read_hidden(where, motion, root=options.root),
         include_body=not options.no_body,
@@ -118,7 +121,7 @@ def _deformer(options: argparse.Namespace, report: Reporter) -> Deformer:
     from ..delivery.bake import rig_deformer, trained_deformer
 
     if options.model is None:
-        return rig_deformer(shared.load_scene(options, report))
+        return rig_deformer(load_scene(options, report))
     for name in ("garment", "body"):
         if getattr(options, name):
             fail(f"--{name}", f"a {name} beside a model", f"the model holds its {name}", "leave one of them out")

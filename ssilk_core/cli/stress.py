@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
 from ..events import Countdown, Message, Reporter, Result, Started
-from .options import BODIES, add_known_fabric, asked_known_fabric, bodies, check_output
+from .options.bodies import BODIES, named_bodies
+from .options.fabric import add_known_fabric, asked_known_fabric
+from .options.files import check_output
 
 if TYPE_CHECKING:
     from ..quality.kept_rows import KeptRows
@@ -53,7 +55,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     if options.output:
         check_output(options.output, options.model, *options.stage)
-    subjects = {body: _subject(options, stage, report) for body, stage in bodies(options.stage).items()}
+    subjects = {body: _subject(options, stage, report) for body, stage in named_bodies(options.stage).items()}
     cases = [replace(case, body=body) for body in subjects for case in CASES if case.matches(options.only)]
     if not cases:
         fail(

@@ -24,8 +24,10 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_TASKS, fail
 from ..events import Reporter, Result, Started
-from . import options as shared
 from ._measured import measured_inputs
+from .options.fabric import add_known_fabric, asked_known_fabric
+from .options.files import check_output
+from .options.numbers import NumberRange
 
 if TYPE_CHECKING:
     from ..delivery.bake import BakeRollout
@@ -44,13 +46,13 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("models", type=Path, nargs="+", metavar="MODEL", help="models on one skeleton")
     verb.add_argument("--stage", type=Path, required=True, help="USD file with the character")
     verb.add_argument("--root", metavar="PRIM", help="SkelRoot of the character, where the stage has several")
-    shared.add_known_fabric(verb)
+    add_known_fabric(verb)
     verb.add_argument("--motions", type=Path, required=True, metavar="FOLDER",
                       help="motion files; models are measured on --clips and reduced to fit the others")  # fmt: skip
     verb.add_argument(
         "--clips", nargs="+", default=[], metavar="NAME", help="measure on these (default: the first two)"
     )
-    verb.add_argument("--frames", type=shared.NumberRange(4, 10**6, int), default=FRAMES, metavar="N",
+    verb.add_argument("--frames", type=NumberRange(4, 10**6, int), default=FRAMES, metavar="N",
                       help="measure on the first N frames of each clip, at the models' rate (default "
                            f"{FRAMES})")  # fmt: skip
     verb.add_argument("--no-refine", action="store_true",
@@ -72,7 +74,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     if options.output:
         if options.output.suffix != ".json":
             fail(str(options.output), "not a name for figures", "it ends in .json")
-        shared.check_output(options.output, *options.models)
+        check_output(options.output, *options.models)
     need_predicates()
     bench = Bench(options, report)
     results = Results(options.output, bench.asked)
@@ -173,7 +175,7 @@ class Bench:
             "frames": self.frames,
             "processor": platform.processor() or platform.machine(),
             "root": self.options.root,
-            **shared.asked_known_fabric(self.options),
+            **asked_known_fabric(self.options),
         }
 
     def _check(self, path: Path, file: ModelFile, first: ModelFile) -> None:

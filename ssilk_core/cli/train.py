@@ -28,7 +28,12 @@ from ..scene.fabric_range import FACTORS, FabricRange
 from ..scene.fabrics import FRICTION
 from ..training.settings import PRESETS, TrainConfig, preset_named
 from ..training.wardrobe.training import WORSE_FIGURE
-from . import options as shared
+from .options.bodies import members, read_member
+from .options.fabric import add_fabric, asked_fabric, garment_fabric
+from .options.files import check_output
+from .options.motions import tell_shapes
+from .options.numbers import NumberRange
+from .options.scene import add_scene, garment_location, load_scene
 
 if TYPE_CHECKING:
     from ..scene.assets import Scene
@@ -38,7 +43,7 @@ if TYPE_CHECKING:
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
     """Add the options of this verb."""
-    shared.add_scene(verb)
+    add_scene(verb)
     verb.add_argument(
         "--motions", type=Path, nargs="+", required=True, metavar="PATH", help="motion files or folders to train on"
     )
@@ -61,7 +66,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--minutes",
-        type=shared.NumberRange(1e-3, 1e6),
+        type=NumberRange(1e-3, 1e6),
         metavar="M",
         help="wall time after the setup, in place of the preset's iterations: a few steps are timed, and the "
         "schedule is scaled to the number that fits; one seed gives one model only for one such number. With "
@@ -103,7 +108,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
         help="with --family: grade the garment to each body, as a pattern is by sizes, so that its rest shape is "
              "where it lies there (default: one garment for all, tight on a heavy body and loose on a slight one)",
     )  # fmt: skip
-    shared.add_fabric(verb)
+    add_fabric(verb)
     verb.add_argument(
         "--fabrics", nargs="*", metavar="PRESET|FACTOR",
         help="train for a range of fabrics, in any of which the model then bakes: from 1/FACTOR to FACTOR times each "
@@ -138,7 +143,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
     if options.output.suffix != ".safetensors":
         fail(str(options.output), "not a name for a model", "it ends in .safetensors")
-    shared.check_output(options.output)
+    check_output(options.output)
     if isinstance(report, TextReporter):
         report.since = time.monotonic()
     with ExitStack() as running:
@@ -218,9 +223,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
         report(Message(f"preset '{options.preset}' is taken, the default on {select_device(device).type}"))
     model, train = configured(options)
     _take_fabric(options, report)
-    scene = shared.load_scene(options, report)
+    scene = load_scene(options, report)
     scene = replace(scene, garment=replace(scene.garment, graded=options.graded))
-    fabric = shared.fabric(options, scene.garment, report)
+    fabric = garment_fabric(options, scene.garment, report)
     if fabric.friction:
         report(Message(f"friction = {fabric.friction:g} is left out; {FRICTION}", "warning"))
     fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
@@ -229,7 +234,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     report(Message("the motions are read"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
-    shared.tell_shapes(options, (*motions, *held), report, trained=scene.character)
+    tell_shapes(options, (*motions, *held), report, trained=scene.character)
     if not held:
         motions, held = split_motions(motions)
         report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
@@ -246,9 +251,9 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
             was, now = now, was
         report(Message(f"{trained}: it was trained as {was}, and goes on as {now}", "warning"))
     over = InnerModel.load_all(options.over, options.output)
-    others = shared.members(options, report)
+    others = members(options, report)
     family = _family(options, others, scene, report) if others else None
-    files = {options.stage, shared.wardrobe(options)[0], *motion_files([*options.motions, *options.valid])}
+    files = {options.stage, garment_location(options)[0], *motion_files([*options.motions, *options.valid])}
     files |= {trained} if base else set()
     files |= {*options.over, *(Path(split_body(member)[0]) for member in others)}
     files = {Path(split_body(str(path))[0]) for path in files}
@@ -282,7 +287,7 @@ def _family(options: argparse.Namespace, others: Sequence[str], scene: Scene, re
     from ..authoring.bodies.differences import need_family
     from ..authoring.preflight.fit import describe_left
 
-    characters = [shared.read_member(options, other, report) for other in others]
+    characters = [read_member(options, other, report) for other in others]
     bodies = need_family([scene.character, *characters], trained=True)
     how = ", and graded to each" if options.graded else ""
     report(Message(f"the garment is carried onto {len(characters)} more bodies, along {bodies.size} directions{how}"))
@@ -332,7 +337,7 @@ def configured(options: argparse.Namespace) -> tuple[ModelConfig, TrainConfig]:
     if options.graded and options.family is None:
         fail("--graded", "no --family", "garments are graded to further bodies", "name these, or leave it out")
     preset = preset_named(options.preset or default_preset(options.device))
-    fabric = shared.asked_fabric(options)
+    fabric = asked_fabric(options)
     if options.fabrics is not None:
         FabricRange.of(fabric, options.fabrics)
     return _settings(options.settings, preset.model, preset.train)

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 from ..errors import EXIT_OK, fail
 from ..events import Reporter, Result
 from ..files import replacing
-from .options import RATE, NumberRange, check_output
+from .options.files import check_output
+from .options.numbers import RATE, NumberRange
 
 if TYPE_CHECKING:
     from ..delivery.view.player import ShotPlayer

@@ -45,8 +45,10 @@ from ..training.wardrobe.panel import ProgressTable, table
 from ..training.wardrobe.queue import CommandTask, End, Queue, Slot
 from ..training.wardrobe.training import GarmentTraining
 from ..work_record import request_key
-from . import options as shared
 from . import train
+from .options.bodies import bodies_in_list, members
+from .options.numbers import NumberRange
+from .options.scene import garment_location
 
 
 def add_arguments(verb: argparse.ArgumentParser) -> None:
@@ -57,7 +59,7 @@ def add_arguments(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--jobs",
-        type=shared.NumberRange(1, 1000, int),
+        type=NumberRange(1, 1000, int),
         help="trainings at a time (default: one for each GPU; one without GPUs)",
     )
     verb.add_argument(
@@ -92,7 +94,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
 
 def _with_bodies(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> WardrobeEntry:
     """Return an entry whose training names its bodies, where its stage has other garments of the list among them."""
-    bodies = shared.bodies_in_list(entry, entries, folder)
+    bodies = bodies_in_list(entry, entries, folder)
     return replace(entry, words=(*entry.words, *(word for body in bodies for word in ("--body", body))))
 
 
@@ -206,7 +208,7 @@ def _need_shapes(options: argparse.Namespace, folder: Path) -> None:
 
     stage, named = folder / options.stage, options.family
     family = named and [each if is_shapes(str(each)) else folder / each for each in named]
-    others = shared.members(argparse.Namespace(stage=stage, family=family), silent)
+    others = members(argparse.Namespace(stage=stage, family=family), silent)
     for body in (str(stage), *(others if named else ())):  # unnamed ones are within the ranges that the stage marks
         if split_body(body)[1]:
             open_stage(body)
@@ -221,7 +223,7 @@ def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
     from ssilk_usd.reading.motion import motion_files
 
     motions = motion_files(folder / motion for motion in [*options.motions, *options.valid])
-    bodies = [options.stage, shared.wardrobe(options)[0], *(options.family or ())]
+    bodies = [options.stage, garment_location(options)[0], *(options.family or ())]
     named = [folder / file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
     own = {path.resolve() for path in (*named, *motions)}
     layers = {Path(file).resolve() for path in own if path.is_file() for file in used_files(str(path))} - own

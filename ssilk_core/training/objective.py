@@ -211,40 +211,20 @@ class Objective:
             Terms of the frames from the third on, terms of the quasi-static states of the single poses, and the last
             two latents (2, batch, latent) for the next window.
         """
-        model, bank, length = self.model, self.bank, sampler.config.window
-        batch = len(sampler.first)
-        times = sampler.frames().reshape(-1)
-        down = sampler.gravity().flatten(0, 1)
+        model, bank = self.model, self.bank
+        length, batch = sampler.config.window, len(sampler.first)
+        count = (length - 2) * batch
+        times, down = sampler.frames().reshape(-1), sampler.gravity().flatten(0, 1)
         fabric = None if sampler.fabric is None else sampler.fabric.repeat(length, 1)
-        near = self._near(times, down, sampler.obstacles and sampler.obstacles.repeated(length), fabric)
-        static = self._static_descriptor(times, down, near, fabric)
-        heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
-        pose = bank.described(static, times, down, heading).reshape(length, batch, -1)
-        # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
-        with torch.set_grad_enabled(not model.integrator.scheme.states):
-            target = model.initial(static).reshape(length, batch, -1)
-            start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
-        body = bank.body(times.reshape(length, batch))
-        if near is not None:
-            body = near.stopping(body, model.feedback.stopped, length)
-        with torch.set_grad_enabled(sampler.config.bptt):
-            z = model.roll([*(start + noise)], target[2:], pose[2:], body)
-        rolled = torch.cat(z[2:])
-        if not sampler.config.bptt:
-            # Repeat all steps at once, from states without gradients.
-            states = torch.cat(z)
-            before, now = states[: -2 * batch], states[batch:-batch]
-            with torch.no_grad():
-                seen = model.seen_from(before, now, body.triples())
-            rolled = model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
-        single_near = self._near(frames, single_down, single_obstacles, single_fabric)
-        quiet = model.initial(self._static_descriptor(frames, single_down, single_near, single_fabric))
+        z, rolled = self._rolled(sampler, noise, times, down, fabric)
+        near = self._near(frames, single_down, single_obstacles, single_fabric)
+        quiet = model.initial(self._static_descriptor(frames, single_down, near, single_fabric))
         with torch.no_grad():
             past = model.vertices(torch.cat(z[:2]), bank.character(times[: 2 * batch]))
         # One decoder call for the windows from the third frame on and the single poses.
         asked = torch.cat([times[2 * batch :], frames])
         character = bank.character(asked)
-        x = self._vertices(torch.cat([rolled, quiet]), character, (length - 2) * batch)
+        x = self._vertices(torch.cat([rolled, quiet]), character, count)
         beneath = self.inner.window(sampler, frames, single_down, single_obstacles) if self.inner else None
         pulled = torch.cat([down[2 * batch :], single_down])
         met = None
@@ -255,22 +235,67 @@ class Objective:
         terms = self.quasi_static_terms(x, pulled, character, self._buried(asked), beneath, met, factors)
         if self.contours:
             terms[INTERSECTION] = self.contours.energy(x)
-        count = (length - 2) * batch
         dynamic = {name: value[:count] for name, value in terms.items()}
         single = {name: value[count:] for name, value in terms.items()}
-        path = torch.cat([past, x[..., : count - batch].detach()], dim=-1)
-        root = bank.root_at(times).T
         moving = factors.first(count) if factors else None
-        kinetic = self.energy.inertia_and_drag(
-            x, path[..., batch:], path[..., :-batch], root[:, 2 * batch :] - root[:, batch:-batch], self.dt, moving
-        )
-        if moving:
-            kinetic = kinetic[0] / moving.density, kinetic[1] / moving.density
-        dynamic["inertia"], dynamic["drag"] = kinetic
+        dynamic["inertia"], dynamic["drag"] = self._kinetic(x, past, times, batch, moving)
         if weight := sampler.config.latent_regularization:
             drawn = torch.cat([rolled[-batch:], quiet])
             dynamic[REGULARIZATION] = weight * latent_distortion(model, self.energy.mass, drawn, LATENT_SCALE)
         return dynamic, single, torch.stack(z[-2:]).detach()
+
+    def _rolled(
+        self, sampler: WindowSampler, noise: Tensor, times: Tensor, down: Tensor, fabric: Tensor | None
+    ) -> tuple[list[Tensor], Tensor]:
+        """Roll one window of every slot, with noise as for `window`.
+
+        Args:
+            times: frames of the windows, one frame of every slot after another (N,).
+            down: gravity and wind in these [g], (N, 3).
+            fabric: features of their fabrics (N, 5), where these are drawn.
+
+        Returns:
+            The latents of each frame, (batch, latent) each, and with gradients those from the third on, joined.
+        """
+        model, length, batch = self.model, sampler.config.window, len(sampler.first)
+        near = self._near(times, down, sampler.obstacles and sampler.obstacles.repeated(length), fabric)
+        static = self._static_descriptor(times, down, near, fabric)
+        heading = None if sampler.heading is None else sampler.heading.repeat(length, 1)
+        pose = self.bank.described(static, times, down, heading).reshape(length, batch, -1)
+        # Beside a stepper, the initialiser is trained on the energy of its own states, not on that of later frames.
+        with torch.set_grad_enabled(not model.integrator.scheme.states):
+            target = model.initial(static).reshape(length, batch, -1)
+            start = torch.where(sampler.carried[None, :, None], sampler.latents, target[:2])
+        body = self.bank.body(times.reshape(length, batch))
+        if near is not None:
+            body = near.stopping(body, model.feedback.stopped, length)
+        with torch.set_grad_enabled(sampler.config.bptt):
+            z = model.roll([*(start + noise)], target[2:], pose[2:], body)
+        if sampler.config.bptt:
+            return z, torch.cat(z[2:])
+        # Repeat all steps at once, from states without gradients.
+        states = torch.cat(z)
+        before, now = states[: -2 * batch], states[batch:-batch]
+        with torch.no_grad():
+            seen = model.seen_from(before, now, body.triples())
+        return z, model.step(before, now, target[2:].flatten(0, 1), pose[2:].flatten(0, 1), seen)
+
+    def _kinetic(
+        self, x: Tensor, past: Tensor, times: Tensor, batch: int, factors: FabricFactors | None
+    ) -> tuple[Tensor, Tensor]:
+        """Return inertia and drag of the windows from the third frame on, whose positions come first in x (V, 3, N).
+
+        Args:
+            past: positions in the first two frames, (V, 3, 2 batch).
+            times: frames of the windows, (window * batch,).
+        """
+        path = torch.cat([past, x[..., : len(times) - 3 * batch].detach()], dim=-1)
+        root = self.bank.root_at(times).T
+        shift = root[:, 2 * batch :] - root[:, batch:-batch]
+        inertia, drag = self.energy.inertia_and_drag(
+            x, path[..., batch:], path[..., :-batch], shift, self.dt, factors
+        )
+        return (inertia / factors.density, drag / factors.density) if factors else (inertia, drag)
 
 
 def total(terms: Terms, half: float = 0.0) -> Tensor:

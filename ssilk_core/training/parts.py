@@ -9,44 +9,36 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ..events import Message, Reporter, format_count, silent
-from ..network import fabrics as of_fabrics
-from ..network.bodies import completed, joined
-from ..network.checkpoint import ModelFile, state_inputs
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel, model_joints
-from ..network.parameters import on_moved_garment, seeing_more
 from ..physics.collision import CollisionBody, limb_axes, reachable_body
-from ..physics.constants import GRAVITY
 from ..physics.energy import GarmentEnergy
 from ..physics.energy.graded import GradedRest
-from ..physics.intersections.cloth import ClothIntersections
-from ..physics.intersections.contours import IntersectionContours
 from ..physics.intersections.pairs import need_predicates
 from ..scene.assets import Floats, Ints, Motion
-from ..scene.fabric_range import FACTORS, FabricRange, ends, factors_of, inputs_of
-from ..scene.family import motion_on, spread_points
+from ..scene.fabric_range import FabricRange
+from ..scene.family import motion_on
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .bodies import BodyWearer, DrawnBodies, FamilyBody
 from .fabrics import FabricDrawer
 from .family_bank import FamilyBank, build_family_bank
 from .inner_garments import InnerGarments
 from .job import TrainJob
-from .memory import searches_contours
-from .motion_bank import MotionBank, build_bank, usable_spans
+from .motion_bank import MotionBank, build_bank
 from .objective import Objective
 from .obstacles import ObstacleDrawer
 from .parallel import SINGLE_PROCESS, ProcessGroup
 from .settings import TrainConfig
 from .shape_smoothing import ShapeSmoothing
+from .starting_model import starting_model
 from .step import Stepper
-from .validation import ValidatedBody, ValidatedFabric, Validator
+from .validation import Validator
+from .validators import build_validator
 from .windows import WindowSampler
 
-FIRST_WEIGHT = "stepper.0.weight"
-VALIDATED = 4  # members of a family, beside its first, that models are validated on
 POSED_AT_ONCE = 1024  # frames, to find limbs that do not count
 
 
@@ -143,7 +135,7 @@ def build_parts(
     Raises:
         SsilkError: the motions are too short, or libigl is missing where `intersection_weight` needs it.
     """
-    scene, skeleton, fps = job.scene, job.scene.character.skeleton, job.model.fps
+    scene, skeleton = job.scene, job.scene.character.skeleton
     if job.train.intersection_weight or job.over:
         need_predicates()
     motions, extra = job.training_motions(), job.extra_motions()
@@ -154,73 +146,52 @@ def build_parts(
     vertices, moving = _reachable(job, every)
     joints = job.base.joints if job.base else model_joints(scene, moving)
     report(Message(f"the network and its inputs are built on {device}"))
-    seen = len(FACTORS) if job.fabrics else 0
-    model = GarmentModel(scene, job.model, joints, job.train.seed, job.family, seen)
-    if job.base and job.whole:
-        known = on_moved_garment(job.base.parameters, job.base.scene, scene, job.base.config)
-        known = seeing_more(known, scene, job.base.config, job.model)
-        if job.fabrics:
-            learned = job.base.fabrics.columns if job.base.fabrics else of_fabrics.unseen(job.base.parameters)
-            known = of_fabrics.joined(known, learned, state_inputs(job.model))
-        if job.family:
-            # To a model of one body coordinates count nothing yet.
-            own = job.base.bodies.columns if job.base.bodies else {}
-            known = joined(known, completed(own, known, job.family.bodies.size))
-        model.load_state_dict({name: torch.from_numpy(value.copy()) for name, value in known.items()})
-    elif job.base:
-        goes_on = _take_over(model, job.base)
-        start = "goes on from that of the given model" if goes_on else "starts anew: it steps otherwise, or sees less"
-        report(Message(f"the stepper {start}"))
-    model = model.to(device)
-    kind = job.model.descriptors
-    bodies = job.family.bodies if job.family else None
-    if bodies:
-        bank: MotionBank = build_family_bank(
-            motions, skeleton, joints, fps, device, bodies, max_joint_speed=MAX_JOINT_SPEED
-        )
-    else:
-        bank = build_bank(motions, skeleton, joints, fps, device, max_joint_speed=MAX_JOINT_SPEED, kind=kind)
-    held = build_bank(job.held_out, skeleton, joints, fps, device, kind=kind)
+    model = starting_model(job, joints, report).to(device)
+    bank = _training_bank(job, motions, joints, device)
+    held = build_bank(job.held_out, skeleton, joints, job.model.fps, device, kind=job.model.descriptors)
     energy = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
-    body, limbs, touched = scene.character.merged_body(), limb_axes(scene), None
+    touched, shape, graded = None, None, None
     if len(vertices):
+        body, limbs = scene.character.merged_body(), limb_axes(scene)
         touched = CollisionBody(body, skeleton.joint_count, vertices=vertices, limbs=limbs, device=device)
-    shape = FamilyBody(touched, scene, bodies) if touched and bodies else None
-    # Validation uses the whole body, to detect collisions with parts that training leaves out.
-    whole = CollisionBody(body, skeleton.joint_count, limbs=limbs, device=device)
-    rest, frames = model.decoder.rest.clone(), job.train.valid_frames  # the base's, whichever body steps are done on
-    spans = usable_spans(job.held_out, skeleton, fps)
-    contours = None
-    if searches_contours(scene, job.train):
-        tension = job.train.intersection_weight * GRAVITY * float(energy.mass.sum())
-        contours = IntersectionContours(ClothIntersections.of(scene), scene.classes, tension, device)
-    inner = None
-    if job.over:
-        listed = ", ".join(f"'{one.name}'" for one in job.over)
-        report(Message(f"beneath it are put {listed}, and where it can touch them is found"))
-        samples, beside = energy.cloth.samples, (bank, held, joints, kind)
-        found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
-        inner = found if len(found) else None
-        if job.loosened:
-            count = f"{job.loosened} pinned vertices lie over cloth that moves"
-            report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
-    members = _validated_members(job, energy, joints, frames, device, group) if job.family else []
-    fabrics = _validated_fabrics(job, held, whole, frames, device, group) if job.fabrics else []
-    graded, measured = None, energy
+    if touched and job.family:
+        shape = FamilyBody(touched, scene, job.family.bodies)
+    rest = model.decoder.rest.clone()  # the base's, whichever body steps are done on
+    inner = _inner_garments(job, energy, motions, bank, held, joints, report) if job.over else None
+    validator = build_validator(job, held, energy, rest, joints, inner, device, group)
     if job.family and scene.garment.graded:
-        # Steps move its rest shape about, and what is validated on the first body needs that body's.
-        measured = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
         graded = GradedRest(energy, scene.garment.rest_mesh, job.family.cloth_moves)
-    validator = Validator(
-        held, measured, whole, scene, rest, fps, frames, group, spans, contours, inner, [*members, *fabrics]
-    )
     smoothing = None if job.stepper_alone else ShapeSmoothing.of(model, job.train.shape_smoothing)
     if smoothing and not job.base:
         smoothing.smooth_start()  # a resumed run replaces it by what it has learned
-    reached = len(vertices)
     return TrainingParts(
-        model, bank, energy, touched, validator, reached, device, group, smoothing, inner, shape, graded, job.fabrics
-    )
+        model, bank, energy, touched, validator, len(vertices), device, group, smoothing, inner, shape, graded,
+        job.fabrics,
+    )  # fmt: skip
+
+
+def _training_bank(job: TrainJob, motions: Sequence[Motion], joints: Ints, device: torch.device) -> MotionBank:
+    """Return the motions to train on, on all bodies of a family where there is one."""
+    given = motions, job.scene.character.skeleton, joints, job.model.fps, device
+    if job.family:
+        return build_family_bank(*given, job.family.bodies, max_joint_speed=MAX_JOINT_SPEED)
+    return build_bank(*given, max_joint_speed=MAX_JOINT_SPEED, kind=job.model.descriptors)
+
+
+def _inner_garments(
+    job: TrainJob, energy: GarmentEnergy, motions: Sequence[Motion], bank: MotionBank, held: MotionBank, joints: Ints,
+    report: Reporter,
+) -> InnerGarments | None:  # fmt: skip
+    """Return the garments beneath, and say what they loosen; None where the garment can touch none of them."""
+    scene, kind = job.scene, job.model.descriptors
+    listed = ", ".join(f"'{one.name}'" for one in job.over)
+    report(Message(f"beneath it are put {listed}, and where it can touch them is found"))
+    samples, beside = energy.cloth.samples, (bank, held, joints, kind)
+    found = InnerGarments(job.over, scene, samples, motions, job.held_out, *beside, report)
+    if job.loosened:
+        count = f"{job.loosened} pinned vertices lie over cloth that moves"
+        report(Message(f"{scene.garment.mesh.path}: {count}: they are tight, so that it can push them out"))
+    return found if len(found) else None
 
 
 def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
@@ -237,80 +208,3 @@ def _reachable(job: TrainJob, motions: Sequence[Motion]) -> tuple[Ints, Floats]:
         reach = reachable_body(other, [motion_on(motion, base, skeleton, ratio) for motion in motions])
         vertices, joints = np.union1d(vertices, reach.vertices), np.logical_or(joints, reach.joints)
     return vertices, joints
-
-
-def _validated_members(
-    job: TrainJob, energy: GarmentEnergy, joints: Ints, frames: int, device: torch.device, group: ProcessGroup
-) -> list[ValidatedBody]:
-    """Return those members of a family, its first left out, that models are validated on as well.
-
-    They are the ones farthest apart, and together they have as many frames as the first.
-    """
-    assert job.family
-    bodies, base, found = job.family.bodies, job.scene.character.skeleton, []
-    chosen = [row for row in spread_points(bodies.members, 1 + VALIDATED) if row]
-    for row in chosen:
-        coordinates = bodies.members[row]
-        scene = job.family.scene_at(job.scene, coordinates)
-        skeleton, ratio = scene.character.skeleton, bodies.height_ratio(coordinates)
-        motions = [motion_on(motion, base, skeleton, ratio) for motion in job.held_out]
-        bank = build_bank(motions, skeleton, joints, job.model.fps, device)
-        body = CollisionBody(
-            scene.character.merged_body(), skeleton.joint_count, limbs=limb_axes(scene), device=device
-        )
-        rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32, device=device)
-        part = max(1, frames // len(chosen))
-        place = torch.tensor(coordinates, dtype=torch.float32, device=device)
-        if scene.garment.graded:
-            energy = GarmentEnergy(scene.garment.rest_mesh, job.fabric, scene.classes, device=device)
-        validator = Validator(bank, energy, body, scene, rest, job.model.fps, part, group)
-        found.append(ValidatedBody(bodies.names[row], place, validator))
-    return found
-
-
-def _validated_fabrics(
-    job: TrainJob, held: MotionBank, body: CollisionBody, frames: int, device: torch.device, group: ProcessGroup
-) -> list[ValidatedFabric]:
-    """Return the fabrics at the ends of a range, which models are validated in as well.
-
-    Together they have as many frames as the model's own.
-    """
-    assert job.fabrics
-    scene, chosen, found = job.scene, ends(job.fabric, job.fabrics), []
-    rest = torch.tensor(scene.garment.mesh.points, dtype=torch.float32, device=device)
-    for fabric in chosen:
-        factors = factors_of(job.fabric, fabric)
-        energy = GarmentEnergy(scene.garment.rest_mesh, fabric, scene.classes, device=device)
-        part = max(1, frames // len(chosen))
-        validator = Validator(held, energy, body, scene, rest, job.model.fps, part, group)
-        seen = torch.tensor(inputs_of(factors), dtype=torch.float32, device=device)
-        density = float(factors[FACTORS.index("density")])
-        found.append(ValidatedFabric(f"fabric {fabric.name}", seen, validator, density))
-    return found
-
-
-def _take_over(model: GarmentModel, base: ModelFile) -> bool:
-    """Give a network the initialiser and decoder of a trained one, and no gradients to them.
-
-    The stepper starts as the trained one where it sees no less than that: what it saw comes first, and more of the
-    cloth counts nothing yet.
-
-    Returns:
-        Whether it does.
-    """
-    learns = ("stepper.", "integrator.")
-    kept = {name: torch.from_numpy(value.copy()) for name, value in base.parameters.items()}
-    own, before = model.config, base.config
-    alike = all(getattr(own, name) == getattr(before, name) for name in ("scheme", "descriptors", "feedback_proxies"))
-    more_points = own.feedback_points - before.feedback_points
-    # Proxies come after points.
-    goes_on = alike and (more_points == 0 or (more_points > 0 and not own.feedback_proxies))
-    if goes_on and FIRST_WEIGHT in kept:
-        more = model.get_parameter(FIRST_WEIGHT).shape[1] - kept[FIRST_WEIGHT].shape[1]
-        kept[FIRST_WEIGHT] = nn.functional.pad(kept[FIRST_WEIGHT], (0, more))
-    model.load_state_dict(
-        {name: value for name, value in kept.items() if goes_on or not name.startswith(learns)}, strict=False
-    )
-    for name, parameter in model.named_parameters():
-        parameter.requires_grad_(name.startswith(learns))
-    return goes_on

@@ -117,7 +117,7 @@ def a_sea(ready: Any, garment: Any) -> Any:
 def near_live(garment: Any) -> np.ndarray | None:
     from blender_addon.playback import playing
 
-    return playing.live(garment)._near
+    return playing.live(garment).rolled.near
 
 
 def live(ready: Any, garment: Any) -> tuple[np.ndarray, np.ndarray | None]:

@@ -63,7 +63,7 @@ def test_ssilk_takes_the_options(ready, skirt, ssilk_python):
     skirt.ssilk.fabric.stretch_model = "baraff_witkin"
     skirt.ssilk.fabric.margin = 0.006
     program = (
-        "import argparse, sys; from ssilk_core.cli.options import add_fabric, asked_fabric; "
+        "import argparse, sys; from ssilk_core.cli.options.fabric import add_fabric, asked_fabric; "
         "verb = argparse.ArgumentParser(); add_fabric(verb); print(asked_fabric(verb.parse_args()))"
     )
     command = [ssilk_python, "-c", program, *fabric_options(skirt.ssilk.fabric)]

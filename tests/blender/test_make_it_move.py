@@ -93,12 +93,12 @@ def test_a_mesh_comes_to_play_while_it_is_trained(ready, skirt, tmp_path, monkey
     watch()
     first = playing.live(skirt)
     assert first and first.model == job / "model.safetensors" and not skirt.ssilk.awaited
-    before = first._written
+    before = first.written
     os.utime(first.model, (before + 5, before + 5))  # as a better model is written
     with monkeypatch.context() as patch:
         patch.setattr(live, "sample", None)  # the motion is not read again
         watch()
-    assert playing.live(skirt) is first and first._written == before + 5 and first.done is None
+    assert playing.live(skirt) is first and first.written == before + 5 and first.done is None
     playing.stop(skirt)
     settings.preset = "preview"  # what an artist chose stays
     called, again = lines_up(bpy, skirt)

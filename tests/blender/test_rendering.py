@@ -172,7 +172,7 @@ def test_a_render_in_another_thread_waits_until_the_main_one_has_read(ready, sta
     from blender_addon.playback import playing
 
     assert ready.ops.ssilk.play_live() == {"FINISHED"}
-    live, first = playing.live(stage), playing.live(stage).placed.copy()
+    live, first = playing.live(stage), playing.live(stage).rolled.placed.copy()
     ready.data.objects["Rig"].animation_data.action = ready.data.actions["Spin Ö"]
     render = threading.Thread(target=playing._render_began, args=(ready.context.scene,))
     render.start()
@@ -183,7 +183,7 @@ def test_a_render_in_another_thread_waits_until_the_main_one_has_read(ready, sta
         time.sleep(0.001)
     try:
         assert playing._rendering and playing._read() == playing.PATIENCE
-        assert not live.stale and np.abs(live.placed - first).max() > 0.1
+        assert not live.stale and np.abs(live.rolled.placed - first).max() > 0.1
     finally:
         playing._render_ended()
     spun = shown(ready, stage, range(1, 41))

@@ -154,7 +154,7 @@ def test_a_pose_that_is_not_keyed_is_noticed_and_solved(ready, trained, windowed
     constraint = ready.data.objects["Rig"].pose.bones["Spine"].constraints.new("LIMIT_ROTATION")
     constraint.use_limit_x, constraint.owner_space = True, "LOCAL"
     ready.context.scene.frame_set(20)
-    assert live.stale and live.solved < 20 and live.noticed
+    assert live.stale and live.solved < 20 and live.solver.noticed
     step_until(lambda: not live.busy)
     assert live.solved == len(FRAMES) and live.stale
 

@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from ssilk_core.cli import main
 from ssilk_core.cli.inputs import CHARACTER, MODEL, MOTIONS, need_input
-from ssilk_core.cli.options import members
+from ssilk_core.cli.options.bodies import members
 from ssilk_core.errors import SsilkError
 from ssilk_core.events import silent
 

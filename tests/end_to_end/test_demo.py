@@ -23,7 +23,7 @@ from ssilk_usd.writing.files import write_garment, write_motion
 
 from ssilk_core.cli import demo, main, view
 from ssilk_core.cli.main import parser
-from ssilk_core.cli.options import load_scene
+from ssilk_core.cli.options.scene import load_scene
 from ssilk_core.delivery.bake import BakeRequest, load_rollout
 from ssilk_core.delivery.view.shots import Look
 from ssilk_core.demo import garments, motions, shipped

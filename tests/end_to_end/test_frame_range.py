@@ -18,7 +18,7 @@ from ssilk_core.cli import main
 from ssilk_core.delivery.bake import origin
 from ssilk_core.delivery.bake.load import load_rollout
 from ssilk_core.delivery.bake.request import BakeRequest
-from ssilk_core.delivery.bake.rollout import _from_fraction
+from ssilk_core.delivery.bake.shot_samples import from_fraction
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_nothing_is_interpolated_across_a_cut_where_the_grids_of_motion_and_shot
     moved[:, 0, 0] = 0.9 * np.arange(len(moved)) + 100 * (np.arange(len(moved)) > 40)  # at 54 m/s
     felt = np.where(np.arange(len(moved)) > 40, 1.0, -1.0)  # gravity and colliders of either side alone
     given = {"gravity": felt[:, None] * [0, 9.81, 0], "proximity": felt[:, None, None] * np.ones((2, 5))}
-    found = _from_fraction(replace(source, translations=moved, **given), skeleton, 0.25)
+    found = from_fraction(replace(source, translations=moved, **given), skeleton, 0.25)
     later = np.arange(len(moved)) + 0.25
     np.testing.assert_allclose(found.translations[:, 0, 0], 0.9 * later + 100 * (later > 40), atol=1e-9)
     for values in (found.gravity[:, 1] / 9.81, found.proximity[:, 1, 2]):

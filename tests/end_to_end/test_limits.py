@@ -14,7 +14,7 @@ from pxr import Gf, Sdf, Usd, UsdSkel
 
 from ssilk_core.cli import main
 from ssilk_core.cli.main import parser
-from ssilk_core.cli.options import NumberRange
+from ssilk_core.cli.options.numbers import NumberRange
 from ssilk_core.delivery.farm.job import numbers
 from ssilk_core.errors import SsilkError
 from ssilk_core.network.checkpoint import load_model, save_model

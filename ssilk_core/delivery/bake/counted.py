@@ -38,7 +38,7 @@ def state_rollout_counts(path: Path, rollout: BakeRollout) -> ShotCounts:
         samples_per_frame=request.samples_per_frame,
         device=request.device,
         points=rollout.refinement is not None and request.writes_points,
-        met=MetWorld(rollout.around.seen, rollout.seconds) if rollout.around.seen else None,
+        met=MetWorld(rollout.around.seen, rollout.samples.seconds) if rollout.around.seen else None,
         riders=rollout.riders,
     )
 

@@ -11,10 +11,11 @@ from pathlib import Path
 from ...errors import fail
 from ...files import relative_path, sha256, split_body, split_location
 from ...scene.assets import ShotWorld
+from .computed_frames import Refinement
 from .opened import provenance_of
 from .record import RECORD
 from .request import AT, BakeRequest, split_start
-from .rollout import BakeRollout, Refinement
+from .rollout import BakeRollout
 
 REFINED = "refined"  # what a shot says of its refinement, under this name
 COLLIDERS = "colliders"  # what a shot says of those that its cloth met, under this name

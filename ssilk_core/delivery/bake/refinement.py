@@ -21,9 +21,10 @@ from ...scene.cycles import led
 from ...scene.held_parts import shares_of_proxies
 from ...scene.kinematics import deform, lbs_deformer, lbs_poses
 from .beneath import GarmentsBeneath
+from .computed_frames import Refinement
 from .direction import Direction, free_stretches
 from .result import RefinementSummary, ShotShapes, Verification
-from .rollout import BakeRollout, Refinement
+from .rollout import BakeRollout
 from .world import tell_surrounded
 
 if TYPE_CHECKING:

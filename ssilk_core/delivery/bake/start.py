@@ -14,10 +14,6 @@ from ...scene.assets import Floats, Garment
 from .request import AT, BakeRequest, split_start
 
 SLACK = 1e-6  # of a time code
-FAR = 0.01  # [m] RMS, from which on latents do not reach the cloth: it is warned of
-ELSEWHERE = 0.1  # of the garment's size, RMS, from which on the cloth is of another moment or character
-SEEN = 1e-4  # [m] that latents may miss at most without a blendshape that makes up for it
-BLEND = 0.5  # [s] after which that weighs nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +83,6 @@ def _need_code(text: str) -> None:
     if at and there == [True, False] and split_start(text)[1] is None:
         found = f"'{code}' after '{AT}' is no time code"
         fail(f"--start-cloth {text}", found, "a number names a frame of it", f"such as {place}{AT}100")
-
-
-def fading(frames: range, fps: float) -> Floats:
-    """Return the weights (F,) of what latents miss, in frames that are counted from the first, at a rate [1/s]."""
-    done: Floats = np.clip(np.array(frames, np.float64) / (fps * BLEND), 0, 1)
-    return np.asarray(1 - done**2 * (3 - 2 * done), np.float64)
 
 
 def need_startable(request: BakeRequest, loops: bool) -> None:

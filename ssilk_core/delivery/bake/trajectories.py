@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from .riders import verify_riders
 from .verification import compare_trajectories, need_valid
 
 if TYPE_CHECKING:
+    from ssilk_usd.shots.shot import ShotSummary
     from ssilk_usd.shots.trajectories import MeshTrajectories
     from ssilk_usd.units import StageUnits
 
@@ -80,24 +82,12 @@ def motion_at(motion: Motion, skeleton: Skeleton, cache: MeshTrajectories, where
 
 
 def skin_trajectories(
-    deformer: Deformer,
-    motion: Motion,
-    points: Sequence[Floats],
-    output: str | os.PathLike[str],
-    *,
-    units: StageUnits,
-    origin: Mapping[str, object],
-    about: Mapping[str, object] | None = None,
-    riders: Sequence[Rider] = (),
-    met: MetWorld | None = None,
-    hidden: Sequence[tuple[int, bool]] = (),
-    include_body: bool = True,
-    verify: bool = True,
-    tolerance: FitTolerance | None = None,
-    device: str = "cpu",
-    source: str = "the garment's points",
-    report: Reporter = silent,
-) -> BakeResult:
+    deformer: Deformer, motion: Motion, points: Sequence[Floats], output: str | os.PathLike[str], *,
+    units: StageUnits, origin: Mapping[str, object], about: Mapping[str, object] | None = None,
+    riders: Sequence[Rider] = (), met: MetWorld | None = None, hidden: Sequence[tuple[int, bool]] = (),
+    include_body: bool = True, verify: bool = True, tolerance: FitTolerance | None = None, device: str = "cpu",
+    source: str = "the garment's points", report: Reporter = silent,
+) -> BakeResult:  # fmt: skip
     """Write vertex trajectories as joints and blendshapes into one file, which appears once it is verified.
 
     Args:
@@ -118,7 +108,6 @@ def skin_trajectories(
             skinning cannot reach, or an output that cannot be written.
         VerificationError: the file is not what was computed; it is not kept.
     """
-    from ssilk_usd.shots.shot import write_shot
     from ssilk_usd.writing.export import packaged
 
     from ...devices import select_device
@@ -132,29 +121,20 @@ def skin_trajectories(
         warn_of_sets(found.deformer, path, report)
     said = {**(about or {}), SKINNED: {**origin, **asdict(tolerance), **shapes.to_metadata()}}
     said |= met_metadata(met.world, path) if met else {}
-    verification: Verification | None = None
     ridden = RiderJoints(found.deformer, riders, found.deformer.skin.indices.shape[1])
-    poses = ridden.poses(motion, found.poses)
     with replacing(path) as unverified:
         with packaged(unverified, report, name=path) as layer:
-            common: dict[str, Any] = {
-                "start": motion.start, "include_body": include_body, "hidden": hidden, "provenance": said,
-                "riders": ridden,
-            }  # fmt: skip
-            if path.suffix == GLB:
-                summary = write_glb_shot(layer, ridden.deformer, motion, poses, **common)
-            else:
-                summary = write_shot(layer, ridden.deformer, motion, poses, units=units, **common)
+            write = _writer(path, units)
+            summary = write(
+                layer, ridden.deformer, motion, ridden.poses(motion, found.poses), start=motion.start,
+                include_body=include_body, hidden=hidden, provenance=said, riders=ridden,
+            )  # fmt: skip
             name = Path(split_location(motion.path)[0]).stem
             counts = state_counts(
                 layer, found.deformer.scene, motion, name=name, device=device, met=met, riders=riders
             )
-        if verify:
-            need_valid(unverified, report)
-            shot = open_shot(unverified)
-            verification = compare_trajectories(shot, points, tolerance=tolerance)
-            verify_riders(shot, shot.sample_times(), ridden, report)
-        else:
+        verification = _verified(unverified, points, tolerance, ridden, report) if verify else None
+        if not verify:
             report(Message("not verified, as asked", "warning"))
     if summary.left_out:
         report(Message(f"{path}: {summary.left_out}", "warning"))
@@ -165,6 +145,24 @@ def skin_trajectories(
         verification=verification, shapes=shapes, shown_skin=counts.shown_skin,
         intersections=counts.intersections, sunk=counts.sunk, entered=counts.entered,
     )  # fmt: skip
+
+
+def _writer(path: Path, units: StageUnits) -> Callable[..., ShotSummary]:
+    """Return what writes a shot into a file of its suffix."""
+    from ssilk_usd.shots.shot import write_shot
+
+    return write_glb_shot if path.suffix == GLB else partial(write_shot, units=units)
+
+
+def _verified(
+    path: Path, points: Sequence[Floats], tolerance: FitTolerance, ridden: RiderJoints, report: Reporter
+) -> Verification:
+    """Return how far a written file is off the points; raise `VerificationError` where it is too far."""
+    need_valid(path, report)
+    shot = open_shot(path)
+    verification = compare_trajectories(shot, points, tolerance=tolerance)
+    verify_riders(shot, shot.sample_times(), ridden, report)
+    return verification
 
 
 def cache_origin(cache: str, mesh: str, output: Path) -> dict[str, object]:

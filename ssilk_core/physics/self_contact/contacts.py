@@ -8,7 +8,7 @@ which they turn, but for the Hessian's part that turning makes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -59,7 +59,6 @@ class ClothContacts:
     Attributes:
         law: how pressure depends on the gap, which is measured from each pair's own start.
         frames: number N.
-        known: how far apart pairs are at least that are not known [m], shape (N,).
         frame: of each contact, shape (P,).
         vertices: shape (4, P).
         coefficients: c_i, shape (4, P).
@@ -72,7 +71,6 @@ class ClothContacts:
 
     law: ContactLaw
     frames: int
-    known: Tensor
     frame: Tensor
     vertices: Tensor
     coefficients: Tensor
@@ -134,14 +132,10 @@ class ClothContacts:
     def without_passing(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
         """Return a step (V, 3, N) from x in which no cloth passes through cloth: some vertices are slowed.
 
-        A step is first cut so short that pairs which are not known cannot meet, whatever the whole garment does.
-
         Args:
             yielding: as in `allowed`.
         """
-        longest = (step - step.mean(0)).norm(dim=1).amax(0).clamp_min(TINY)
-        step = step * (0.5 * CLOSING * self.known / longest).clamp_max(1)
-        done = torch.zeros_like(longest, dtype=torch.bool)
+        done = torch.zeros(self.frames, dtype=torch.bool, device=x.device)
         near = self._meeting(x, step, yielding)
         for _ in range(SLOWED):
             share = near.allowed(x, step, yielding)
@@ -164,18 +158,19 @@ class ClothContacts:
 
     def select(self, frames: Tensor) -> ClothContacts:
         """Return the contacts in the frames with indices (M,), in ascending order."""
+        if len(frames) == self.frames:
+            return self
         new = places_among(self.frame, frames, self.frames)
-        return replace(self._kept(new >= 0, new, len(frames)), known=self.known[frames])
+        return self._kept(new >= 0, new, len(frames))
 
     @classmethod
     def concatenated(cls, parts: Sequence[ClothContacts]) -> ClothContacts:
         """Return the contacts in the frames of several, one after the other."""
         places = consecutive([part.frames for part in parts], parts[0].frame.device)
         rows = "vertices", "coefficients", "second", "direction", "start", "area", "slack"
-        known = torch.cat([part.known for part in parts])
         frame = torch.cat([place[part.frame] for part, place in zip(parts, places)])
         own = (torch.cat([getattr(part, name) for part in parts], dim=-1) for name in rows)
-        return cls(parts[0].law, len(known), known, frame, *own)
+        return cls(parts[0].law, sum(part.frames for part in parts), frame, *own)
 
     def pressing(self, x: Tensor) -> ClothContacts:
         """Return those that have an energy."""
@@ -183,7 +178,7 @@ class ClothContacts:
 
     def _kept(self, kept: Tensor, frame: Tensor, frames: int) -> ClothContacts:
         own = self.vertices, self.coefficients, self.second, self.direction, self.start, self.area, self.slack
-        return ClothContacts(self.law, frames, self.known, *(part[..., kept] for part in (frame, *own)))
+        return ClothContacts(self.law, frames, *(part[..., kept] for part in (frame, *own)))
 
     def _relative(self, x: Tensor) -> Tensor:
         """Return the gaps as the law counts them."""

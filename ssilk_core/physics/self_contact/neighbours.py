@@ -3,13 +3,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
-from .. import loops
-
 AT_ONCE = 1 << 24  # pairs in memory before distances are compared
 MOST_CELLS = 1 << 16  # of the grid along an axis, so that cells of many frames have numbers of 64 bits
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """B points in N frames in the order of cells, and where in it those are that may be near A others.
+
+    Attributes:
+        order: frame and point as one number, frame B + point, shape (N B,).
+        first, last: the parts of this order in which those near one of the others are, shapes (N, A, 9).
+    """
+
+    order: Tensor
+    first: Tensor
+    last: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor, others: Tensor, reach: float) -> Grid:
+        """Return the grid of points (B, 3, N), for others (A, 3, N) within reach [m] of them; all must be finite."""
+        low = torch.minimum(points.amin((0, 2)), others.amin((0, 2)))
+        span = torch.maximum(points.amax((0, 2)), others.amax((0, 2))) - low
+        size = max(reach, float(span.max()) / MOST_CELLS)
+        cells = (span / size).long() + 3  # an empty layer of cells on each side
+        own, theirs = (_cells(x, low, size, cells) for x in (others, points))
+        key, order = theirs.flatten().sort(stable=True)
+        steps = torch.arange(-1, 2, device=points.device)
+        rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
+        row = (own[..., None] + rows).contiguous()
+        return cls(order, torch.searchsorted(key, row - 1), torch.searchsorted(key, row + 1, right=True))
 
 
 def near_pairs(
@@ -34,31 +62,15 @@ def near_pairs(
     Returns:
         Frame, point and other of each pair, shape (3, P).
     """
-    low = torch.minimum(points.amin((0, 2)), others.amin((0, 2)))
-    span = torch.maximum(points.amax((0, 2)), others.amax((0, 2))) - low
-    size = max(float(reach.max() + other_reach.max()), float(span.max()) / MOST_CELLS)
-    cells = (span / size).long() + 3  # an empty layer of cells on each side
-    own, theirs = (_cells(x, low, size, cells) for x in (points, others))
-    key, order = theirs.flatten().sort(stable=True)
-    other_frame, other = order // len(others), order % len(others)
-    steps = torch.arange(-1, 2, device=points.device)
-    rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
-    row = (own[..., None] + rows).contiguous()
-    starts = torch.searchsorted(key, row - 1)
-    ends = torch.searchsorted(key, row + 1, right=True)
-    if loops.available(points.device):
-        from ..loops.near_pairs import near_pairs_loop
-
-        parts = order, starts.flatten(0, 1), ends.flatten(0, 1)
-        return near_pairs_loop(points, reach, others, other_reach, *parts, groups, ascending)
-    counts = ends - starts
-    starts, counts = starts.flatten(), counts.flatten()
+    grid = Grid.of(others, points, float(reach.max() + other_reach.max()))
+    other_frame, other = grid.order // len(others), grid.order % len(others)
+    starts, counts = grid.first.flatten(), (grid.last - grid.first).flatten()
     found, first, total = [], 0, counts.cumsum(0)
     while first < len(counts):
         before = total[first - 1] if first else 0
         last = max(first + 1, int(torch.searchsorted(total, before + AT_ONCE, right=True)))
-        query = torch.repeat_interleave(torch.arange(first, last, device=key.device), counts[first:last])
-        within = torch.arange(len(query), device=key.device) - (total[query] - counts[query] - before)
+        query = torch.repeat_interleave(torch.arange(first, last, device=points.device), counts[first:last])
+        within = torch.arange(len(query), device=points.device) - (total[query] - counts[query] - before)
         at = starts[query] + within
         frame, point = query // (9 * len(points)), query // 9 % len(points)
         far = points[point, :, frame] - others[other[at], :, other_frame[at]]

@@ -10,7 +10,7 @@ points comes to a border of its face or edge.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -46,6 +46,10 @@ class Separations:
     def side(self) -> Tensor:
         """1 or -1, or 0 where the pair is seen at too flat an angle to have one, shape (P,)."""
         return torch.where(self.height.abs() > SEEN_FROM * self.distance, self.height.sign(), 0)
+
+    def kept(self, kept: Tensor | slice) -> Separations:
+        """Return the separations of the pairs that `kept` names."""
+        return Separations(*(getattr(self, each.name)[..., kept] for each in fields(self)))
 
     def gaps(self, side: Tensor) -> tuple[Tensor, Tensor]:
         """Return the distances [m], negative on the wrong side, and in which direction they grow, (P,), (3, P).

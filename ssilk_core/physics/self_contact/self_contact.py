@@ -6,6 +6,11 @@ positions it has moved to. There a pair that has no side takes the one on which 
 no more loses it. In positions that are only tried, and after the body has moved, cloth may have passed through: the
 pair then still belongs to its side, and is pushed back, in later steps too.
 
+Many pairs lie near each other, and few touch. All near pairs are found around positions, with their distances there.
+At other positions a pair is nearer by at most what its vertices have moved since, so that most need no other look
+(`PairKind.close`). Near pairs are looked for anew where the garment has left, and where a step would be cut short by
+what is not known. A side is kept only for pairs on the wrong one: all others are on theirs at the last positions.
+
 Pinned and tight cloth does not touch itself: it follows skin, which leaves no room between it where it folds. Tight
 cloth of two garments touches where one lies on the other in the bind pose.
 
@@ -24,15 +29,17 @@ from torch import Tensor
 
 from ...errors import fail
 from ...scene.mesh import topology
+from .. import loops
 from ..energy.collision import ContactLaw
 from ..framed import consecutive
 from .cloth import TouchingCloth
-from .contacts import SLACK, ClothContacts
-from .neighbours import near_pairs, places_among
+from .contacts import CLOSING, SLACK, TINY, ClothContacts
+from .neighbours import Grid, near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
 
 REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
-TRIED, MOVED = 0.5, 0.1  # of that, by which vertices may be elsewhere where positions are tried, and moved to
+LEFT, MOVED = 0.5, 0.2  # of that, by which vertices may be elsewhere, and where they are when a step is cut short
+DEEPER = 2e-3  # [m] by which cloth may have passed further through cloth than contact reaches, where it is only tried
 STRETCH = 1.3  # by which faces and edges may be longer than at rest
 CLOSER = 0.7  # of the distance at rest: pairs that are nearer there touch at this, as along seams and slits
 VERTEX_SHARE = 0.5  # of a vertex's area: both of two layers count
@@ -41,25 +48,25 @@ EDGE_SHARE = 0.25  # of an edge's area: it makes the smaller part of the pressur
 
 @dataclass(frozen=True, eq=False)
 class KnownPairs:
-    """Pairs of one kind in N frames, by ascending frame, first and second.
+    """Pairs of one kind in N frames, by ascending frame.
 
     Attributes:
         frame: shape (P,).
         first, second: vertex and face, or two edges, shape (P,).
-        side: 1 or -1, or 0 where a pair has none, shape (P,).
-        start: gap at which contact begins [m], shape (P,).
+        distance: at the positions around which pairs are known [m], shape (P,).
+        side: 1 or -1, where a pair belongs that was on the other side at the last positions, else 0, shape (P,).
     """
 
     frame: Tensor
     first: Tensor
     second: Tensor
+    distance: Tensor
     side: Tensor
-    start: Tensor
 
     def kept(self, kept: Tensor, frame: Tensor | None = None) -> KnownPairs:
         """Return the pairs that `kept` (P,) names, with other frames (P,) where they are given."""
         own = self.frame if frame is None else frame
-        return KnownPairs(own[kept], self.first[kept], self.second[kept], self.side[kept], self.start[kept])
+        return KnownPairs(own[kept], self.first[kept], self.second[kept], self.distance[kept], self.side[kept])
 
     def select(self, frames: Tensor, count: int) -> KnownPairs:
         """Return those in the frames with indices (M,), in ascending order, of a number of frames."""
@@ -67,13 +74,15 @@ class KnownPairs:
         return self.kept(new >= 0, new)
 
     def sides_of(self, other: KnownPairs) -> Tensor:
-        """Return the sides of other pairs as far as they are known here, 0 elsewhere."""
-        if not len(self.frame) or not len(other.frame):
+        """Return the sides of other pairs as far as they are kept here, 0 elsewhere."""
+        own = self.kept(self.side != 0)
+        if not len(own.frame) or not len(other.frame):
             return torch.zeros_like(other.side)
-        size = 1 + int(max(pairs.max() for pairs in (self.first, self.second, other.first, other.second)))
-        own, asked = ((pairs.frame * size + pairs.first) * size + pairs.second for pairs in (self, other))
-        at = torch.searchsorted(own, asked).clamp_max(len(own) - 1)
-        return torch.where(own[at] == asked, self.side[at], 0)
+        size = 1 + int(max(pairs.max() for pairs in (own.first, own.second, other.first, other.second)))
+        keys, asked = ((pairs.frame * size + pairs.first) * size + pairs.second for pairs in (own, other))
+        keys, order = keys.sort()
+        at = torch.searchsorted(keys, asked).clamp_max(len(keys) - 1)
+        return torch.where(keys[at] == asked, own.side[order[at]], 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +103,8 @@ class ClothNeighbours:
     def select(self, frames: Tensor) -> ClothNeighbours:
         """Return those in the frames with indices (M,), in ascending order."""
         count = self.at.shape[-1]
+        if len(frames) == count:
+            return self
         faces, edges = self.faces.select(frames, count), self.edges.select(frames, count)
         return ClothNeighbours(self.last[..., frames], self.at[..., frames], faces, edges)
 
@@ -108,7 +119,7 @@ class ClothNeighbours:
                 torch.cat([frames[part.frame] for frames, part in own]),
                 *(
                     torch.cat([getattr(part, item) for _, part in own])
-                    for item in ("first", "second", "side", "start")
+                    for item in ("first", "second", "distance", "side")
                 ),
             )
             rows = found.frame.argsort(stable=True)
@@ -159,44 +170,80 @@ class PairKind:
     second_stiffness: Tensor | None
 
     def near(self, at: Tensor, reach: float, garment: Tensor | None = None) -> KnownPairs:
-        """Return pairs without a common vertex that may lie within reach of each other; sides and starts are 0.
+        """Return pairs without a common vertex that lie within reach of each other; sides are 0.
 
         Args:
             garment: of each vertex, where only those of two garments are pairs, shape (V,).
         """
-        middles = at[self.first].mean(1), at[self.second].mean(1)
+        middles, ascending = (at[self.first].mean(1), at[self.second].mean(1)), self.first is self.second
+        groups = None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]])
+        reaches = self.first_reach + reach, self.second_reach
+        if loops.available(at.device):
+            from ..loops.separations import near_loop
+
+            grid = Grid.of(middles[1], middles[0], float(reaches[0].max() + reaches[1].max()))
+            found = near_loop(at, self.first, self.second, middles, reaches, grid, groups, ascending, reach)
+            frame, first, second, distance = found
+            return KnownPairs(frame, first, second, distance, torch.zeros_like(distance))
         frame, first, second = near_pairs(
-            middles[0],
-            self.first_reach + reach,
-            middles[1],
-            self.second_reach,
-            groups=None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]]),
-            ascending=self.first is self.second,
+            middles[0], reaches[0], middles[1], reaches[1], groups=groups, ascending=ascending
         )
-        apart = (self.first[first][:, :, None] != self.second[second][:, None]).flatten(1).all(1)
-        none = at.new_zeros(len(frame))
-        return KnownPairs(frame, first, second, none, none).kept(apart)
+        one, other = self.first[first].T, self.second[second].T
+        distance = self.measure(at[torch.cat([one, other]), :, frame].movedim(-1, 1)).distance
+        kept = (distance < reach) & (one[:, None] != other).flatten(0, 1).all(0)
+        return KnownPairs(frame, first, second, distance, torch.zeros_like(distance)).kept(kept)
+
+    def close(self, x: Tensor, pairs: KnownPairs, moved: Tensor, near: float, step: Tensor | None = None) -> Tensor:
+        """Return the rows of pairs that are close at positions x (V, 3, N).
+
+        Close are those nearer than `near` [m], and those which come nearer in a step (V, 3, N), or in one in which
+        some vertices are slower, by more than `CLOSING` of their distance.
+
+        Args:
+            moved: how far each vertex has moved since pairs were found, shape (V, N).
+        """
+        if step is not None:
+            moved = moved + step.norm(dim=1) / CLOSING
+        moves = moved[self.first].amax(1), moved[self.second].amax(1)
+        if loops.available(x.device):
+            from ..loops.separations import close_loop
+
+            given = pairs.frame, pairs.first, pairs.second, pairs.distance, moves, near, step, CLOSING
+            return close_loop(x, self.first, self.second, *given).nonzero()[:, 0]
+        bound = pairs.distance - moves[0][pairs.first, pairs.frame] - moves[1][pairs.second, pairs.frame]
+        rows = (bound < near).nonzero()[:, 0]
+        found = pairs.kept(rows)
+        (now,) = self.at([x], found)
+        kept = now.distance < near
+        if step is not None:
+            along = (now.direction * step[self.vertices(found), :, found.frame].movedim(-1, 1)).sum(1)
+            count = self.first.shape[1]
+            closing = along[count:].clamp_min(0).amax(0) - along[:count].clamp_max(0).amin(0)
+            kept |= closing > CLOSING * now.distance
+        return rows[kept]
 
     def vertices(self, pairs: KnownPairs) -> Tensor:
         """Return the vertices of each pair, shape (4, P)."""
         return torch.cat([self.first[pairs.first].T, self.second[pairs.second].T])
 
-    def at(self, x: Tensor, pairs: KnownPairs) -> Separations:
-        """Return how pairs are separated at positions (V, 3, N), or at (V, 3, 1) for all frames."""
-        frame = pairs.frame if x.shape[-1] > 1 else torch.zeros_like(pairs.frame)
-        return self.measure(x[self.vertices(pairs), :, frame].movedim(-1, 1))
+    def at(self, places: Sequence[Tensor], pairs: KnownPairs) -> list[Separations]:
+        """Return how pairs are separated at several positions (V, 3, N), or at (V, 3, 1) for all frames."""
+        vertices, none = self.vertices(pairs), torch.zeros_like(pairs.frame)
+        corners = [x[vertices, :, pairs.frame if x.shape[-1] > 1 else none] for x in places]
+        found, count = self.measure(torch.cat(corners, dim=1).movedim(-1, 1)), len(none)
+        return [found.kept(slice(number * count, (number + 1) * count)) for number in range(len(places))]
 
-    def contacts(self, now: Separations, pairs: KnownPairs) -> tuple[Tensor, ...]:
-        """Return the frames, and what `ClothContacts` holds, of pairs that touch or nearly do as they lie `now`."""
-        gap, direction = now.gaps(pairs.side)
-        kept = gap < pairs.start + REACH
-        pairs = pairs.kept(kept)
+    def contacts(self, now: Separations, pairs: KnownPairs, side: Tensor, rest: Separations) -> tuple[Tensor, ...]:
+        """Return what `ClothContacts` holds of pairs on sides (P,) as they lie `now`, and in the bind pose."""
+        gap, direction = now.gaps(side)
         vertices = self.vertices(pairs)
         second = (torch.arange(4, device=gap.device) >= self.first.shape[1])[:, None].expand_as(vertices)
+        most = _mean(self.first_start, self.second_start, pairs)
+        start = torch.minimum(CLOSER * rest.distance, most)
         area = torch.minimum(self.first_area[pairs.first], self.second_area[pairs.second])
         if self.first_stiffness is not None and self.second_stiffness is not None:
             area = area * _mean(self.first_stiffness, self.second_stiffness, pairs)
-        return pairs.frame, vertices, now.coefficients[:, kept], second, direction[:, kept], pairs.start, area
+        return pairs.frame, vertices, now.coefficients, second, direction, start, area
 
 
 class SelfContact:
@@ -254,12 +301,15 @@ class SelfContact:
         """Return what may touch around positions `at`, on the sides of the positions `last`, or older ones."""
         if not bool(at.isfinite().all()):
             fail("simulation", "positions that are not finite", "cloth cannot be kept apart from cloth there")
-        faces = self._sided(self._faces, last, at, before.faces if before else None)
-        return ClothNeighbours(last, at, faces, self._sided(self._edges, last, at, before.edges if before else None))
+        faces = self._near(self._faces, last, at, before.faces if before else None)
+        return ClothNeighbours(last, at, faces, self._near(self._edges, last, at, before.edges if before else None))
 
-    def around(self, x: Tensor, known: ClothNeighbours, allowance: float = TRIED) -> ClothNeighbours:
+    def around(self, x: Tensor, known: ClothNeighbours) -> ClothNeighbours:
         """Return what may touch around positions x: what is known, in frames where vertices are near enough."""
-        stale = ~(_drift(x, known) <= allowance * REACH)
+        return self._anew(x, known, ~(_drift(x, known).amax(0) <= LEFT * REACH))
+
+    def _anew(self, x: Tensor, known: ClothNeighbours, stale: Tensor) -> ClothNeighbours:
+        """Return what may touch, in stale frames (N,) around positions x."""
         if not bool(stale.any()):
             return known
         new = stale.nonzero()[:, 0]
@@ -270,28 +320,56 @@ class SelfContact:
 
         What lies further on the wrong side than contact begins belongs there from now on.
         """
-        known = self.around(x, known, MOVED)
-
-        def there(pairs: KnownPairs, now: Separations) -> KnownPairs:
-            away = pairs.side * now.height < -self.law.start
-            side = torch.where((pairs.side == 0) | away, now.height.sign(), pairs.side)
-            return replace(pairs, side=torch.where(now.facing, side, 0))
-
-        now = self._faces.at(x, known.faces), self._edges.at(x, known.edges)
-        known = ClothNeighbours(x, known.at, there(known.faces, now[0]), there(known.edges, now[1]))
-        return known, self._contacts(x, known, *now)
+        known = self.around(x, known)
+        drift, parts, pairs = _drift(x, known), [], []
+        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
+            rows = kind.close(x, own, drift, self.law.start)
+            close = own.kept(rows)
+            now, last, rest = kind.at((x, known.last, self.rest), close)
+            side = _sides(close, last)
+            wrong = now.facing & (side * now.height < 0) & (side * now.height >= -self.law.start)
+            side = torch.where(wrong, side, 0)
+            pairs.append(replace(own, side=torch.zeros_like(own.side).index_copy_(0, rows, side)))
+            parts.append(kind.contacts(now, close, side, rest))
+        return ClothNeighbours(x, known.at, *pairs), self._joined(x, parts).pressing(x)
 
     def contacts(self, x: Tensor, known: ClothNeighbours) -> ClothContacts:
         """Return the contacts at positions x, among pairs that are known around them."""
-        return self._contacts(x, known, self._faces.at(x, known.faces), self._edges.at(x, known.edges))
+        drift, parts = _drift(x, known), []
+        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
+            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER))
+            now, last, rest = kind.at((x, known.last, self.rest), close)
+            parts.append(kind.contacts(now, close, _sides(close, last), rest))
+        return self._joined(x, parts).pressing(x)
 
-    def _contacts(self, x: Tensor, known: ClothNeighbours, faces: Separations, edges: Separations) -> ClothContacts:
-        parts = self._faces.contacts(faces, known.faces), self._edges.contacts(edges, known.edges)
+    def ahead(self, step: Tensor, known: ClothNeighbours) -> tuple[ClothNeighbours, Tensor, ClothContacts]:
+        """Return what may touch ahead of a step (V, 3, N) from the last positions, which share of it each vertex may
+        move so that no pairs meet that are not known (V, N), and which contacts may slow the step further."""
+        x, longest = known.last, (step - step.mean(0)).norm(dim=1).amax(0)
+        drift = _drift(x, known).amax(0)
+        cut = longest > self._unknown(drift)
+        known = self._anew(x, known, cut & (drift > MOVED * REACH))
+        drift = _drift(x, known)
+        most = self._unknown(drift.amax(0))
+        share = torch.where(longest > most, (most / step.norm(dim=1).clamp_min(TINY)).clamp_max(1), 1.0)
+        step, parts = share[:, None] * step, []
+        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
+            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER, step))
+            now, rest = kind.at((x, self.rest), close)
+            parts.append(kind.contacts(now, close, close.side, rest))
+        return known, share, self._joined(x, parts)
+
+    def _unknown(self, drift: Tensor) -> Tensor:
+        """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, nor so
+        far that pairs must be looked for where a step is only tried."""
+        return torch.minimum(0.5 * CLOSING * (self.reach - 2 * drift), LEFT * REACH - drift)
+
+    def _joined(self, x: Tensor, parts: Sequence[tuple[Tensor, ...]]) -> ClothContacts:
+        """Return contacts of both kinds, by ascending frame."""
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
         order = joined[0].argsort(stable=True)
         slack = self._slack(joined[1], joined[5])
-        unknown = self.reach - 2 * _drift(x, known)
-        return ClothContacts(self.law, x.shape[-1], unknown, *(part[..., order] for part in [*joined, slack]))
+        return ClothContacts(self.law, x.shape[-1], *(part[..., order] for part in [*joined, slack]))
 
     def _slack(self, vertices: Tensor, start: Tensor) -> Tensor:
         """Return by which pairs that begin to touch later may come nearer, however near they are [m], shape (P,).
@@ -303,28 +381,22 @@ class SelfContact:
             return slack
         return slack.masked_fill(self._garment[vertices[0]] != self._garment[vertices[-1]], 0.0)
 
-    def _sided(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
+    def _near(self, kind: PairKind, last: Tensor, at: Tensor, before: KnownPairs | None) -> KnownPairs:
         """Return the pairs of a kind that `neighbours` tells of."""
         pairs = kind.near(at, self.reach, None if self._own else self._garment)
         pairs = pairs.kept(self._can_touch(kind, pairs))
-        pairs = pairs.kept(kind.at(at, pairs).distance < self.reach)
-        most = _mean(kind.first_start, kind.second_start, pairs)
-        start = torch.minimum(CLOSER * kind.at(self.rest, pairs).distance, most)
-        then = kind.at(last, pairs)
-        side = torch.where(then.facing, then.height.sign(), 0)
-        older = torch.zeros_like(side) if before is None else before.sides_of(pairs)
-        return replace(pairs, start=start, side=torch.where(older == 0, side, older))
+        return pairs if before is None else replace(pairs, side=before.sides_of(pairs))
 
     def _can_touch(self, kind: PairKind, pairs: KnownPairs) -> Tensor:
         """Tell which pairs of a kind may touch at all, bool (P,)."""
-        vertices = kind.vertices(pairs)
-        loose = self._loose[vertices].any(0)
+        loose = self._loose[kind.first].any(1)[pairs.first] | self._loose[kind.second].any(1)[pairs.second]
         if self._garment is None:
             return loose
+        vertices = kind.vertices(pairs)
         other = self._garment[vertices[0]] != self._garment[vertices[-1]]
         beside = other & ~loose & ~self._pinned[vertices].all(0)
         rows = beside.nonzero()[:, 0]
-        beside[rows] = kind.at(self.rest, pairs.kept(rows)).distance < self.reach
+        beside[rows] = kind.at([self.rest], pairs.kept(rows))[0].distance < self.reach
         return loose | beside  # of one garment alone, none is known where it may not touch itself
 
 
@@ -333,13 +405,18 @@ def _mean(first: Tensor, second: Tensor, pairs: KnownPairs) -> Tensor:
     return 0.5 * (first[pairs.first] + second[pairs.second])
 
 
+def _sides(pairs: KnownPairs, last: Separations) -> Tensor:
+    """Return the sides of pairs that lay as they did `last`, 0 where they have none, shape (P,)."""
+    return torch.where(pairs.side == 0, torch.where(last.facing, last.height.sign(), 0), pairs.side)
+
+
 def _drift(x: Tensor, known: ClothNeighbours) -> Tensor:
-    """Return how far from where pairs are known a vertex of each frame is at most [m], shape (N,).
+    """Return how far each vertex is from where pairs are known [m], shape (V, N).
 
     What all move alike counts for nothing: it brings none together.
     """
     away = x - known.at
-    return (away - away.mean(0)).norm(dim=1).amax(0)
+    return (away - away.mean(0)).norm(dim=1)
 
 
 def _radii(corners: np.ndarray) -> np.ndarray:

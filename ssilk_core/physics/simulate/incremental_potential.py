@@ -86,10 +86,19 @@ class StepInputs(Framed):
     beneath: PosedBeneath | None = None
 
     @property
+    def touching(self) -> list[ClothContacts | Friction]:
+        """What is among a number of places that changes from step to step: cloth on cloth, and what rubs."""
+        return [part for part in (self.contacts, self.friction) if part is not None]
+
+    @property
+    def alone(self) -> StepInputs:
+        """What is left without these."""
+        return replace(self, neighbours=None, contacts=None, friction=None)
+
+    @property
     def is_plain(self) -> bool:
-        """Whether all of it is tensors of fixed sizes: one garment meets its body alone, and nothing rubs."""
-        changing = self.neighbours, self.contacts, self.friction, self.world, self.beneath
-        return all(each is None for each in changing) and not isinstance(self.pierced, PiercedOutfit)
+        """Whether the rest is tensors of fixed sizes: one garment meets its body alone."""
+        return self.world is None and self.beneath is None and not isinstance(self.pierced, PiercedOutfit)
 
 
 class IncrementalPotential:
@@ -149,12 +158,12 @@ class IncrementalPotential:
         return self._self_contact()
 
     def replays(self, x: Tensor, inputs: StepInputs) -> bool:
-        """Return whether `captured` serves positions x (V, 3, N)."""
+        """Return whether `captured` serves positions x (V, 3, N), for all of the inputs but those that touch."""
         return self.in_graphs and inputs.is_plain and replays(x)
 
     @cached_property
     def captured(self) -> CapturedPotential:
-        """What a GPU computes of it at once."""
+        """What a GPU computes of it at once, for inputs alone (`StepInputs.alone`)."""
 
         def state(x: Tensor, inputs: StepInputs) -> list[Tensor]:
             distance = self.body_distance(x, inputs)
@@ -233,8 +242,10 @@ class IncrementalPotential:
         inputs = self.with_contacts(x, inputs, moved=True)
         arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
         for _ in range(ROUNDS):
-            assert inputs.contacts is not None
-            step = inputs.contacts.without_passing(x, target - x)
+            assert inputs.neighbours is not None
+            step = target - x
+            neighbours, share, met = self.self_contact.ahead(step, inputs.neighbours)
+            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, share.amin(0) * step)
             arrived = arrived | (step.norm(dim=1).amax(0) < ARRIVED)
             if bool(arrived.all()):
                 break
@@ -302,9 +313,8 @@ class IncrementalPotential:
         total = self._elastic_energy(x)
         if self.stitching:
             total = total + self.stitching.energy(x)
-        for part in (inputs.contacts, inputs.friction):
-            if part is not None:
-                total = total + part.energy(x)
+        for part in inputs.touching:
+            total = total + part.energy(x)
         if inputs.world is not None:
             total = total + self._world_energy(x, inputs.world)
         if self._by_loop(x, inputs) and not x.requires_grad:
@@ -344,9 +354,8 @@ class IncrementalPotential:
         total = self._elastic_gradient(x)
         if self.stitching:
             total += stitch_gradient(self.stitching, x)
-        for part in (inputs.contacts, inputs.friction):
-            if part is not None:
-                total += part.gradient(x)
+        for part in inputs.touching:
+            total += part.gradient(x)
         if inputs.world is not None:
             total += self._world_gradient(x, inputs.world)
         if self._by_loop(x, inputs):
@@ -388,8 +397,7 @@ class IncrementalPotential:
             contact = self._with_world(contact, x, inputs.world)
         fixed = None if fixed is None else fixed[self.free]
         found = self._hessian(x, weight[self.free].float(), contact, fixed, exact_hessian)
-        parts = [part.slopes(x) for part in (inputs.contacts, inputs.friction) if part is not None]
-        return replace(found, contacts=self._stiffness(x, Slopes.joined(*parts))) if parts else found
+        return replace(found, contacts=self.touching_stiffness(x, inputs))
 
     def _world_energy(self, x: Tensor, world: PosedWorld) -> Tensor:
         """Return the energy of contact with what surrounds the character [J], shape (N,)."""
@@ -423,10 +431,13 @@ class IncrementalPotential:
         """Return the samples that meet body and world, at positions (V, 3, N), shape (S, 3, N)."""
         return self.cloth.positions(x)[: self.sample_count]
 
-    def _stiffness(self, x: Tensor, slopes: Slopes) -> ContactStiffness:
-        """Return the Hessian that slopes add up to."""
+    def touching_stiffness(self, x: Tensor, inputs: StepInputs) -> ContactStiffness | None:
+        """Return the Hessian of what touches, or None where nothing could."""
+        if not inputs.touching:
+            return None
         place = torch.full((len(x),), -1, device=x.device)
         place[self.free] = torch.arange(len(self.free), device=x.device)
+        slopes = Slopes.joined(*(part.slopes(x) for part in inputs.touching))
         return ContactStiffness.of(slopes, x.shape[-1], place, len(self.free))
 
     def residual(self, gradient: Tensor) -> Tensor:

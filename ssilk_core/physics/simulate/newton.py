@@ -29,7 +29,7 @@ from ...errors import fail
 from .. import kernels
 from ..collision import SmoothedDistance
 from ..framed import Framed
-from ..self_contact import ClothContacts, ClothNeighbours
+from ..self_contact import ClothNeighbours
 from .blocks import BlockMatrix
 from .incremental_potential import IncrementalPotential, StepInputs
 
@@ -115,8 +115,9 @@ class State(Framed):
     def at(cls, potential: IncrementalPotential, x: Tensor, inputs: StepInputs) -> State:
         """Return the state of positions (V, 3, N)."""
         if potential.replays(x, inputs):
-            energy, *planes = potential.captured.state(x, inputs)
-            return cls(x, SmoothedDistance(*planes) if planes else None, energy)
+            energy, *planes = potential.captured.state(x, inputs.alone)
+            energy = sum((part.energy(x) for part in inputs.touching), energy)
+            return cls(x, SmoothedDistance(*planes) if planes else None, energy, inputs.neighbours)
         body_distance = potential.body_distance(x, inputs)
         return cls(x, body_distance, potential.energy(x, inputs, body_distance), inputs.neighbours)
 
@@ -280,8 +281,9 @@ class Search:
         step, count = newton_step(
             potential, self.state, inputs, gradient, self.options.cg_iterations, course.fixed, exact_hessian
         )
-        if inputs.contacts is not None:
-            step = self._without_passing(inputs.contacts, step)
+        if inputs.neighbours is not None:
+            step = self._without_passing(inputs.neighbours, step)
+            inputs = self.inputs
         self.state, length, obstructing = line_search(potential, self.state, inputs, gradient, step)
         misled = exact_hessian & (length < MISLED_BELOW)
         new = obstructing & ~course.fixed & ~misled
@@ -295,11 +297,14 @@ class Search:
         )
         self._evaluate()
 
-    def _without_passing(self, contacts: ClothContacts, step: Tensor) -> Tensor:
+    def _without_passing(self, known: ClothNeighbours, step: Tensor) -> Tensor:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
-        slowed = contacts.without_passing(self.state.x, step, YIELDING)
-        steep = (self.gradient * slowed).sum((0, 1)) < DOWNHILL * (self.gradient * step).sum((0, 1))
-        return torch.where(steep, slowed, contacts.allowed(self.state.x, step, YIELDING).amin(0) * step)
+        x, gradient = self.state.x, self.gradient
+        known, share, contacts = self.potential.self_contact.ahead(step, known)
+        self.inputs, self.state = replace(self.inputs, neighbours=known), replace(self.state, neighbours=known)
+        slowed, whole = contacts.without_passing(x, share[:, None] * step, YIELDING), share.amin(0) * step
+        steep = (gradient * slowed).sum((0, 1)) < DOWNHILL * (gradient * whole).sum((0, 1))
+        return torch.where(steep, slowed, contacts.allowed(x, whole, YIELDING).amin(0) * whole)
 
     def _release_fixed(self, may: Tensor) -> None:
         """Release the fixed vertices of frames (N,) that may, and whose other vertices have converged, once."""
@@ -314,11 +319,12 @@ class Search:
         if self.inputs.neighbours is not None:
             around = replace(self.inputs, neighbours=self.state.neighbours)
             self.inputs = self.potential.with_contacts(self.state.x, around, moved=True)
-        given = self.state.x, self.inputs, self.state.body_distance
-        if self.potential.replays(self.state.x, self.inputs):
-            (gradient,) = self.potential.captured.gradient(*given)
+        x, inputs, distance = self.state.x, self.inputs, self.state.body_distance
+        if self.potential.replays(x, inputs):
+            (gradient,) = self.potential.captured.gradient(x, inputs.alone, distance)
+            gradient = sum((part.gradient(x) for part in inputs.touching), gradient)
         else:
-            gradient = self.potential.gradient(*given)
+            gradient = self.potential.gradient(x, inputs, distance)
         self.gradient = gradient.masked_fill(self.course.fixed[:, None], 0)
         self.residual = self.potential.residual(self.gradient)
 
@@ -339,12 +345,13 @@ def newton_step(
     solved until its residual has fallen to `reduction`.
     """
     right = -gradient[potential.free].float()
-    given = state.x, inputs, state.body_distance, fixed, exact_hessian
-    if potential.replays(state.x, inputs):
-        blocks, inverse = potential.captured.hessian(*given)
-        matrix = BlockMatrix(potential.block_pattern, blocks, inverse=inverse)
+    x, others = state.x, (state.body_distance, fixed, exact_hessian)
+    if potential.replays(x, inputs):
+        blocks, inverse = potential.captured.hessian(x, inputs.alone, *others)
+        touching = potential.touching_stiffness(x, inputs)
+        matrix = BlockMatrix(potential.block_pattern, blocks, touching, None if touching else inverse)
     else:
-        matrix = potential.hessian(*given)
+        matrix = potential.hessian(x, inputs, *others)
     z, count = matrix.solve(right, reduction, cg_iterations)
     step = torch.zeros_like(state.x)
     step[potential.free] = z.to(step.dtype)

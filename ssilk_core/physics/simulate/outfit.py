@@ -26,7 +26,6 @@ from ..collision.limb_axes import outfit_axes
 from ..collision.pierced import PiercedOutfit
 from ..collision.samples import ContactSamples, SampledCloth
 from ..self_contact import ClothNeighbours, SelfContact, TouchingCloth
-from ..self_contact.contacts import Slopes
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern
 from .friction import Friction
@@ -76,6 +75,8 @@ class OutfitPotential(IncrementalPotential):
     Args:
         own: whether each garment also touches itself.
     """
+
+    in_graphs = False  # its garments are evaluated one after the other
 
     def __init__(
         self, garments: Sequence[WornGarment], *, own: bool, device: torch.device, dtype: torch.dtype
@@ -214,9 +215,8 @@ class OutfitPotential(IncrementalPotential):
         """Return the energy [J] of each frame, shape (N,), at the distances `body_distance` of x."""
         every = self._split(inputs, body_distance)
         total = torch.stack([part.energy(x[rows], own, distance) for part, rows, own, distance in every]).sum(0)
-        for met in (inputs.contacts, inputs.friction):
-            if met is not None:
-                total = total + met.energy(x)
+        for met in inputs.touching:
+            total = total + met.energy(x)
         return total
 
     def collision(self, x: Tensor, body_distance: SmoothedDistance | None) -> Tensor:
@@ -233,9 +233,8 @@ class OutfitPotential(IncrementalPotential):
         """Return the gradient [N] at all vertices, shape (V, 3, N)."""
         every = self._split(inputs, body_distance)
         total = torch.cat([part.gradient(x[rows], own, distance) for part, rows, own, distance in every])
-        for met in (inputs.contacts, inputs.friction):
-            if met is not None:
-                total += met.gradient(x)
+        for met in inputs.touching:
+            total += met.gradient(x)
         return total
 
     def hessian(
@@ -253,9 +252,7 @@ class OutfitPotential(IncrementalPotential):
         ]
         diagonal = [each.blocks[: each.pattern.count] for each in found]
         above = [each.blocks[each.pattern.count :] for each in found]
-        parts = [met.slopes(x) for met in (inputs.contacts, inputs.friction) if met is not None]
-        contacts = self._stiffness(x, Slopes.joined(*parts)) if parts else None
-        return BlockMatrix(self._pattern, torch.cat([*diagonal, *above]), contacts)
+        return BlockMatrix(self._pattern, torch.cat([*diagonal, *above]), self.touching_stiffness(x, inputs))
 
     def residual(self, gradient: Tensor) -> Tensor:
         """Return the largest RMS acceleration of a garment that a gradient (V, 3, N) leaves, in units of g: (N,)."""

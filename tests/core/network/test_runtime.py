@@ -339,7 +339,7 @@ def test_schemes_without_loops_play_long_motions_with_numpy(scene, toy_model, to
     model = toy_model(scene, scale=0.1, scheme="verlet").eval()
     motion, player = toy_motion(scene, 20), player_of(model)
     assert player.stepper._compiled() is None
-    exact = expected_vertices(model.double(), motion)  # nothing draws rounding back here: PyTorch's grows to 1e-5, too
+    exact = expected_vertices(model.double(), motion)  # nothing draws rounding back: PyTorch's grows to 1e-5
     np.testing.assert_allclose(all_vertices(player.play(motion)), exact, rtol=0, atol=1e-5)
 
 

@@ -9,18 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
-from ssilk_core.physics.self_contact import ClothContacts, SelfContact, TouchingCloth
+from ssilk_core.physics.self_contact import ClothContacts, ClothNeighbours, SelfContact, TouchingCloth
 from ssilk_core.physics.self_contact.neighbours import near_pairs
 from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.blocks import BlockMatrix, BlockPattern
 from ssilk_core.physics.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
 from ssilk_core.physics.simulate.contact_stiffness import ContactStiffness
+from ssilk_core.physics.simulate.friction import Friction
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
-from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
+from ssilk_core.physics.simulate.newton import Search, SolverOptions, minimise_from, newton_step
 from ssilk_core.scene.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, SkinWeights
 from ssilk_core.scene.fabrics import Fabric
 
@@ -61,10 +63,7 @@ def stacked(height: float) -> torch.Tensor:
     return frames(np.concatenate([first, second]))
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
-    if not compiled:
-        monkeypatch.setattr("ssilk_core.physics.loops.available", lambda device: False)
+def test_near_pairs_are_those_of_all_distances():
     points, others = random(40, 3, 3), random(60, 3, 3, seed=1)
     reach, other_reach = 0.2 * random(40, seed=2), 0.2 * random(60, seed=3)
     far = (points[:, None] - others[None]).square().sum(2).sqrt()
@@ -75,6 +74,50 @@ def test_near_pairs_are_those_of_all_distances(compiled, monkeypatch):
     kept = expected[:, (groups[0][expected[1]] != groups[1][expected[2]]) & (expected[1] < expected[2])]
     found = near_pairs(points, reach, others, other_reach, groups=groups, ascending=True)
     assert 10 < len(kept[0]) < len(expected[0]) and torch.equal(found, kept)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_compiled_loops_find_the_pairs_that_the_reference_finds(scene, toy_grid, monkeypatch, name):
+    contact, x, _ = crumpled(toy_grid, scene, 3)
+    kind, x = getattr(contact, name), 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    step, moved = 0.02 * (random(*x.shape, seed=3) - 0.5), torch.full_like(x[:, 0], 0.004)
+    half = (torch.arange(len(x)) < len(x) // 2).long()
+
+    def found() -> list[torch.Tensor]:
+        pairs = kind.near(x, contact.reach)
+        others = kind.near(x, contact.reach, half)
+        nearer = x + 0.004 * torch.nn.functional.normalize(random(*x.shape, seed=4) - 0.5, dim=1)
+        rows = [kind.close(nearer, pairs, moved, START, ahead) for ahead in (None, step)]
+        return [pairs.frame, pairs.first, pairs.second, pairs.distance, others.first, others.second, *rows]
+
+    compiled = found()
+    monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
+    expected = found()
+    lengths = [len(each) for each in expected]
+    assert lengths[0] > lengths[4] > 10 and lengths[0] > lengths[7] > lengths[6] > 10
+    order = (compiled[0] * 10**4 + compiled[1]) * 10**4 + compiled[2]
+    by_key = order.argsort()
+    compiled[:4] = [each[by_key] for each in compiled[:4]]
+    places = by_key.argsort()
+    compiled[6:] = [places[rows].sort()[0] for rows in compiled[6:]]
+    assert {*zip(*(each.tolist() for each in compiled[4:6]))} == {*zip(*(each.tolist() for each in expected[4:6]))}
+    for own, other in zip([*compiled[:4], *compiled[6:]], [*expected[:4], *expected[6:]]):
+        torch.testing.assert_close(own, other, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_close_pairs_are_all_that_are_close_or_meet(scene, toy_grid, name):
+    contact, x, _ = crumpled(toy_grid, scene, 2)
+    kind, x, step = getattr(contact, name), 0.4 * x, 0.01 * (random(*x.shape, seed=3) - 0.5)
+    pairs, moved = kind.near(x, contact.reach), 0.002 * random(*x.shape, seed=4)
+    (now,) = kind.at([x + moved], pairs)
+    close = torch.zeros(len(now.distance), dtype=torch.bool)
+    close[kind.close(x + moved, pairs, moved.norm(dim=1), START, step)] = True
+    along = (now.direction * step[kind.vertices(pairs), :, pairs.frame].movedim(-1, 1)).sum(1)
+    count = kind.first.shape[1]
+    meets = along[count:].amax(0) - along[:count].amin(0) > 0.8 * now.distance
+    assert meets.any() and not close.all()
+    assert close[meets | (now.distance < START)].all()
 
 
 @pytest.mark.parametrize("shape", [over_faces, between_edges])
@@ -150,8 +193,19 @@ def test_a_side_is_kept_for_later_steps_but_not_far_inside(layers):
     known = contact.neighbours(stacked(0.004), stacked(-0.002))
     x = stacked(-0.003)
     assert contact.moved(x, known)[1].gap(x).min().item() == pytest.approx(-0.003)
-    deep = stacked(-START - 0.002)
-    assert contact.moved(deep, known)[1].gap(deep).min() > 0
+    deep, nearer = stacked(-START - 0.002), stacked(-START + 0.001)
+    there, touching = contact.moved(deep, known)
+    assert not len(touching.frame)
+    assert contact.contacts(nearer, there).gap(nearer).min().item() == pytest.approx(START - 0.001)
+
+
+def test_sides_are_found_again_whatever_the_order_of_pairs(scene, toy_grid):
+    contact, x, _ = crumpled(toy_grid, scene, 2)
+    pairs = contact.neighbours(x, x).edges
+    side = random(len(pairs.frame), seed=3).mul(8).floor().sub(1).clamp_max(1) * (random(len(pairs.frame)) < 0.1)
+    order, other = random(len(side), seed=4).argsort(), random(len(side), seed=5).argsort()[: len(side) // 2]
+    assert {*side.tolist()} == {-1, 0, 1}
+    assert torch.equal(replace(pairs, side=side).kept(order).sides_of(pairs.kept(other)), side[other])
 
 
 def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
@@ -181,29 +235,34 @@ def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np
 
 def test_no_step_passes_through_folds(scene, toy_grid):
     contact, x, faces = crumpled(toy_grid, scene, 3)
-    touching = contact.contacts(x, contact.neighbours(x, x))
-    crossed = 0
+    known, crossed = contact.neighbours(x, x), 0
     for seed in range(8):
         step = 0.04 * (random(*x.shape, seed=seed) - 0.5)
-        held = x + touching.without_passing(x, step)
+        held = x + kept_apart(contact, step, known)
         for n in range(3):
             crossed += len(self_intersections((x + step)[..., n].numpy(), faces))
             assert not len(self_intersections(held[..., n].numpy(), faces))
         assert (held - x).abs().max() > 1e-4
     assert crossed > 50
     alike = torch.full_like(x, 0.004)  # what all move alike is not slowed
-    torch.testing.assert_close(touching.without_passing(x, alike), alike)
+    torch.testing.assert_close(kept_apart(contact, alike, known), alike)
+
+
+def kept_apart(contact: SelfContact, step: torch.Tensor, known: ClothNeighbours) -> torch.Tensor:
+    """A step from the last positions, in which no cloth passes through cloth."""
+    known, share, met = contact.ahead(step, known)
+    return met.without_passing(known.last, share[:, None] * step)
 
 
 def test_layers_that_are_not_known_to_be_near_do_not_meet_in_a_step(layers):
     _, contact = layers
     x = stacked(contact.reach + 1e-3)
     x[4:, 1] += 0.1
-    touching = contact.contacts(x, contact.neighbours(x, x))
+    known = contact.neighbours(x, x)
     step = torch.zeros_like(x)
     step[:3, 1], step[3:, 1] = 0.05, -0.05
-    held = touching.without_passing(x, step)
-    assert not len(touching.frame)
+    held = kept_apart(contact, step, known)
+    assert not len(known.faces.frame) and not len(known.edges.frame)
     assert 1e-3 < float((held[0] - held[3])[1, 0]) < contact.reach
 
 
@@ -235,7 +294,8 @@ def test_a_garment_turns_with_what_is_pinned(scene, toy_grid):
     stays = torch.where(torch.as_tensor(pinned)[:, None, None], turned, x)  # the rest would stay where it was
     held, inputs = potential.approach(x, stays, still, None)
     assert (held - turned)[pinned].norm(dim=1).max() < 5e-3
-    assert inputs.contacts.gap(held).min() > 0
+    _, _, met = potential.self_contact.ahead(0.02 * (random(*held.shape) - 0.5), inputs.neighbours)
+    assert met.gap(held).min() > 0
 
 
 def _about_z(angle: float) -> torch.Tensor:
@@ -256,7 +316,7 @@ def test_frames_are_independent(scene, toy_grid):
     parts = [(torch.tensor(rows), known.select(torch.tensor(rows))) for rows in ([0, 2], [1])]
     joined = known.joined([parts[1], parts[0]])
     for kind in ("faces", "edges"):
-        for name in ("frame", "first", "second", "side", "start"):
+        for name in ("frame", "first", "second", "distance", "side"):
             assert torch.equal(getattr(getattr(joined, kind), name), getattr(getattr(known, kind), name))
     assert torch.equal(joined.at, known.at)
 
@@ -271,9 +331,8 @@ def random_contacts(vertices: int, count: int, frames_of: int) -> ClothContacts:
     law = ContactLaw(1e5, 5.0, 4e-3)
     second = torch.tensor([[False], [True], [True], [True]]).expand(4, count)
     start, area = torch.full((count,), 5.0, dtype=torch.float64), 1e-4 * random(count, seed=5)
-    known = torch.full((frames_of,), 0.01, dtype=torch.float64)
     rows = frame, corners, coefficients, second, direction, start, area, torch.zeros_like(start)
-    return ClothContacts(law, frames_of, known, *rows)
+    return ClothContacts(law, frames_of, *rows)
 
 
 @pytest.mark.parametrize("frames_of", [1, 3])
@@ -352,6 +411,31 @@ def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
     apart = [len(self_intersections(x, faces)) for x in twisted(potential, points, pinned, apart=True)]
     assert sum(through) > 10
     assert apart == [0] * 10
+
+
+def test_what_touches_is_added_to_what_a_graph_gives(scene, toy_grid, monkeypatch):
+    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    potential = IncrementalPotential(
+        dressed(scene, points, faces, points[:, 1] > -1e-9), replace(FABRIC, friction=0.3), device=CPU
+    )
+    _, x, _ = crumpled(toy_grid, scene, 2)
+    x = 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    known = potential.self_contact.neighbours(x, x)
+    friction = Friction.of_contacts(potential.self_contact.contacts(x, known), x, 0.3, 1 / 30)
+    still = torch.zeros(3, 2, dtype=torch.float64)
+    inputs = StepInputs(None, still, x, x, 1 / 30, neighbours=known, friction=friction)
+
+    def found() -> list[torch.Tensor]:
+        search = Search(potential, x + 1e-4 * random(*x.shape, seed=5), inputs, SolverOptions())
+        step, _ = newton_step(potential, search.state, search.inputs, search.gradient, 50)
+        return [search.state.energy, search.gradient, step]
+
+    expected = found()
+    monkeypatch.setattr(potential, "replays", lambda x, inputs: inputs.is_plain)
+    monkeypatch.setattr(Captured, "__call__", lambda self, *given: self._function(*given))
+    for own, other in zip(found(), expected):
+        torch.testing.assert_close(own, other)
+    assert len(potential.self_contact.contacts(x, known).frame) > 10 and expected[1].abs().max() > 1e-3
 
 
 def test_pairs_are_looked_for_once_at_the_same_positions(scene, toy_grid, monkeypatch):

@@ -111,7 +111,7 @@ def test_a_window_equals_a_plain_loop(objective, bptt, clearance):
             assert value.abs().min() > 0 or name == "collision"
             np.testing.assert_allclose(value.detach(), theirs[name].detach(), rtol=2e-3, atol=1e-6, err_msg=name)
     assert found[0]["collision"].max() > 0
-    np.testing.assert_allclose(found[2], expected[2], atol=1e-5)
+    np.testing.assert_allclose(found[2], expected[2], atol=5e-5)  # single precision: 1e-5 on some processors
     mine, theirs = (
         gradients(objective, total(dynamic) + total(static_batch)) for dynamic, static_batch, _ in (found, expected)
     )

@@ -21,8 +21,9 @@ from ssilk_core.scene.assets import TIGHT, Scene
 from ssilk_core.scene.fabrics import FABRICS
 from ssilk_core.scene.mesh import topology
 from ssilk_core.training.job import TrainJob
-from ssilk_core.training.parts import FIRST_WEIGHT, _take_over, build_parts
+from ssilk_core.training.parts import build_parts
 from ssilk_core.training.settings import TrainConfig
+from ssilk_core.training.starting_model import FIRST_WEIGHT, take_over
 
 CPU = torch.device("cpu")
 
@@ -42,7 +43,7 @@ def test_initialiser_and_decoder_are_kept_and_the_stepper_alone_learns(scene, to
     assert asked.model == replace(base.config, feedback_points=5)
     assert asked.train.static_iterations == 0
     model = GarmentModel(scene, asked.model, base.joints, 7)
-    assert _take_over(model, base)
+    assert take_over(model, base)
     for name, parameter in model.named_parameters():
         learns = name.startswith(("stepper.", "integrator."))
         assert parameter.requires_grad == learns
@@ -58,7 +59,7 @@ def test_the_stepper_goes_on_and_what_it_did_not_see_counts_nothing_yet(
     base = model_file(trained, FABRICS["silk"], {})
     asked = job(scene, base, toy_motion(scene, 9), feedback_points=after)
     model = GarmentModel(scene, asked.model, base.joints, 7)
-    assert _take_over(model, base)
+    assert take_over(model, base)
     old, new = torch.from_numpy(base.parameters[FIRST_WEIGHT]), model.stepper[0].weight.detach()
     assert new.shape[1] == old.shape[1] + more
     assert torch.equal(new[:, : old.shape[1]], old) and not new[:, old.shape[1] :].any()
@@ -73,7 +74,7 @@ def test_a_stepper_that_sees_less_or_steps_otherwise_starts_anew(scene, toy_mode
     asked = job(scene, base, toy_motion(scene, 9), **model)
     new = GarmentModel(scene, asked.model, base.joints, 7)
     fresh = new.stepper[0].weight.detach().clone()
-    assert not _take_over(new, base)
+    assert not take_over(new, base)
     assert torch.equal(new.stepper[0].weight, fresh)
 
 

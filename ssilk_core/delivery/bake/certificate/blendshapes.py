@@ -13,7 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from ....scene.assets import Floats, GarmentPose
-from ..rollout import BakeRollout, Certificate
+from ..computed_frames import Certificate
+from ..rollout import BakeRollout
 from .work import CertificateWork
 
 RMS, LARGEST = 1e-5, 4e-5  # [m] by which blendshapes may miss displacements, a tenth of the room
