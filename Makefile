@@ -1,4 +1,5 @@
-# `make demo` films a cape that ships trained, then trains, bakes, verifies and films a draft; `make test` runs every check.
+# `make demo` films a cape that ships trained, then trains, bakes, verifies and films a draft. `make test` runs all
+# checks but the tests that take longest, which `make test-slow` runs.
 # Both create the environment they need in .venv; only Python 3.11 (or later) and make must be there.
 # `make extension` packs the Blender extension, with ssilk in it, into dist/; `make test-blender` tests it
 # in Blender's Python module. Both need Python 3.11 and download some 370 MB into .venv-blender.
@@ -14,7 +15,7 @@ BLENDER_STAMP := $(BLENDER_VENV)/.installed
 export PYTHONDONTWRITEBYTECODE :=
 BLENDER_TOOL = $(wildcard $(BLENDER_VENV)/lib/python3.11/site-packages/bpy/*/scripts/addons_core/bl_pkg/cli/blender_ext.py)
 
-.PHONY: demo test pytest lint docs extension test-blender clean
+.PHONY: demo test test-slow pytest lint docs extension test-blender clean
 
 demo: $(STAMP)
 	$(BIN)/ssilk demo --output demo_out
@@ -34,8 +35,14 @@ FIRST := $(addprefix tests/core/,physics/test_loops.py physics/test_simulate_sol
 pytest: export OMP_NUM_THREADS := 1
 pytest: $(STAMP)
 	$(BIN)/python -m pytest --collect-only -qq > /dev/null || true
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(FIRST)
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(addprefix --ignore=,$(FIRST))
+	$(BIN)/python -m pytest -m "not slow" -n 2 --dist loadfile --no-loadscope-reorder $(FIRST)
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
+		$(addprefix --ignore=,$(FIRST))
+
+# What takes longest and seldom finds what the others do not.
+test-slow: export OMP_NUM_THREADS := 1
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -32,6 +32,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -226,6 +227,9 @@ def _inputs(options: argparse.Namespace, folder: Path) -> list[Path]:
     bodies = [options.stage, garment_location(options)[0], *(options.family or ())]
     named = [folder / file for body in bodies if (file := split_body(str(body))[0]) and not is_shapes(file)]
     own = {path.resolve() for path in (*named, *motions)}
-    layers = {Path(file).resolve() for path in own if path.is_file() for file in used_files(str(path))} - own
-    ordered = sorted(layers, key=lambda path: (path.name, path))
+    layers: set[Path] = set()
+    for path in filter(Path.is_file, own):
+        with suppress(SsilkError):  # a file that cannot be read is told by the training that reads it
+            layers |= {Path(file).resolve() for file in used_files(str(path))}
+    ordered = sorted(layers - own, key=lambda path: (path.name, path))
     return [*named, *(folder / file for file in options.over), *motions, *ordered]

@@ -409,6 +409,7 @@ def save_graded(model: str, output: str) -> None:
     save_model(output, replace(file, scene=replace(file.scene, garment=garment)))
 
 
+@pytest.mark.slow
 def test_a_page_counts_stretch_from_the_rest_shape_of_the_garment_that_was_trained(world, capsys):
     from ssilk_core.physics.energy import GarmentEnergy
 

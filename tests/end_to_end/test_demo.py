@@ -178,6 +178,7 @@ def first_points(shot: Path) -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("brief")
 def test_one_model_is_filmed_on_three_bodies(tmp_path, capsys):
     assert main(["demo", "--garment", "cape_family", "-o", str(tmp_path)]) == 0
@@ -193,6 +194,7 @@ def test_one_model_is_filmed_on_three_bodies(tmp_path, capsys):
     assert min(np.abs(shot["Cape"] - neutral["Cape"]).max() for shot in (tall, heavy)) > 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("brief")
 def test_one_model_is_filmed_in_three_fabrics(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(view, "run", lambda *_: 0)  # three shots are drawn side by side above

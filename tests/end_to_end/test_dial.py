@@ -99,6 +99,7 @@ def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measure
     assert "unfinished" not in found and names == [(row["split"], row["place"]) for row in measured["figures"]]
 
 
+@pytest.mark.slow
 def test_times_are_kept_beside_the_errors(measured, script, world):
     path = world / "times.json"
     path.write_text(json.dumps(measured))

@@ -123,6 +123,7 @@ def test_a_run_that_was_stopped_goes_on(world, stopped, capsys):
     }
 
 
+@pytest.mark.slow
 def test_a_run_that_is_cut_again_and_again_comes_to_the_same_figures(world, monkeypatch, capsys):
     """It is cut after every third part: records, stops, loops, steps of simulations, single steps."""
     words = f"{WORLD} --index index.json --solver -o"

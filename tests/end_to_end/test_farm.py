@@ -325,6 +325,7 @@ def test_a_motion_that_changes_while_it_is_read_is_read_again(farm, toy, monkeyp
         assert LayerFolder("out").is_done(tasks[0])
 
 
+@pytest.mark.slow
 def test_a_cancelled_worker_stops_in_time_and_leaves_nothing_half_written(farm, toy):
     toy.write_clip(farm / "a.usda", frames=1200)
     assert run(f"{WORDS} --bundle bundle") == 0  # the job holds a hash of the clip
@@ -348,6 +349,7 @@ def test_a_job_runs_where_its_inputs_lie_elsewhere(farm):
     assert task("--tasks 0 --path-mapping rules.json") == 0
 
 
+@pytest.mark.slow
 def test_tasks_do_not_wait_for_a_gpu_that_this_machine_does_not_have(farm, monkeypatch, capsys):
     if importlib.util.find_spec("ray") is None:
         pytest.skip("ray is not installed")

@@ -120,6 +120,7 @@ def check_equal(whole: Path) -> None:
     assert [point | {"seconds": 0} for point in curve["points"]] == [p | {"seconds": 0} for p in other["points"]]
 
 
+@pytest.mark.slow
 def test_killed_wherever_a_file_gets_its_name(forks, command, whole, tmp_path, monkeypatch):
     """Resumed ones write a model that was lost, and the curve; each step then a state, a curve, and maybe a model."""
     monkeypatch.chdir(tmp_path)

@@ -228,6 +228,7 @@ def test_changed_joints_and_topology_are_warned_of_with_the_shots_that_they_outd
     assert any("1 shots" in text and "(run)" in text for text in texts), texts
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_bytes(copy):
     outputs, found = ("layers", "shot.usdc", "shot.usda", "shot.usdz"), []
     code = "import sys; from ssilk_core.cli import main; written, *words = sys.argv[1:];"

@@ -240,6 +240,7 @@ def crossing_frames(folder: str) -> list[int]:
     return [frame for frame, each in enumerate(pairs) if len(each)]
 
 
+@pytest.mark.slow
 def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file(copy, capsys):
     """Whatever the order of the models; the file is proven against that of the inner garment, which must be there."""
     Path("dented.safetensors").replace("coat.safetensors")
@@ -278,6 +279,7 @@ def test_an_outer_garment_is_certified_over_the_inner_one_as_it_lies_in_its_file
     assert not any(len(intersections_between(x, faces, y, faces)) for x, y in zip(points["coat"], points["skirt"]))
 
 
+@pytest.mark.slow
 def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(copy, capsys):
     """Whatever the order of the models; the inner garment is as it is without the outer, which comes out of it."""
     Path("dented.safetensors").replace("coat.safetensors")
@@ -426,7 +428,7 @@ def test_copies_of_a_list_replace_no_file_that_it_reads(toy, copy, capsys):
     Path("cloth").mkdir()
     Usd.Stage.Open("rigged.usda").Export("cloth/coat.usdc")
     listed = Path("outfit.toml").read_text()
-    Path("outfit.toml").write_text(listed.replace('"/Hero/Skirt"', '"cloth/coat.usdc:/Hero/Skirt"'))
+    Path("outfit.toml").write_text(listed.replace('garment = "Skirt"', 'garment = "cloth/coat.usdc:/Hero/Skirt"'))
     before = Path("cloth/coat.usdc").read_bytes()
     capsys.readouterr()
     assert main(shlex.split("inspect outfit.toml --fix cloth")) == 2

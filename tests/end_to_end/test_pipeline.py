@@ -225,6 +225,7 @@ def test_a_shot_is_verified_wherever_its_folder_goes(world, tmp_path, monkeypatc
     assert run(f"verify {moved}/shots/shot.usdc --model {moved}/cape.safetensors") == 0
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_goes_on_to_the_same_model(world):
     """Interrupted by SIGINT, resumed, and compared with one that was left alone.
 

@@ -57,6 +57,7 @@ def crossings(coat: Shot, skirt: Shot) -> list[int]:
     ]
 
 
+@pytest.mark.slow
 def test_what_starts_in_a_tangle_is_settled_apart_and_stays_so(stage, capsys):
     assert crossing("coat.usda:/Hero/Skirt", "/Hero/Skirt") > 0
     assert main([*shlex.split(SIMULATE), "--tolerance", "0.3", "--points", "--json"]) == 0

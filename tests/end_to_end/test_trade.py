@@ -46,6 +46,7 @@ def no_clock(monkeypatch):
     monkeypatch.setattr("ssilk_core.quality.trade.measure.play_time", lambda player, motion: Time(1.0, 2.0))
 
 
+@pytest.mark.slow
 def test_a_sweep_is_written_drawn_and_taken_up_again(world, capsys, no_clock):
     assert run(f"{TRADE} --clips long short --frames 12 --no-refine -o trade.json") == 0
     document, text = json.loads((world / "trade.json").read_text()), capsys.readouterr().out

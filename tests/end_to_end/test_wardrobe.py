@@ -539,6 +539,7 @@ def test_an_outfit_is_trained_from_the_inside_out(world, capsys):
     assert over == {"skirt": sha256(Path("out/skirt.safetensors"))}
 
 
+@pytest.mark.slow
 def test_two_processes_train_one_garment_and_one_of_them_speaks(world, toy):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -174,7 +174,7 @@ def test_a_file_holds_what_the_decoder_gives(model, scene, toy_motion, tmp_path)
     assert parameter_shapes(scene, model.config, model.joints) == found
 
 
-@pytest.mark.parametrize("kind", ["paper", "points beside proxies"])
+@pytest.mark.parametrize("kind", ["paper", pytest.param("points beside proxies", marks=pytest.mark.slow)])
 def test_an_engine_plays_the_graph_alike(calm, scene, toy_motion, tmp_path, kind):
     """The paper's own graph is played as PyTorch's: the one with points has its operations, and exports take long."""
     onnxruntime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: the extra 'dev' brings it")

@@ -161,6 +161,7 @@ def test_a_fold_through_itself_opens(scene):
     assert np.linalg.norm(found.points[0] - start, axis=1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_cloth_that_a_limb_came_through_is_lifted_off_it(scene):
     limb = trimesh.creation.capsule(height=0.3, radius=0.05, count=[24, 24])
     tube = trimesh.creation.cylinder(radius=0.06, height=0.2, sections=32)

@@ -120,6 +120,7 @@ def test_a_sheet_is_carried_by_what_it_lies_on(scene, toy_grid):
     assert abs(float((smooth[-1][0] - smooth[0][0])[:, 0].mean())) < 1e-3
 
 
+@pytest.mark.slow
 def test_an_upper_layer_is_held_by_the_lower_one(scene, toy_grid):
     sheets, x = lying(scene, toy_grid, 2)
     steps, half = 4, x.shape[0] // 2

@@ -246,6 +246,7 @@ def crossings(inner: Scene, outer: Scene, x: np.ndarray, y: np.ndarray) -> int:
     )
 
 
+@pytest.mark.slow
 def test_what_starts_apart_never_intersects(scene, toy_motion, toy_grid):
     inner, outer, motion = swept(scene, toy_motion, toy_grid)
     fabric = replace(LIGHT, friction=0.0)

@@ -403,6 +403,7 @@ def twisted(
     return found
 
 
+@pytest.mark.slow
 def test_a_sheet_that_is_twisted_to_a_rope_stays_apart(scene, toy_grid):
     points, faces = toy_grid(8, 8, height=0.5, width=0.5)
     pinned = points[:, 1] > -1e-9

@@ -219,6 +219,7 @@ def test_a_batch_of_shots_equals_one_by_one(scene, toy_motion) -> None:
         np.testing.assert_allclose(points, alone, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_more_substeps_approach_a_limit_at_first_order(scene, toy_motion) -> None:
     motion = toy_motion(scene, 4)
     quiet = replace(CLOTH, bending=0.05, drag=2.0)  # stiff and slow enough not to buckle one way or the other
@@ -349,6 +350,7 @@ def forward(degrees: Sequence[float]) -> np.ndarray:
     return quaternion_from_matrix(np.array(turned))
 
 
+@pytest.mark.slow
 def test_an_arm_that_jumps_through_cloth_in_one_frame_comes_to_lie_under_it(toy_grid) -> None:
     # In one step from the hanging sheet the search ended where the cloth that the arm is through changes: 244 g left.
     scene, pose = arm_behind_a_sheet(*toy_grid(21, 17, height=0.5, width=0.4))
@@ -390,6 +392,7 @@ def test_between_two_poses_joints_turn_about_their_parents(toy_grid) -> None:
     torch.testing.assert_close(found.body.points, half.body.points, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cloth, self_contact", [(CLOTH, False), (replace(CLOTH, friction=0.4), True)])
 def test_a_shot_that_needs_shorter_steps_leaves_the_others_as_they_are(
     toy_grid, monkeypatch, cloth, self_contact

@@ -150,6 +150,7 @@ STRIP = 8 / 9  # of the rigidity of a plate: its edges are free to curl, as by P
 NEAR = 0.03  # of the sag: triangles at the edges have hinges on two sides only
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bending_length", "rows"), [(0.03, 18), (0.05, 22)])  # cotton, denim
 def test_a_strip_overhangs_as_the_heavy_elastica(scene, toy_grid, bending_length, rows):
     """The sag is compared, also where the strip hangs steeply."""

@@ -381,6 +381,7 @@ def playlist(dressed: EvaluationScene, motion: Motion, slow: Motion, **options: 
     )
 
 
+@pytest.mark.slow
 def test_every_method_gets_its_row_in_every_split(scene, dressed, motion, toy_motion, toy_model):
     motion, slow = motion.clip(0, 10), toy_motion(scene, 6, speed=0.3)
     subjects = [

@@ -369,6 +369,7 @@ def test_a_run_does_not_go_on_with_another_range(scene, toy_motion, tmp_path):
     assert "points" not in replace(job, fabrics=FabricRange.of(OWN, ["2"])).identity()["fabrics"]  # as runs of before
 
 
+@pytest.mark.slow
 def test_after_a_short_training_stiff_cloth_hangs_less_than_soft_cloth(scene, toy_motion, tmp_path):
     """The strip hangs from its upper end: what is stretched by its weight reaches farther down."""
     motion, path = toy_motion(scene, 40, speed=0.2), tmp_path / "m.safetensors"

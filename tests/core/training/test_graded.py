@@ -260,6 +260,7 @@ def test_a_run_goes_on_with_the_garment_as_it_began(scene, graded, family, toy_m
     assert one["family"] != other["family"] and {**one, "family": ""} == {**other, "family": ""}
 
 
+@pytest.mark.slow
 def test_a_trained_garment_that_is_graded_is_stretched_less_on_a_heavy_body(
     scene, graded, family, members, toy_motion, tmp_path
 ):
