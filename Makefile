@@ -39,7 +39,7 @@ pytest: $(STAMP)
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder \
 		$(addprefix --ignore=,$(FIRST))
 
-# What takes longest and seldom finds what the others do not.
+# The tests that take longest, which `make test` leaves out.
 test-slow: export OMP_NUM_THREADS := 1
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile

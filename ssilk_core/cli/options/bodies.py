@@ -72,12 +72,12 @@ def bodies_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folde
     from ...training.wardrobe.listing import garment_file
 
     table = entry.located(folder)
-    stage, own = Path(table["stage"]), garment_file(table)[1]
+    stage, (file, own) = Path(table["stage"]), garment_file(table)
     if not Path(split_body(str(stage))[0]).is_file():
         return []  # which is told where it is read
     others = [garment_file(each.located(folder)) for each in entries if each is not entry]
-    beside = [prim for file, prim in others if prim and Path(file).resolve() == stage.resolve()]
-    return bodies_beside(str(stage), beside, own if garment_file(table)[0] == str(stage) else None) if beside else []
+    beside = [prim for other, prim in others if prim and is_same_file(other, stage)]
+    return bodies_beside(str(stage), beside, own if file == str(stage) else None) if beside else []
 
 
 def members(options: argparse.Namespace, report: Reporter) -> list[str]:
