@@ -11,7 +11,9 @@ from typing import Any
 from .forms import GARMENTS, digits, document, duration, fixed, percent, result, table
 
 SPLITS = ("valid", "test", "flips")
-METHODS = {"LBS": "LBS", "ncs": "NCS", "ncs*": "NCS*", "snug": "SNUG", "ssilk": "**SSILK**"}
+METHODS = {
+    "LBS": "LBS", "ncs": "NCS", "ncs*": "NCS*", "snug": "SNUG", "paper": "preset `paper`", "ssilk": "**SSILK**",
+}  # fmt: skip
 IN_RESULTS = {"cape": "Cape", "fringe_skirt": "FringeSkirt", "hooded_dress": "HoodedDress"}
 LBS, REFINED = "linear blend skinning", "refine 4"
 FULL = "full, poses included"
@@ -20,13 +22,15 @@ FULL = "full, poses included"
 def cells() -> dict[tuple[str, str, str], dict[str, Any]]:
     """Return totals [J] and intersections by garment, method and split.
 
-    Those of other methods are from `tables.py`, those of garments that ship from `ssilk evaluate`.
+    Those of other methods are from `tables.py`, those of garments that ship and of the preset `paper` from
+    `ssilk evaluate`.
     """
     found = {(row["garment"], row["method"], row["split"]): row for row in result("table1")["figures"]}
-    for name in GARMENTS:
-        for row in measured(name):
+    sources = [(name, name, "ssilk") for name in GARMENTS] + [("cape", "cape_paper", "paper")]
+    for name, file, method in sources:
+        for row in measured(file):
             figures = row["figures"]
-            found[IN_RESULTS[name], "ssilk", row["split"]] = {
+            found[IN_RESULTS[name], method, row["split"]] = {
                 "total": [figures["total"]],
                 **{f"intersections_{at}": [figures["intersections"][at]] for at in ("mean", "worst")},
             }
@@ -34,7 +38,7 @@ def cells() -> dict[tuple[str, str, str], dict[str, Any]]:
 
 
 def measured(name: str) -> list[dict[str, Any]]:
-    """Return what `ssilk evaluate` found of a garment that ships, a row for each split."""
+    """Return what `ssilk evaluate` found of a network, a row for each split."""
     rows: list[dict[str, Any]] = document(f"evaluate_{name}")["figures"]
     return [row for row in rows if row["method"] == "ssilk" and row["split"] in SPLITS]
 
@@ -69,7 +73,9 @@ def other_methods() -> str:
     crossed = any("intersections_mean" in row for row in energies.values())
     iterations = {(each["garment"], each["method"]): f"{each['iterations']:,}" for each in _trained()}
     for name, words in GARMENTS.items():
-        for number, (method, shown) in enumerate(METHODS.items()):
+        own_methods = {method: words for method, words in METHODS.items()
+                       if (IN_RESULTS[name], method, SPLITS[0]) in energies}  # fmt: skip
+        for number, (method, shown) in enumerate(own_methods.items()):
             keys = [(IN_RESULTS[name], method, split) for split in SPLITS]
             row = ["" if number else words, shown, iterations.get((IN_RESULTS[name], method), "")]
             row += [digits(mean(energies[key]["total"])) for key in keys]
