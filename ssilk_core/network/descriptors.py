@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..physics.constants import GRAVITY
-from ..scene.assets import Floats, Motion, Skeleton
+from ..scene.assets import Floats, Motion, Scene, Skeleton
 from ..scene.kinematics import local_transforms, matrix_from_quaternion, motion_transforms
 from .proximity import proximity_vectors
 
@@ -80,6 +80,24 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
         if keep[joint] and skeleton.parents[joint] >= 0 and joint != skeleton.hub:
             keep[skeleton.parents[joint]] = True
     return np.flatnonzero(keep)
+
+
+def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
+    """Return the joints for a garment's descriptors: those that it is skinned to, or that move body parts in reach.
+
+    Args:
+        scene: character, garment and rig.
+        colliding: flag of each joint that moves a reachable body vertex, shape (J,).
+    """
+    skeleton = scene.character.skeleton
+    used = np.array(colliding, dtype=bool)
+    for skin in (scene.rig.skin, scene.lbs_skin):
+        indices = skin.indices[skin.weights > 0]
+        used[indices[indices < skeleton.joint_count]] = True
+    for parent in scene.rig.parents:
+        if parent < skeleton.joint_count:
+            used[parent] = True
+    return descriptor_joints(skeleton, used)
 
 
 def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from ... import events
 from ...errors import fail
 from ...scene.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
 from ...scene.kinematics import rigid
+from ...scene.mesh.geodesic import distances, distances_along_edges
 from ...scene.mesh.topology import vertex_areas, vertex_normals
 from .clusters import (
     Cluster,
@@ -40,6 +41,8 @@ class RigOptions:
         roots_per_cluster: number of proxies of a cluster whose parent is a character joint (the paper's j).
         influences: largest number of proxies per vertex.
         seam_blend: whether loose vertices near the seam keep a share of the body's weights.
+        exact: whether distances between proxies are exact; else they run along edges. As many are placed then, on the
+            same pieces, but not at the same vertices.
     """
 
     proxies: int = 20
@@ -47,6 +50,7 @@ class RigOptions:
     roots_per_cluster: int = 4
     influences: int = 4
     seam_blend: bool = True
+    exact: bool = True
 
     def __post_init__(self) -> None:
         for name, least in (("proxies", 0), ("max_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
@@ -157,6 +161,7 @@ def _clusters(
             proxies=int(shares[number]),
             roots=roots,
             twin=twin,
+            measure=distances if options.exact else distances_along_edges,
             placed=placed,
         )
     return list(clusters.values())
