@@ -52,13 +52,13 @@ class Cluster:
     joint: int
 
 
-def find_seam(mesh: Mesh, loose: Mask) -> Seam:
-    """Measure the distance of every vertex to those that are not `loose` (V,).
+def find_seam(mesh: Mesh, loose: Mask, measure: Measure = distances) -> Seam:
+    """Return the distance of every vertex to those that are not `loose` (V,), by a measure of distances.
 
     Raises:
         SsilkError: all vertices of an island are loose, or a loose vertex belongs to no face.
     """
-    seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
+    seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose), measure))
     falling = seam.nearest < 0
     lone = np.flatnonzero(falling & ~vertex_mask(mesh.faces, mesh.vertex_count))
     if len(lone):

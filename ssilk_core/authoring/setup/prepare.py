@@ -35,7 +35,7 @@ def prepare_scene(
         garment: fitted to the character's bind pose, with or without weights and classes.
         rig: proxies authored for the garment, or None.
         rough: whether classes, the joints that count and the number of proxies are enough: levels are sought at the
-            usual tightness alone, and distances between proxies are not exact.
+            usual tightness alone, and distances for proxies are not exact.
         report: receives a message about each thing that is added.
 
     Raises:

@@ -76,13 +76,15 @@ def within_of(points: Floats, faces: Ints, kind: NDArray[np.bool_], reach: float
     return kind | within(points, border, np.flatnonzero(kind), reach)
 
 
-def nearest_sources(points: Floats, faces: Ints, sources: Ints) -> tuple[Floats, NDArray[np.int64]]:
+def nearest_sources(
+    points: Floats, faces: Ints, sources: Ints, measure: Measure = distances
+) -> tuple[Floats, NDArray[np.int64]]:
     """Return the distance to the nearest of `sources` [m], and that source (-1 if unreachable), both (V,).
 
-    The distance is exact. The source is found by descending the distance field along edges, so it may be either of
-    two sources whose distances differ by less than an edge.
+    The distance is exact by default. The source is found by descending the distance field along edges, so it may be
+    either of two sources whose distances differ by less than an edge.
     """
-    distance = distances(points, faces, sources)
+    distance = measure(points, faces, sources)
     pairs = edges(faces)
     heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
     downhill = distance[tails] < distance[heads]
