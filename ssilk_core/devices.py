@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from typing import TYPE_CHECKING
 
 from .errors import fail
@@ -22,7 +23,7 @@ def select_device(name: str) -> torch.device:
     import torch
 
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        return torch.device(usual_device())
     try:
         device = torch.device(name)
         torch.empty(1, device=device)
@@ -32,13 +33,33 @@ def select_device(name: str) -> torch.device:
     return device
 
 
+def usual_device() -> str:
+    """Return what "auto" stands for, "cuda" or "cpu"; to say so, a torch of processors alone need not be loaded."""
+    if "torch" not in sys.modules and _for_processors():
+        return "cpu"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _for_processors() -> bool:
+    """Return whether the torch that is installed says of itself that it was built for processors alone."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("torch").endswith("+cpu")
+    except PackageNotFoundError:  # it lies on the path without being installed
+        return False
+
+
 def default_preset(name: str) -> str:
     """Return the preset that a device finishes while someone waits: "draft" on a processor, else "preview".
 
     Args:
         name: as for `select_device`.
     """
-    return "draft" if select_device(name).type == "cpu" else "preview"
+    device = usual_device() if name == "auto" else select_device(name).type
+    return "draft" if device == "cpu" else "preview"
 
 
 BUSY = 0.75  # cores that other programs take, from which on it is told

@@ -43,5 +43,5 @@ def quiet_machine() -> Iterator[None]:
 def few_contacts() -> Iterator[None]:
     """Cloth touches the body at vertices and at few points between, where contact itself is not what is tested."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ssilk_core.physics.collision.samples.MAX_SPACING", 0.1)
+        patch.setattr("ssilk_core.physics.samples.MAX_SPACING", 0.1)
         yield

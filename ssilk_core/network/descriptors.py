@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..physics.constants import GRAVITY
-from ..scene.assets import Floats, Motion, Skeleton
+from ..scene.assets import Floats, Motion, Scene, Skeleton
 from ..scene.kinematics import local_transforms, matrix_from_quaternion, motion_transforms
 from .proximity import proximity_vectors
 
@@ -82,18 +82,29 @@ def descriptor_joints(skeleton: Skeleton, used: Floats) -> np.ndarray:
     return np.flatnonzero(keep)
 
 
+def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
+    """Return the joints for a garment's descriptors: those that it is skinned to, or that move body parts in reach.
+
+    Args:
+        scene: character, garment and rig.
+        colliding: flag of each joint that moves a reachable body vertex, shape (J,).
+    """
+    skeleton = scene.character.skeleton
+    used = np.array(colliding, dtype=bool)
+    for skin in (scene.rig.skin, scene.lbs_skin):
+        indices = skin.indices[skin.weights > 0]
+        used[indices[indices < skeleton.joint_count]] = True
+    for parent in scene.rig.parents:
+        if parent < skeleton.joint_count:
+            used[parent] = True
+    return descriptor_joints(skeleton, used)
+
+
 def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
     """Return the places in `joints` (J',) of those whose rotations are features: all but the hub, and other roots."""
     skeleton = seen_skeleton(skeleton)
-    above = skeleton.hub_path[:-1]
-    return np.array(
-        [
-            i
-            for i, joint in enumerate(joints)
-            if joint in above or (joint != skeleton.hub and skeleton.parents[joint] >= 0)
-        ],
-        dtype=np.int64,
-    )
+    above = np.isin(joints, skeleton.hub_path[:-1])
+    return np.flatnonzero(above | ((joints != skeleton.hub) & (skeleton.parents[joints] >= 0)))
 
 
 def pose_features(
@@ -132,7 +143,12 @@ def pose_features(
         six_d(np.swapaxes(root, -1, -2) @ _past(root, steps) - np.eye(3)) * motion.fps * RATE_TIME for steps in (1, 2)
     ]
     dynamic = np.concatenate([rate, change, *turn, accelerations(world[..., :3, 3], root, motion.fps)], axis=1)
-    return PoseFeatures(static, SATURATION * np.tanh(dynamic / SATURATION), down, down[:, :0], gravity, near)
+    return PoseFeatures(static, saturated(dynamic), down, down[:, :0], gravity, near)
+
+
+def saturated(dynamic: Floats) -> Floats:
+    """Limit dynamic features; in single precision, as networks see them, which takes a third of the time."""
+    return SATURATION * np.tanh((dynamic / SATURATION).astype(np.float32)).astype(np.float64)
 
 
 def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
@@ -146,7 +162,7 @@ def accelerations(places: Floats, root: Floats, fps: float) -> Floats:
         Shape (F, 3 J').
     """
     acceleration = _differences(places, fps)[1] / (RATE_TIME**2 * GRAVITY)
-    return np.einsum("fba,fjb->fja", root, acceleration).reshape(len(places), -1)
+    return (acceleration @ root).reshape(len(places), -1)
 
 
 def seen_skeleton(skeleton: Skeleton) -> Skeleton:

@@ -17,13 +17,11 @@ POSES_AT_ONCE = 256  # frames in each chunk of LBS poses
 
 def matrix_from_quaternion(quaternions: Floats) -> Floats:
     """Return rotation matrices, shape (..., 3, 3), of unit quaternions (w, x, y, z), shape (..., 4)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternions, dtype=np.float64), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    w, x, y, z = np.moveaxis(np.asarray(quaternions, dtype=np.float64), -1, 0).copy()
+    xx, yy, zz, xy, xz, yz, wx, wy, wz = x * x, y * y, z * z, x * y, x * z, y * z, w * x, w * y, w * z
+    entries = (1 - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy), 2 * (xy + wz), 1 - 2 * (xx + zz), 2 * (yz - wx),
+               2 * (xz - wy), 2 * (yz + wx), 1 - 2 * (xx + yy))  # fmt: skip
+    return np.stack(entries, axis=-1).reshape(*np.shape(w), 3, 3)
 
 
 def quaternion_from_matrix(matrices: Floats) -> Floats:

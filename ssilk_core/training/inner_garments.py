@@ -23,11 +23,12 @@ from ..events import Message, Reporter, silent
 from ..network.checkpoint import ModelFile, load_model, network
 from ..network.descriptors import place_of_hub
 from ..network.model.network import GarmentModel
-from ..physics.collision import Contacts, PosedBody, reachable_cloth
+from ..physics.collision import Contacts, PosedBody
 from ..physics.collision.inner_cloth import InnerCloth, Planes, loosened_over
-from ..physics.collision.samples import ContactSamples
 from ..physics.intersections.layers import ClothLayers, LayerCounts
 from ..physics.intersections.pairs import need_predicates
+from ..physics.reach import reachable_cloth
+from ..physics.samples import ContactSamples
 from ..scene.assets import PINNED, Motion, Scene, Skeleton
 from ..scene.kinematics import MAX_JOINT_SPEED
 from .motion_bank import MotionBank, build_bank, roll_states

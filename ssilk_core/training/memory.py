@@ -8,17 +8,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-
-import torch
+from typing import TYPE_CHECKING
 
 from ..errors import fail
 from ..network.settings import ModelConfig
-from ..physics.collision.samples import contact_samples
-from ..physics.energy.stitching import held_stitches
 from ..physics.intersections.figures import EVERY
+from ..physics.samples import contact_samples
 from ..scene.assets import LOOSE, PINNED, Scene
 from ..scene.fabrics import Fabric
+from ..scene.mesh.stitches import held_stitches
 from .settings import MOST_SMOOTHED_VERTICES, TrainConfig
+
+if TYPE_CHECKING:
+    import torch
 
 PLANNED_SHARE = 0.8  # of the free memory
 DEFAULT_FREE_MEMORY = 8 << 30  # bytes, where the system offers no portable way to ask
@@ -36,11 +38,14 @@ CONTROL_GROUPS = (
 )
 
 
-def free_memory(device: torch.device) -> int:
+def free_memory(device: torch.device | str) -> int:
     """Return the free memory of a device [bytes]; on the CPU within the container's limit."""
-    if device.type == "cuda":
+    kind = str(device).partition(":")[0]
+    if kind == "cuda":
+        import torch
+
         return int(torch.cuda.mem_get_info(device)[0])
-    if device.type != "cpu" or not MEMINFO.is_file():
+    if kind != "cpu" or not MEMINFO.is_file():
         return DEFAULT_FREE_MEMORY
     machine = int(_numbers(MEMINFO)["MemAvailable:"]) * 1024
     left = (_left_in_container(*names) for names in CONTROL_GROUPS if (CONTAINER / names[0]).is_file())
@@ -72,7 +77,7 @@ class StepMemory:
 
     Attributes:
         body_vertices: those of the body that the garment can touch.
-        samples: at which the garment meets the body (`collision.samples`), its vertices among them.
+        samples: at which the garment meets the body (`physics.samples`), its vertices among them.
         stitches: that hold its islands on one another.
         smoothed: vertices whose blendshapes are smoothed by a matrix that is still to be built.
         contours: whether the garment's intersections with itself are searched for.
@@ -172,6 +177,8 @@ def fits_in_memory(work: Callable[[], None]) -> bool:
 
 def _of_memory(error: BaseException | None) -> bool:
     """Return whether an error, or its cause, is a lack of memory; failed graph captures hide it in their cause."""
+    import torch
+
     while error is not None:
         if isinstance(error, torch.OutOfMemoryError) or "out of memory" in str(error):
             return True

@@ -12,12 +12,13 @@ import torch
 from torch import Tensor
 
 from ..events import Message, Reporter, format_count, silent
-from ..network.descriptors import place_of_hub
-from ..network.model.network import GarmentModel, model_joints
-from ..physics.collision import CollisionBody, limb_axes, reachable_body
+from ..network.descriptors import model_joints, place_of_hub
+from ..network.model.network import GarmentModel
+from ..physics.collision import CollisionBody, limb_axes
 from ..physics.energy import GarmentEnergy
 from ..physics.energy.graded import GradedRest
 from ..physics.intersections.pairs import need_predicates
+from ..physics.reach import reachable_body
 from ..scene.assets import Floats, Ints, Motion
 from ..scene.fabric_range import FabricRange
 from ..scene.family import motion_on

@@ -19,7 +19,7 @@ def training_seconds(samples: int, train: TrainConfig, device: str) -> float | N
     """Return the estimated duration of a training [s]; None for a device that has not been measured.
 
     Args:
-        samples: at which the garment meets the body (`collision.samples`).
+        samples: at which the garment meets the body (`physics.samples`).
     """
     if device not in SECONDS_PER_SAMPLE:
         return None

@@ -13,7 +13,8 @@ from ssilk_core.network.checkpoint import load_model, network
 from ssilk_core.network.rollout import garment_poses, roll
 from ssilk_core.network.runtime import Player
 from ssilk_core.network.settings import ModelConfig
-from ssilk_core.physics.collision import nearest_planes, reachable_body, signed_distance
+from ssilk_core.physics.collision import nearest_planes, signed_distance
+from ssilk_core.physics.reach import reachable_body
 from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Character, ProxyRig, Scene
 from ssilk_core.scene.fabrics import Fabric
 from ssilk_core.scene.kinematics import deform, motion_transforms, skin_points, skinning_matrices

@@ -22,7 +22,7 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
     If `motions` is empty, the rest pose determines which part of the body the garment can touch.
     """
-    from ...physics.collision import reachable_body
+    from ...physics.reach import reachable_body
 
     reach = reachable_body(scene, motions or [rest_motion(scene)])
     yield from memory(scene, preset, len(reach.vertices))
@@ -31,11 +31,11 @@ def training_cost(scene: Scene, motions: Sequence[Motion], preset: Preset) -> Fi
 
 def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
     """Yield the memory and time that a preset takes when the garment can touch `body_vertices` vertices."""
-    from ...devices import busy_cores, kept_busy, select_device
+    from ...devices import busy_cores, kept_busy, usual_device
     from ...scene.fabrics import FABRICS
     from ...training.memory import StepMemory, decoded_frames, free_memory
 
-    model, train, device = preset.model, preset.train, select_device("auto")
+    model, train, device = preset.model, preset.train, usual_device()
     free = free_memory(device)
     step = StepMemory.of(scene, model, train, FABRICS["default"], body_vertices)
     needed = step.needed(decoded_frames(train, train.batch))
@@ -54,7 +54,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         why="training progresses more slowly per step with smaller batches" if lowered else "",
         fix="free memory, or choose another device or a smaller preset" if lowered else "",
     )
-    seconds = training_seconds(step.samples, train, device.type)
+    seconds = training_seconds(step.samples, train, device)
     found = f"preset '{preset.name}' takes about {format_seconds(seconds)} on {device}" if seconds else (
         f"the time that preset '{preset.name}' takes is unknown: training has not been measured on {device}"
     )  # fmt: skip
@@ -62,7 +62,7 @@ def memory(scene: Scene, preset: Preset, body_vertices: int) -> Findings:
         "scaled by contact samples and frames from a garment on two CPU threads or several on a shared GPU; "
         "the actual time may differ by half"
     )
-    if device.type == "cpu" and (others := kept_busy(busy_cores())):
+    if device == "cpu" and (others := kept_busy(busy_cores())):
         why += f", and {others} now, so that it takes longer as long as they do"
     long = seconds is not None and seconds > LONG
     yield Finding(
@@ -80,7 +80,7 @@ def irrelevant_joints(scene: Scene, colliding: np.ndarray) -> Findings:
 
     `colliding` flags the joints that move that part of the body, shape (J,).
     """
-    from ...network.model.network import model_joints
+    from ...network.descriptors import model_joints
 
     skeleton = scene.character.skeleton
     unseen = np.setdiff1d(np.arange(skeleton.joint_count), model_joints(scene, colliding))

@@ -154,7 +154,7 @@ def _on_scene(inputs: PreflightInput, blocked: bool) -> Findings:
         if any(attachment.unattached_islands(garment.mesh, garment.classes)):
             return
     try:
-        scene = prepare_scene(inputs.character, garment, inputs.rig)
+        scene = prepare_scene(inputs.character, garment, inputs.rig, rough=True)
     except SsilkError as error:
         yield Finding(
             severity="error",

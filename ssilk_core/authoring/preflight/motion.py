@@ -258,13 +258,15 @@ def still_joints(motions: Sequence[Motion], skeleton: Skeleton) -> Findings:
 
 def buried_limbs(scene: Scene, motions: Sequence[Motion]) -> Findings:
     """Yield the limbs whose tips lie in another part of the body, of those that loose cloth must not cross."""
+    if not motions:
+        return
     import torch
 
     from ...physics.collision import limb_axes
     from ...physics.collision.limb_axes import LimbPoser
 
     axes, skeleton = limb_axes(scene), scene.character.skeleton
-    if axes is None or not motions:
+    if axes is None:
         return
     poser, buried = LimbPoser(axes, scene.character.merged_body(), torch.device("cpu")), []
     seconds = sum(motion.frame_count / motion.fps for motion in motions)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ...errors import fail
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.geodesic import farthest_points, nearest_sources, submesh
+from ...scene.mesh.geodesic import Measure, distances, farthest_points, nearest_sources, submesh
 from ...scene.mesh.topology import components, edges, vertex_areas, vertex_mask
 from .mirror import mates_of, mirrored_points
 
@@ -52,13 +52,13 @@ class Cluster:
     joint: int
 
 
-def find_seam(mesh: Mesh, loose: Mask) -> Seam:
-    """Measure the distance of every vertex to those that are not `loose` (V,).
+def find_seam(mesh: Mesh, loose: Mask, measure: Measure = distances) -> Seam:
+    """Return the distance of every vertex to those that are not `loose` (V,), by a measure of distances.
 
     Raises:
         SsilkError: all vertices of an island are loose, or a loose vertex belongs to no face.
     """
-    seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose)))
+    seam = Seam(*nearest_sources(mesh.points, mesh.faces, np.flatnonzero(~loose), measure))
     falling = seam.nearest < 0
     lone = np.flatnonzero(falling & ~vertex_mask(mesh.faces, mesh.vertex_count))
     if len(lone):
@@ -114,6 +114,7 @@ def build_cluster(
     proxies: int,
     roots: int,
     twin: Ints | None = None,
+    measure: Measure = distances,
     placed: Callable[[], object] = lambda: None,
 ) -> Cluster:
     """Sample `proxies` vertices of a loose piece and connect them to the character's joints.
@@ -127,6 +128,7 @@ def build_cluster(
         parents: parents of the character's joints, shape (J,).
         twin: of each vertex of a symmetric piece, its image among these: proxies are symmetric too then, and may be
             one fewer, shape (M,).
+        measure: of the distance between proxies.
         placed: called after each proxy.
     """
     inside = np.zeros(mesh.vertex_count, dtype=bool)
@@ -139,10 +141,12 @@ def build_cluster(
     samples: Ints
     mates: Ints
     if twin is None or proxies == 1:
-        samples, spread = farthest_points(points, faces, int(first.argmin()), proxies, sampled=placed)
+        samples, spread = farthest_points(
+            points, faces, int(first.argmin()), proxies, measure=measure, sampled=placed
+        )
         mates = np.arange(len(samples))
     else:
-        samples, spread = mirrored_points(points, faces, twin, first, proxies, placed)
+        samples, spread = mirrored_points(points, faces, twin, first, proxies, measure, placed)
         mates = mates_of(samples, twin)
     order, above = hierarchy(spread, samples, seam.distance[vertices], at_seam, edges(faces), roots, mates)
     joint = carrying_joint(body_weights[seam.nearest[vertices[at_seam]]].sum(axis=0), parents)

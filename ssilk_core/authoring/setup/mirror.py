@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...scene.assets import Floats, Ints, Mesh
-from ...scene.mesh.geodesic import distances
+from ...scene.mesh.geodesic import Measure
 from ...scene.mesh.topology import edge_use, edges
 
 SAME = 1e-5  # [m] between a vertex and the image of its twin
@@ -96,13 +96,20 @@ def find_mirror(mesh: Mesh, pieces: Ints, hosts: Ints) -> Mirror | None:
 
 
 def mirrored_points(
-    points: Floats, faces: Ints, twin: Ints, first: Floats, count: int, placed: Callable[[], object]
+    points: Floats,
+    faces: Ints,
+    twin: Ints,
+    first: Floats,
+    count: int,
+    measure: Measure,
+    placed: Callable[[], object],
 ) -> tuple[Ints, Floats]:
     """Sample vertices by farthest-point sampling, in pairs of twins and in the plane.
 
     Args:
         first: where to begin: the vertex with the lowest value, one in the plane if any has a finite one, shape (V,).
         count: how many are wanted; one fewer is sampled where the last has no place in the plane.
+        measure: of the distance of vertices to sources.
         placed: called after each sample.
 
     Returns:
@@ -111,12 +118,12 @@ def mirrored_points(
     numbers = np.arange(len(points))
     pairs, within, paired = edges(faces), twin == numbers, twin[twin] == numbers
     crossing = np.unique(pairs[twin[pairs[:, 0]] == pairs[:, 1]])
-    to_plane = distances(points, faces, np.union1d(np.flatnonzero(within), crossing))
+    to_plane = measure(points, faces, np.union1d(np.flatnonzero(within), crossing))
     samples: list[int] = []
     rows: list[Floats] = []
 
     def add(vertex: int) -> None:
-        row = distances(points, faces, np.array([vertex]))
+        row = measure(points, faces, np.array([vertex]))
         both = (
             [(vertex, (row + row[twin]) / 2)] if within[vertex] else [(vertex, row), (int(twin[vertex]), row[twin])]
         )

@@ -13,6 +13,7 @@ from ... import events
 from ...errors import fail
 from ...scene.assets import LOOSE, Character, Floats, Garment, Ints, Mesh, ProxyRig, SkinWeights
 from ...scene.kinematics import rigid
+from ...scene.mesh.geodesic import Measure, distances, distances_along_edges
 from ...scene.mesh.topology import vertex_areas, vertex_normals
 from .clusters import (
     Cluster,
@@ -40,6 +41,8 @@ class RigOptions:
         roots_per_cluster: number of proxies of a cluster whose parent is a character joint (the paper's j).
         influences: largest number of proxies per vertex.
         seam_blend: whether loose vertices near the seam keep a share of the body's weights.
+        exact: whether distances along the cloth are exact; else they run along edges. As many are placed then, on the
+            same pieces, but not at the same vertices.
     """
 
     proxies: int = 20
@@ -47,6 +50,7 @@ class RigOptions:
     roots_per_cluster: int = 4
     influences: int = 4
     seam_blend: bool = True
+    exact: bool = True
 
     def __post_init__(self) -> None:
         for name, least in (("proxies", 0), ("max_proxies", 1), ("roots_per_cluster", 1), ("influences", 1)):
@@ -98,13 +102,14 @@ def build_rig(
     if options.proxies == 0 or not loose.any():
         return ProxyRig(garment.mesh.path, (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), garment.skin)
     body_weights = garment.skin.dense(character.skeleton.joint_count)
-    seam = find_seam(joined, loose)
+    measure = distances if options.exact else distances_along_edges
+    seam = find_seam(joined, loose, measure)
     pieces, piece_of = find_pieces(joined, loose), np.full(joined.vertex_count, -1)
     for number, piece in enumerate(pieces):
         piece_of[piece] = number
     mirror = find_mirror(garment.mesh, piece_of, hosts.carry(np.arange(joined.vertex_count)))
     images = np.arange(len(pieces)) if mirror is None else piece_of[mirror.twin[[piece[0] for piece in pieces]]]
-    clusters = _clusters(character, joined, pieces, images, body_weights, seam, options, mirror, report)
+    clusters = _clusters(character, joined, pieces, images, body_weights, seam, measure, options, mirror, report)
     weights = proxy_weights(
         joined,
         loose,
@@ -127,6 +132,7 @@ def _clusters(
     images: Ints,
     body_weights: Floats,
     seam: Seam,
+    measure: Measure,
     options: RigOptions,
     mirror: Mirror | None,
     report: events.Reporter,
@@ -157,6 +163,7 @@ def _clusters(
             proxies=int(shares[number]),
             roots=roots,
             twin=twin,
+            measure=measure,
             placed=placed,
         )
     return list(clusters.values())

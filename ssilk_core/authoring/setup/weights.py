@@ -71,8 +71,8 @@ def transfer_weights(
         cloth = mesh.points[first[held]], areas[held], _among(pairs, held, len(first))
         if len(held):
             weights[held] = bind_to_skin(character, *cloth, (copied + weights)[held] / 2, options.influences)
-        for _ in range(options.tight_rounds, options.loose_rounds if loose.any() else 0):
-            weights[loose] = smooth(weights, pairs, 1)[loose]
+        if loose.any():
+            weights = smooth(weights, pairs, options.loose_rounds - options.tight_rounds, loose)
     movable = None if classes is None else np.asarray(classes) == LOOSE
     return SkinWeights.from_dense(mesh.path, Hosts.of(mesh).blend(weights[place], movable), options.influences)
 

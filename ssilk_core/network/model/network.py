@@ -13,7 +13,6 @@ from ...errors import fail
 from ...scene.assets import Deformer, Floats, GarmentPose, Motion, Scene, SkinWeights
 from ...scene.family import DressedFamily
 from ...scene.kinematics import ProxyAxes
-from ..descriptors import descriptor_joints
 from ..parameters import descriptor_sizes
 from ..proximity import PLANE, proximity_size, proximity_vertices, sees_at
 from ..settings import ModelConfig
@@ -247,21 +246,3 @@ class GarmentModel(nn.Module):
             torch.as_tensor(activation, dtype=torch.float32, device=parameter.device),
             torch.as_tensor(transforms.transpose(1, 2, 3, 0), dtype=torch.float32, device=parameter.device),
         )
-
-
-def model_joints(scene: Scene, colliding: Floats) -> np.ndarray:
-    """Return the joints for a garment's descriptors: those that it is skinned to, or that move body parts in reach.
-
-    Args:
-        scene: character, garment and rig.
-        colliding: flag of each joint that moves a reachable body vertex, shape (J,).
-    """
-    skeleton = scene.character.skeleton
-    used = np.array(colliding, dtype=bool)
-    for skin in (scene.rig.skin, scene.lbs_skin):
-        indices = skin.indices[skin.weights > 0]
-        used[indices[indices < skeleton.joint_count]] = True
-    for parent in scene.rig.parents:
-        if parent < skeleton.joint_count:
-            used[parent] = True
-    return descriptor_joints(skeleton, used)

@@ -27,6 +27,7 @@ ONE, TWO, HALF = np.float32(1), np.float32(2), np.float32(0.5)
 LARGEST = np.float32(88)  # of an exponent whose exponential is finite
 PER_LN2, LN2, LN2_REST = np.float32(1 / np.log(2)), np.float32(0.693359375), np.float32(np.log(2) - 0.693359375)
 C2, C3, C4, C5, C6, C7 = (np.float32(1 / np.prod(np.arange(1.0, n + 1))) for n in range(2, 8))
+LANES = 8  # frames that are skinned at once, in one vector register
 SAME = 1e-6  # of a row's largest entry: by how much integers times their scale may miss it, which is rounding
 
 
@@ -47,11 +48,11 @@ def matrices(layers: list[Layer]) -> tuple[tuple[NDArray, ...], ...]:
 
 
 def rig_arrays(rig: PointRig) -> tuple[Any, ...]:
-    """Return order, parents, scales and identity of what D gives, its reach, pivots, weights, shapes and rest."""
+    """Return order, parents, scales and identity of what D gives, reach, pivots, weights, shapes, ones and rest."""
     decoder = rig.decoder
     above = rig.rounds[0][1] if rig.rounds else rig.order
     ends = as_float32(decoder.scale[:, 0]), as_float32(decoder.identity[:, 0]), decoder.reach
-    return rig.order, above, *ends, rig.pivots, rig.of_proxies, rig.shapes, rig.rest
+    return rig.order, above, *ends, rig.pivots, rig.of_proxies, rig.shapes, np.ones_like(rig.rest), rig.rest
 
 
 @compiled
@@ -92,9 +93,10 @@ def _product(given, weights, scales, added, out):
     for i in range(0, whole, 4):
         a, b, c, d = given[i], given[i + 1], given[i + 2], given[i + 3]
         for o in range(outputs):
-            one = a * np.float32(weights[i, o]) + b * np.float32(weights[i + 1, o])
-            other = c * np.float32(weights[i + 2, o]) + d * np.float32(weights[i + 3, o])
-            out[o] += one + other
+            total = out[o] + a * np.float32(weights[i, o])  # one instruction for each product and sum
+            total = total + b * np.float32(weights[i + 1, o])
+            total = total + c * np.float32(weights[i + 2, o])
+            out[o] = total + d * np.float32(weights[i + 3, o])
     for i in range(whole, inputs):
         for o in range(outputs):
             out[o] += given[i] * np.float32(weights[i, o])
@@ -134,7 +136,7 @@ def _place(outputs, rig, anchors, affine, powers, work, points):
         rig: a `PointRig`, as `rig_arrays` has it.
         anchors, affine: of the frame, as `TwoFrames.points` has them, shapes (3, 4, A) and (3, 4, M).
     """
-    order, above, scale, identity, reach, pivots, of_proxies, shapes, rest = rig
+    order, above, scale, identity, reach, pivots, of_proxies, shapes, ones, rest = rig
     size, count, kept = len(scale), anchors.shape[2], points.shape[1]
     own, placed, shaped, active, doubled = work
     for place in range(12):
@@ -174,11 +176,7 @@ def _place(outputs, rig, anchors, affine, powers, work, points):
     for k in range(first):
         doubled[k] = outputs[k]
     _tanh(doubled, powers[:first], ONE, active)
-    for n in range(len(rest)):
-        shaped[n] = rest[n]
-    for k in range(first):
-        for n in range(len(rest)):
-            shaped[n] += active[k] * shapes[k, n]
+    _product(active, shapes, ones, rest, shaped)
     for axis in range(3):
         for m in range(kept):
             points[axis, m] = affine[axis, 0, m]
@@ -322,31 +320,45 @@ class SparseSkin:
         """Return vertices in world space [m], shape (F, V, 3), as `skin_garment` does."""
         frames, count = len(origins), len(self.counts)
         active = as_float32(np.vstack([activations, np.ones((1, frames), np.float32)]))
-        blended, found = as_float32(matrices).reshape(len(matrices), -1), np.empty((frames, count, 3))
+        packed, found = _packed(matrices), np.empty((frames, count, 3))
         for start in range(0, count, TILE):  # whose points stay in the cache
             points = self.shapes[3 * start : 3 * (start + TILE)] @ active
-            _skin(points, blended, self.joints, self.weights, self.counts, origins, start, found)
+            _skin(points, packed, self.joints, self.weights, self.counts, origins, start, found)
         return found
+
+
+def _packed(matrices: NDArray) -> NDArray:
+    """Return matrices (J, 3, 4, F) by `LANES` frames, zero behind the last one, shape (blocks, J, 12 LANES)."""
+    joints, frames = len(matrices), matrices.shape[3]
+    packed = np.zeros((-(-frames // LANES) * LANES, joints, 12), np.float32)
+    packed[:frames] = matrices.reshape(joints, 12, frames).transpose(2, 0, 1)
+    return as_float32(packed.reshape(-1, LANES, joints, 12).transpose(0, 2, 3, 1)).reshape(-1, joints, 12 * LANES)
 
 
 @compiled
 def _skin(points, matrices, joints, weights, counts, origins, start, found):
-    """Write points (3 T, F), moved by matrices (J, 12 F) and origins (F, 3), into (F, V, 3) from `start` on."""
+    """Write points (3 T, F), moved by matrices as `_packed` has them and origins (F, 3), into (F, V, 3) from `start`.
+
+    The matrices of a block of frames stay in the nearest cache.
+    """
     frames = len(origins)
-    blend, out = np.empty(12 * frames, np.float32), np.empty((3, frames), np.float32)
-    for t in range(len(points) // 3):
-        v = start + t
-        blend[:] = np.float32(0)
-        for entry in range(counts[v]):
-            joint, weight = joints[v, entry], weights[v, entry]
-            for n in range(12 * frames):
-                blend[n] += weight * matrices[joint, n]
-        for axis in range(3):
-            at = 4 * axis * frames
-            for n in range(frames):
-                x, y, z = blend[at + n], blend[at + frames + n], blend[at + 2 * frames + n]
-                moved = x * points[3 * t, n] + y * points[3 * t + 1, n] + z * points[3 * t + 2, n]
-                out[axis, n] = moved + blend[at + 3 * frames + n]
-        for n in range(frames):
+    blend, out = np.empty(12 * LANES, np.float32), np.empty((3, LANES), np.float32)
+    for block in range(len(matrices)):
+        first, turn = block * LANES, matrices[block]
+        here = min(LANES, frames - first)
+        for t in range(len(points) // 3):
+            v = start + t
+            blend[:] = np.float32(0)
+            for entry in range(counts[v]):
+                weight, row = weights[v, entry], turn[joints[v, entry]]
+                for n in range(12 * LANES):
+                    blend[n] += weight * row[n]
             for axis in range(3):
-                found[n, v, axis] = out[axis, n] + origins[n, axis]
+                at = 4 * axis * LANES
+                for n in range(here):
+                    x, y, z = blend[at + n], blend[at + LANES + n], blend[at + 2 * LANES + n]
+                    p, q, r = points[3 * t, first + n], points[3 * t + 1, first + n], points[3 * t + 2, first + n]
+                    out[axis, n] = x * p + y * q + z * r + blend[at + 3 * LANES + n]
+            for n in range(here):
+                for axis in range(3):
+                    found[first + n, v, axis] = out[axis, n] + origins[first + n, axis]

@@ -3,8 +3,9 @@
 
 Positions have the shape (V, 3, N): vertices, coordinates, frames. A garment meets the body in this order:
 
-1. `reach`: once, the part of the body that the garment can touch; `body` poses that part in each frame.
-2. `samples`: once, the points of the cloth at which it meets the body, each with the area that it stands for.
+1. `physics.reach`: once, the part of the body that the garment can touch; `body` poses that part in each frame.
+2. `physics.samples`: once, the points of the cloth at which it meets the body, each with the area that it stands
+   for; `sampled_cloth` has their positions.
 3. `contacts`: each sample asks for the plane that it can touch: loose cloth the whole body, tight cloth the patch
    beneath it (`patches`).
 4. `distance` answers: the nearest vertex (`nearest_vertex`), then the nearest point on the triangles around it
@@ -23,7 +24,6 @@ from .contacts import Contacts
 from .distance import Patches, PosedBody, nearest_planes, signed_distance, signed_distance_to_planes, smoothed_planes
 from .limb_axes import LimbAxes, PosedLimbs, limb_axes
 from .ray_casting import RayCaster, RayHits
-from .reach import ReachableBody, reachable_body, reachable_cloth
 from .smoothed_distance import SmoothedDistance
 
 __all__ = [
@@ -35,12 +35,9 @@ __all__ = [
     "PosedLimbs",
     "RayCaster",
     "RayHits",
-    "ReachableBody",
     "SmoothedDistance",
     "limb_axes",
     "nearest_planes",
-    "reachable_body",
-    "reachable_cloth",
     "signed_distance",
     "signed_distance_to_planes",
     "smoothed_planes",

@@ -23,13 +23,13 @@ from ...scene.assets import PINNED, TIGHT, Ints, Scene
 from ...scene.mesh import topology
 from ...scene.mesh.blocks import compact_blocks
 from .. import kernels
+from ..samples import ContactSamples
 from .closest_point import closest_on_faces
 from .distance import MAX_DEPTH, Patches, PosedBody, nearest_planes, signed_distance_to_planes, smoothed_planes
 from .limb_axes import loose_faces
 from .nearest_vertex import GARMENT_BLOCK
 from .patches import faces_around, patches_beneath
 from .pierced import PiercedCloth, Piercing
-from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 
 NO_CONTACT_DISTANCE = 1e6  # [m]

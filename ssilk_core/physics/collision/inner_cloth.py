@@ -32,11 +32,11 @@ from ...scene.mesh.blocks import compact_blocks
 from .. import kernels
 from ..framed import Framed
 from ..operators import SparseOperator
+from ..samples import ContactSamples
 from .closest_point import triangle_patches
 from .contacts import NO_CONTACT_DISTANCE, no_planes
 from .distance import PosedBody, nearest_planes, signed_distance_to_planes, smoothed_planes
 from .nearest_vertex import BODY_GROUP, GARMENT_BLOCK
-from .samples import ContactSamples
 from .smoothed_distance import SmoothedDistance
 
 DEEPEST = 0.05  # [m] beneath inner cloth, up to which a sample is pushed out

@@ -23,9 +23,9 @@ from torch import Tensor
 from ...scene.assets import LOOSE, Scene
 from .. import kernels, loops
 from ..framed import Framed
+from ..samples import ContactSamples
 from .limb_axes import MIN_LENGTH, PosedLimbs, along_paths, loose_faces
 from .ray_casting import EDGE_TOLERANCE, RayCaster
-from .samples import ContactSamples
 
 # A tenth of a metre counts as 20 mm of depth. With a quarter of that, solver iterations did not free most hands.
 SLOPE = 0.2

@@ -10,16 +10,18 @@ from torch import Tensor
 from ...scene.assets import LOOSE, TIGHT, Floats, Ints, Mesh
 from ...scene.fabrics import Fabric
 from ...scene.mesh import topology
+from ...scene.mesh.stitches import held_stitches
 from ...scene.mesh.topology import SLIVER
 from .. import kernels, loops
 from ..collision import PosedBody, signed_distance, signed_distance_to_planes
-from ..collision.samples import ContactSamples, SampledCloth, contact_samples
+from ..collision.sampled_cloth import SampledCloth
 from ..kernels.corners import elastic_tables
 from ..operators import difference_operator
+from ..samples import ContactSamples, contact_samples
 from .bending import bending_energy, dihedral_angles
 from .collision import ContactLaw
 from .factors import FabricFactors
-from .stitching import Stitching, held_stitches
+from .stitching import Stitching
 from .stretch import column_weights, deformation_gradient_operator, stiffened, stretch_density, stretched_areas
 
 TERMS = ("stretch", "bending", "gravity", "inertia", "collision", "tether", "stitch")

@@ -19,25 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...scene.assets import PINNED, Floats, Ints, Mesh
-from ...scene.fabrics import Fabric
-from ...scene.mesh.stitches import NONE, Stitches, find_stitches
+from ...scene.assets import Floats, Ints, Mesh
+from ...scene.mesh.stitches import Stitches
 from .. import kernels
 from ..operators import Entries, SparseOperator
 from .bending import cross
 
 FADING = 1e-3  # of the rest normal's length
-
-
-def held_stitches(mesh: Mesh, fabric: Fabric, classes: Ints | None) -> Stitches:
-    """Return the stitches of a garment, without those between pinned vertices alone, which hold anyway."""
-    if not fabric.stitch:
-        return NONE
-    found = find_stitches(mesh)
-    if classes is None:
-        return found
-    moves = np.column_stack([found.vertices, found.corners])
-    return found.select((classes[moves] != PINNED).any(axis=1))
 
 
 class Stitching:

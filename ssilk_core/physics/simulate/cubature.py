@@ -20,9 +20,11 @@ from torch import Tensor
 
 from ...scene.assets import Floats, Ints, Mesh, Scene, SkinWeights
 from ...scene.mesh import topology
+from ...scene.mesh.stitches import held_stitches
 from ..collision import Contacts
-from ..collision.samples import SampledCloth, vertex_samples
-from ..energy.stitching import Stitching, held_stitches
+from ..collision.sampled_cloth import SampledCloth
+from ..energy.stitching import Stitching
+from ..samples import vertex_samples
 from .hessian import Hessian
 from .hinges import Hinges
 from .incremental_potential import IncrementalPotential

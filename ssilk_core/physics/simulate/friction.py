@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..collision.samples import SampledCloth
+from ..collision.sampled_cloth import SampledCloth
 from ..energy.collision import ContactLaw
 from ..framed import consecutive
 from ..self_contact import ClothContacts

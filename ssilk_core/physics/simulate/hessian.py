@@ -14,10 +14,10 @@ from torch import Tensor
 from ...scene.assets import PINNED, Ints, Scene
 from ...scene.mesh import topology
 from .. import loops
-from ..collision.samples import ContactSamples
 from ..energy import GarmentEnergy
 from ..energy.stitching import Stitching
 from ..operators import SparseOperator
+from ..samples import ContactSamples
 from .blocks import BlockMatrix, BlockPattern
 from .hinges import Hinges
 from .membrane import Membrane, outer

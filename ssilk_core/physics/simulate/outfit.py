@@ -24,7 +24,8 @@ from ...scene.fabrics import Fabric
 from ..collision import PosedBody, SmoothedDistance
 from ..collision.limb_axes import outfit_axes
 from ..collision.pierced import PiercedOutfit
-from ..collision.samples import ContactSamples, SampledCloth
+from ..collision.sampled_cloth import SampledCloth
+from ..samples import ContactSamples
 from ..self_contact import ClothNeighbours, SelfContact, TouchingCloth
 from ..world.surroundings import PosedWorld
 from .blocks import BlockMatrix, BlockPattern

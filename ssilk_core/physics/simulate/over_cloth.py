@@ -21,7 +21,8 @@ from ...scene.fabrics import Fabric
 from ..collision import SmoothedDistance
 from ..collision.contacts import no_planes
 from ..collision.inner_cloth import InnerCloth, InnerSurface, PosedBeneath
-from ..collision.samples import ContactSamples, SampledCloth
+from ..collision.sampled_cloth import SampledCloth
+from ..samples import ContactSamples
 from .hessian import Hessian
 from .incremental_potential import IncrementalPotential, StepInputs
 

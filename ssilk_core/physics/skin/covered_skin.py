@@ -24,7 +24,7 @@ from ...scene.assets import Scene, SkinWeights
 from ..collision import limb_axes
 from ..collision.limb_axes import LimbPoser
 from ..collision.pierced import Piercing
-from ..collision.samples import vertex_samples
+from ..samples import vertex_samples
 from ..skinning import Skinning
 from .covered_points import SKIN_POINTS, CoveredPoints, SkinStates
 from .figures import ShownSkin

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..assets import Floats, Ints, Mesh
+from ..assets import PINNED, Floats, Ints, Mesh
+from ..fabrics import Fabric
 from .topology import SLIVER, components, edges, islands, vertex_normals
 
 TOUCH = 0.005  # [m] between islands that lie on one another: thick cloth, and what modelling leaves
@@ -111,6 +112,17 @@ def find_stitches(mesh: Mesh) -> Stitches:
     """Return what lies on another island at rest: the feet within `TOUCH`, or `SAGITTA` of a long edge."""
     feet = find_feet(mesh)
     return touching(mesh, feet, find_carried(mesh, feet))
+
+
+def held_stitches(mesh: Mesh, fabric: Fabric, classes: Ints | None) -> Stitches:
+    """Return the stitches of a garment, without those between pinned vertices alone, which hold anyway."""
+    if not fabric.stitch:
+        return NONE
+    found = find_stitches(mesh)
+    if classes is None:
+        return found
+    moves = np.column_stack([found.vertices, found.corners])
+    return found.select((classes[moves] != PINNED).any(axis=1))
 
 
 def touching(mesh: Mesh, feet: Stitches, carried: Stitches) -> Stitches:

@@ -125,10 +125,11 @@ def components(pairs: Ints, vertex_count: int) -> NDArray[np.int64]:
         label = merged
 
 
-def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
+def smooth(values: Floats, pairs: Ints, rounds: int, free: NDArray[np.bool_] | None = None) -> Floats:
     """Average each row of `values` (V, N) with those of its neighbours, `rounds` times.
 
-    `pairs` (E, 2) are undirected edges. A vertex counts as its own neighbour. Constants are preserved.
+    `pairs` (E, 2) are undirected edges. A vertex counts as its own neighbour. Constants are preserved. Where `free`
+    (V,) is given, the other rows stay.
     """
     count = len(values)
     heads, tails = np.concatenate([pairs, pairs[:, ::-1]]).T
@@ -141,7 +142,8 @@ def smooth(values: Floats, pairs: Ints, rounds: int) -> Floats:
         total = result.copy()
         if len(owners):
             total[owners] += np.add.reduceat(result[tails], starts, axis=0)
-        result = total * share[:, None]
+        averaged = total * share[:, None]
+        result = averaged if free is None else np.where(free[:, None], averaged, result)
     return result
 
 

@@ -299,6 +299,9 @@ def test_prepare_fills_what_is_missing_and_says_so(trunk):
     garment = Garment(tube([0.16, 0.16, 0.5], [1.1, 0.95, 0.4]))
     scene = prepare_scene(trunk, garment, rig_options=RigOptions(proxies=6), report=said.append)
     assert scene.rig.proxy_count == 6
+    rough = prepare_scene(trunk, garment, rig_options=RigOptions(proxies=6), rough=True)
+    assert rough.rig.proxy_count == 6
+    np.testing.assert_array_equal(rough.classes, scene.classes)
     text = " ".join(event.text for event in said if isinstance(event, events.Message))
     assert all(word in text for word in ("no vertex classes", "no skinning weights", "no proxy joints"))
 

@@ -260,6 +260,10 @@ def test_proxies_of_a_symmetric_garment_are_symmetric(character, options, proxie
     mates = np.array([leaves.index(leaf) for leaf in flipped])
     assert rig.proxy_count >= proxies - 1 and (mates[mates] == np.arange(len(mates))).all()
     np.testing.assert_allclose(places[mates], mirrored(places), atol=1e-9)
+    rough = build_rig(character, garment, RigOptions(proxies=proxies, exact=False))
+    assert rough.proxy_count == rig.proxy_count
+    hinges, joints = ({*each.parents[each.parents < len(JOINTS)]} for each in (rough, rig))
+    assert hinges == joints
     for leaf, place in zip(leaves, places):
         assert leaf.endswith({-1: "_L", 0: tuple("0123456789"), 1: "_R"}[int(np.sign(np.round(place[0] - 0.5, 6)))])
     turns = rig.bind_transforms[:, :3, :3]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.network.model.network import GarmentModel, mlp, model_joints
+from ssilk_core.network.descriptors import model_joints
+from ssilk_core.network.model.network import GarmentModel, mlp
 from ssilk_core.network.parameters import descriptor_sizes, parameter_shapes
 from ssilk_core.network.schemes import SCHEMES
 from ssilk_core.network.settings import ModelConfig

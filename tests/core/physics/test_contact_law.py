@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from ssilk_core.physics.collision.samples import MAX_SPACING, SampledCloth, contact_samples
+from ssilk_core.physics.collision.sampled_cloth import SampledCloth
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.physics.energy.collision import ContactLaw
+from ssilk_core.physics.samples import MAX_SPACING, contact_samples
 from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Mesh
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 from ssilk_core.scene.mesh.topology import subdivision_middles

@@ -21,7 +21,7 @@ from ssilk_core.physics.collision import (
 )
 from ssilk_core.physics.collision.one_ring import triangle_rings
 from ssilk_core.physics.collision.patches import faces_around, patches_beneath
-from ssilk_core.physics.collision.samples import vertex_samples
+from ssilk_core.physics.samples import vertex_samples
 from ssilk_core.scene.assets import LOOSE, PINNED, TIGHT, Body, Character, Mesh, Scene, SkinWeights
 
 CPU = torch.device("cpu")

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from ssilk_core.physics import kernels, loops
-from ssilk_core.physics.collision.samples import contact_samples
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.physics.energy.factors import FabricFactors
 from ssilk_core.physics.energy.graded import GradedRest
+from ssilk_core.physics.samples import contact_samples
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import FABRICS, Fabric
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from ssilk_core.physics.collision import PosedBody
-from ssilk_core.physics.collision.samples import MAX_DIVISIONS, MAX_SPACING
 from ssilk_core.physics.energy import GarmentEnergy
+from ssilk_core.physics.samples import MAX_DIVISIONS, MAX_SPACING
 from ssilk_core.scene.assets import LOOSE, TIGHT, Mesh
 from ssilk_core.scene.fabrics import Fabric
 

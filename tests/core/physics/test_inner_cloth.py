@@ -8,11 +8,12 @@ import pytest
 import torch
 import trimesh
 
-from ssilk_core.physics.collision import nearest_planes, reachable_cloth
+from ssilk_core.physics.collision import nearest_planes
 from ssilk_core.physics.collision.contacts import no_planes
 from ssilk_core.physics.collision.inner_cloth import DEEPEST, InnerCloth, turned_away
-from ssilk_core.physics.collision.samples import vertex_samples
 from ssilk_core.physics.energy.collision import ContactLaw
+from ssilk_core.physics.reach import reachable_cloth
+from ssilk_core.physics.samples import vertex_samples
 from ssilk_core.scene.assets import Mesh
 from ssilk_core.scene.fabrics import Fabric
 

@@ -15,7 +15,7 @@ from ssilk_core.physics.collision import CollisionBody, Contacts, RayCaster, lim
 from ssilk_core.physics.collision.limb_axes import MAX_RADIUS, LimbPoser, body_axes, inside
 from ssilk_core.physics.collision.pierced import MARGIN, SLOPE, Piercing
 from ssilk_core.physics.collision.ray_casting import EDGE_TOLERANCE
-from ssilk_core.physics.collision.samples import vertex_samples
+from ssilk_core.physics.samples import vertex_samples
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.skin.covered_skin import CoveredSkin, ShownCounts
 from ssilk_core.scene.assets import LOOSE, TIGHT, Body, Character, Mesh, Motion, Scene, Skeleton, SkinWeights

@@ -11,9 +11,9 @@ import torch
 
 from ssilk_core.authoring.setup.hosts import need_stitch
 from ssilk_core.errors import SsilkError
-from ssilk_core.physics.collision import reachable_body
 from ssilk_core.physics.energy import GarmentEnergy
 from ssilk_core.physics.energy.stitching import Stitching
+from ssilk_core.physics.reach import reachable_body
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.scene.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, SkinWeights

@@ -81,5 +81,7 @@ def test_smoothing_is_the_mean_with_neighbours_and_keeps_lone_rows(sphere):
     chain = np.array([[0, 1], [1, 2]])
     np.testing.assert_allclose(topology.smooth(values, chain, 1), [[1.5], [3.0], [4.5], [5.0]])
     np.testing.assert_array_equal(topology.smooth(values, chain, 0), values)
+    free = np.array([True, False, True, True])
+    np.testing.assert_allclose(topology.smooth(values, chain, 2, free), [[2.25], [3.0], [3.75], [5.0]])
     flat = topology.smooth(np.ones((len(sphere.vertices), 2)), topology.edges(sphere.faces), 20)
     np.testing.assert_allclose(flat, 1)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from math import inf
 
@@ -98,6 +99,10 @@ def test_the_default_preset_follows_the_device(monkeypatch):
     assert default_preset("cpu") == "draft"
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert default_preset("auto") == "preview"
+    with monkeypatch.context() as unloaded:
+        unloaded.delitem(sys.modules, "torch")
+        unloaded.setattr("importlib.metadata.version", lambda name: "2.13.0+cpu")
+        assert default_preset("auto") == "draft" and "torch" not in sys.modules
     words = ["train", "hero.usda", "--motions", "walks", "-o", "cape.safetensors", "--device", "cpu"]
     for more, size in ((), PRESETS["draft"]), (("--preset", "preview"), PRESETS["preview"]):
         assert configured(parser().parse_args([*words, *more])) == (size.model, size.train)

@@ -102,6 +102,7 @@ def _asked(request: bytes) -> int:
         try:
             server.stdin.write(request)
             server.stdin.flush()
+            import_module("pxr.UsdSkel")  # meanwhile: whoever has tried it reads it next
             answer = server.stdout.readline()
         except BrokenPipeError:
             continue

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene, SkinWeights
-from ...scene.kinematics import motion_transforms, skin_points, skinning_matrices
-from ...scene.mesh import topology
-from ...scene.mesh.geodesic import edge_graph
-from ...scene.mesh.stitches import find_stitches, joined_mesh
+from ..scene.assets import LOOSE, TIGHT, Floats, Ints, Motion, Scene, SkinWeights
+from ..scene.kinematics import motion_transforms, skin_points, skinning_matrices
+from ..scene.mesh import topology
+from ..scene.mesh.geodesic import edge_graph
+from ..scene.mesh.stitches import find_stitches, joined_mesh
 
 REACH_MARGIN = 0.08  # [m]; allowance for blendshapes and stretch
 SAMPLED_POSES = 200
