@@ -183,15 +183,16 @@ class _Sight:
     def along(self, starts: Floats, directions: Floats, low: float, high: Floats | float) -> tuple[Ints, Floats]:
         """Return a triangle that each ray (R, 3) meets from `low` to `high` [m], and where, as `BlockedRays.find`."""
         count = len(starts)
-        part = (np.broadcast_to(np.float32(reach), count) for reach in (low, high))
         start, direction = (starts - self._origin).astype(np.float32), directions.astype(np.float32)
-        return self._rays.find(self._points, start, direction, *part, np.full(count, NO_TRIANGLE))
+        least, most = np.full(count, low, np.float32), np.full(count, high, np.float32)
+        return self._rays.find(self._points, start, direction, least, most, np.full(count, NO_TRIANGLE))
 
     def is_narrow(self, middles: Floats, normals: Floats, thickness: Floats) -> bool:
         """Return whether most points (R, 3) midway between layers have a side as near as the layers are apart."""
         first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
         first /= np.linalg.norm(first, axis=1, keepdims=True)
-        sides = [sign * axis for axis in (first, np.cross(normals, first)) for sign in (-1, 1)]
+        second = np.cross(normals, first)
+        sides: list[Floats] = [first, second, -first, -second]
         met = [self.along(middles, side, 0.0, thickness)[0] != NO_TRIANGLE for side in sides]
         return bool(np.any(met, axis=0).mean() > 0.5)
 
