@@ -18,7 +18,7 @@ from .decoder import NumpyDecoder
 from .deformer import deformer
 from .feedback import ClothPoints
 from .kinematics import ProxyKinematics
-from .networks import evaluate, layers
+from .networks import Layer, evaluate, layers
 from .skinning import tiles
 from .stepper import NumpyStepper, SoftClamp, SpringStepper, VerletStepper, diverged
 
@@ -70,8 +70,13 @@ class NumpyGarment:
         return deformer(self.file)
 
     def quasi_static(self, static: NDArray) -> NDArray:
-        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
-        rest = np.ascontiguousarray(evaluate(self.initialiser, static.T).T)
+        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1).
+
+        Proximity, which comes first in these, may be left out where nothing is near.
+        """
+        first, *others = self.initialiser
+        network = [Layer(first.rows[-1 - static.shape[1] :]), *others]
+        rest = np.ascontiguousarray(evaluate(network, static.T).T)
         SoftClamp(self.file.config.latent_bound, rest.shape)(rest)
         rest[diverged(rest)] = 0
         return rest
