@@ -52,11 +52,15 @@ class NumpyGarment:
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
-        self.stepper: NumpyStepper[Any] | None = None
-        if stepper := STEPPERS[config.scheme]:
-            points = ClothPoints(file, self.decoder)
-            sizes = descriptor_sizes(scene, file.joints, config)
-            self.stepper = stepper(config, file.parameters, *sizes, points)
+
+    @cached_property
+    def stepper(self) -> NumpyStepper[Any] | None:
+        """What takes it from frame to frame; None where each frame is for itself."""
+        file, stepper = self.file, STEPPERS[self.file.config.scheme]
+        if stepper is None:
+            return None
+        sizes = descriptor_sizes(file.scene, file.joints, file.config)
+        return stepper(file.config, file.parameters, *sizes, ClothPoints(file, self.decoder))
 
     @cached_property
     def sparse_skin(self) -> SparseSkin:
