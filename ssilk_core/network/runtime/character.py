@@ -81,9 +81,7 @@ def character_frames(
     return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins, met)
 
 
-def unseeing(
-    motion: Motion, world: Floats, skeleton: Skeleton, joints: NDArray, kind: str = "relative"
-) -> NDArray:
+def unseeing(motion: Motion, world: Floats, skeleton: Skeleton, joints: NDArray, kind: str = "relative") -> NDArray:
     """Return static descriptors of a motion without the proximity of colliders, which comes first, float32 (F, S').
 
     Args:

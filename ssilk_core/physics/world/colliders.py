@@ -156,9 +156,9 @@ class ColliderPoser:
         middle, half = (around.low + around.high)[:, None] / 2, (around.high - around.low)[:, None] / 2
         for collider in world.colliders:
             there = np.array([collider.is_there(world.fps, each) for each in _changing(collider.present, seconds)])
-            placed = np.stack([
-                placed_at(collider.placements, world, each) for each in _changing(collider.placements, seconds)
-            ])
+            placed = np.stack(
+                [placed_at(collider.placements, world, each) for each in _changing(collider.placements, seconds)]
+            )
             placed = np.broadcast_to(placed, (len(seconds), 4, 4))
             turn, place = placed[:, :3, :3], placed[:, None, :3, 3]
             frames = np.flatnonzero(there & ~self._is_far(collider, turn, place[:, 0], near))

@@ -150,9 +150,11 @@ class CollisionSurface:
         on_border[on_edge], on_border[at_vertex] = self._border_edge[edge], self._border_vertex[vertex]
         behind = on_border & (side < 0)
         side[on_border] = 1.0
-        normal = normal * (turned / np.maximum(np.sqrt(_dot(normal, normal)), np.finfo(float).tiny))[:, None]
-        direct = away * (side / np.maximum(length, TOUCHING))[:, None]
-        direction = np.where((length > TOUCHING)[:, None], direct, normal)
+        direction = away * (side / np.maximum(length, TOUCHING))[:, None]
+        if len(touching := np.flatnonzero(length <= TOUCHING)):
+            own = normal[touching]
+            outward = np.broadcast_to(turned, length.shape)[touching]
+            direction[touching] = own * (outward / np.maximum(np.sqrt(_dot(own, own)), np.finfo(float).tiny))[:, None]
         where = self.part.take(face), on_border, behind, self.faces.take(face, axis=0), weights
         return SurfaceDistance(side * length, direction, *where)
 
