@@ -40,7 +40,7 @@ def inspect_list(
     for entry in entries:
         table = tables[entry.name] = entry.located(folder)
         own = _options_of(entry, table, tables, options)
-        own.body = bodies_in_list(entry, entries, folder)
+        own.body = bodies_in_list(entry, entries, folder, report)
         if copy:
             prim = _garment_in(table)[1]
             own.fix = _copy_in(copy.parent, entry.name)

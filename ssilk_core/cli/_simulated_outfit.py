@@ -14,7 +14,7 @@ from ..errors import fail
 from ..events import Message, Reporter
 from ..physics.simulate import WornGarment
 from ..training.wardrobe.listing import WardrobeEntry, read_list
-from .options.bodies import bodies_in_list
+from .options.bodies import left_out_in_list
 from .options.fabric import garment_fabric
 from .options.scene import load_scene
 
@@ -58,7 +58,8 @@ def outfit_options(options: argparse.Namespace) -> dict[str, argparse.Namespace]
             allowed = "an outfit is simulated of the garments of its list"
             fail(f"{path}: table '{entry.name}', key 'over'", f"a model, {models[0]}", allowed, "add its garment")
         found[entry.name] = _options(options, entry, table)
-        found[entry.name].body = bodies_in_list(entry, entries, path.parent)
+        left_out = left_out_in_list(entry, entries, path.parent)  # they are met as garments, all of them
+        found[entry.name].body = [body for bodies in left_out.values() for body in bodies]
     stages = {str(each.stage) for each in found.values()}
     if len({Path(stage).resolve() for stage in stages}) > 1:
         allowed = "garments of an outfit are worn by one character"

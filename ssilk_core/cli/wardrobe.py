@@ -73,7 +73,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     device, slots = _slots(options.device, options.jobs)
     need_writable(options.output / "log")
     entries = read_list(options.list)
-    entries = [_with_bodies(entry, entries, options.list.parent) for entry in entries]
+    entries = [_with_bodies(entry, entries, options.list.parent, report) for entry in entries]
     requests, known = dict[str, str](), dict[str, GarmentTraining]()
     for entry in entries:
         requests[entry.name] = _request(options.parser, entry, options.list, device, requests)
@@ -93,9 +93,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     return max((training.code for training in trainings), key=lambda code: (code not in (EXIT_OK, EXIT_WORSE), code))
 
 
-def _with_bodies(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> WardrobeEntry:
-    """Return an entry whose training names its bodies, where its stage has other garments of the list among them."""
-    bodies = bodies_in_list(entry, entries, folder)
+def _with_bodies(
+    entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path, report: Reporter
+) -> WardrobeEntry:
+    """Return an entry whose training leaves out of its bodies what its stage has of the list's other garments."""
+    bodies = bodies_in_list(entry, entries, folder, report)
     return replace(entry, words=(*entry.words, *(word for body in bodies for word in ("--body", body))))
 
 

@@ -108,13 +108,19 @@ def inner_joints(skeleton: Skeleton, joints: np.ndarray) -> np.ndarray:
 
 
 def pose_features(
-    motion: Motion, skeleton: Skeleton, joints: np.ndarray, world: Floats | None = None, kind: str = "relative"
+    motion: Motion,
+    skeleton: Skeleton,
+    joints: np.ndarray,
+    world: Floats | None = None,
+    kind: str = "relative",
+    moving: bool = True,
 ) -> PoseFeatures:
     """Return the descriptors of every frame of a motion; frames before the first repeat it.
 
     Args:
         world: `motion_transforms` of the motion, if it is already computed.
         kind: of `settings.DESCRIPTORS`.
+        moving: false leaves out what looks back on earlier frames, which P does not see.
     """
     world = motion_transforms(motion, skeleton.parents) if world is None else world
     if skeleton.seen is None:
@@ -132,6 +138,8 @@ def pose_features(
     near = None
     if motion.proximity is not None:
         near = (proximity_vectors(motion.proximity) @ root).reshape(len(local), -1)
+    if not moving:
+        return PoseFeatures(static, static[:, :0], down, down[:, :0], gravity, near)
     if kind == "absolute":
         axes, places = six_d(root), world[:, centre, :3, 3]
         past = [_past(static, steps) for steps in (1, 2)]

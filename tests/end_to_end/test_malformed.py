@@ -231,6 +231,7 @@ STAGES = [
     Case("unknown root", f"{RIG} --root Nobody", ("'Nobody'", "--root")),
     Case("unknown wearer", BAKE.replace("safetensors", "safetensors:/Nobody"), ("'/Nobody'", "MODEL:/ROOT")),
     Case("unknown body", f"{RIG} --body Nobody", ("'Nobody'", "--body")),
+    Case("unknown body to leave out", f"{RIG} --body ^Nobody", ("'Nobody'", "--body")),
     Case("missing body", RIG, ("/Hero", "no skinned body mesh"), without("hero.usda", BODY)),
 ]
 

@@ -17,12 +17,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from pxr import Sdf, Usd
+from pxr import Sdf
 
 from ssilk_core.cli import main, wardrobe
 from ssilk_core.cli.main import parser
+from ssilk_core.cli.options.bodies import read_member
+from ssilk_core.cli.options.scene import read_stage
 from ssilk_core.errors import EXIT_WORSE, SsilkError
-from ssilk_core.events import GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event
+from ssilk_core.events import Event, GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event, silent
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
 from ssilk_core.training.wardrobe.listing import WardrobeEntry, read_list, write_list
@@ -178,20 +180,32 @@ def test_nothing_is_trained_when_an_entry_cannot_be(toy, tmp_path, monkeypatch, 
 
 
 def test_garments_of_a_list_that_a_stage_does_not_mark_are_no_bodies_of_each_other(toy, tmp_path, monkeypatch):
+    """Nor on other bodies of a family, which may lack them or have them elsewhere."""
     monkeypatch.chdir(toy.copy(tmp_path))
-    stage = Usd.Stage.Open("rigged.usda")
-    for name in ("Tights", "Cloak", "Boots"):
-        Sdf.CopySpec(stage.GetRootLayer(), "/Hero/Body", stage.GetRootLayer(), f"/Hero/{name}")
-    stage.GetRootLayer().Export("dressed.usda")
-    text = (
-        '[defaults]\nstage = "dressed.usda"\nmotions = "clip.usda"\n[cloak]\ngarment = "Cloak"\nover = ["tights"]\n'
-    )
-    entries = listed(tmp_path, text + '[tights]\ngarment = "/Hero/Tights"\n[skirt]\ngarment = "Skirt"\n')
+    for file, meshes in (("dressed", "Tights Cloak Boots"), ("heavy", "Clothes/Tights Boots")):
+        Path(f"{file}.usda").write_text(Path("rigged.usda").read_text())
+        layer = Sdf.Layer.FindOrOpen(f"{file}.usda")
+        Sdf.PrimSpec(layer.GetPrimAtPath("/Hero"), "Clothes", Sdf.SpecifierDef, "Xform")
+        assert all(Sdf.CopySpec(layer, "/Hero/Body", layer, f"/Hero/{mesh}") for mesh in meshes.split())
+        layer.Save()
+    text = '[defaults]\nstage = "dressed.usda"\nmotions = "clip.usda"\n'
+    text += '[cloak]\ngarment = "dressed.usda:/Hero/Cloak"\nover = ["tights"]\n'
+    text += '[tights]\ngarment = "/Hero/Tights"\n[skirt]\ngarment = "Skirt"\n'
+    entries, heard = listed(tmp_path, text), list[Event]()
+    worn = {"cloak": ["^/Hero/Tights"], "tights": ["^/Hero/Cloak"], "skirt": ["^/Hero/Tights", "^/Hero/Cloak"]}
+    train = parser(["train"])
     for entry in entries:
-        named = wardrobe._with_bodies(entry, entries, tmp_path).words[len(entry.words) :]
-        assert named == ("--body", "/Hero/Body", "--body", "/Hero/Boots"), entry.name
+        words = wardrobe._with_bodies(entry, entries, tmp_path, heard.append).words
+        options = train.parse_args(["train", *words, "-o", "out.safetensors"])
+        assert options.body == worn[entry.name]
+        for character in (read_stage(options, silent)[0], read_member(options, "heavy.usda", silent)):
+            assert [body.mesh.path.rpartition("/")[2] for body in character.bodies] == ["Body", "Boots"], entry.name
+    assert [event.text.partition(":")[0] for event in heard] == ["skirt does not meet tights, cloak"]
     alone = [entry for entry in entries if entry.name == "cloak"]
-    assert wardrobe._with_bodies(alone[0], alone, tmp_path) == alone[0]
+    assert wardrobe._with_bodies(alone[0], alone, tmp_path, heard.append) == alone[0]
+    every = listed(tmp_path, text + '[boots]\ngarment = "Boots"\n[body]\ngarment = "Body"\n')
+    words = wardrobe._with_bodies(every[0], every, tmp_path, silent).words
+    assert not read_stage(train.parse_args(["train", *words, "-o", "out.safetensors"]), silent)[0].bodies
 
 
 def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypatch):

@@ -141,8 +141,9 @@ def test_a_network_that_sees_colliders_plays_with_the_floor_of_its_shot_and_says
         load_rollout(BakeRequest(model="model.safetensors", stage="rigged.usda", motion="plain.usda")).deformer.scene,
     )
     # Where each point of P's state for the pose alone is, and the floor beneath it.
-    points, reach = RestingPoints(player)(motion), scene.garment.mesh.diagonal
-    roots = motion_transforms(motion, player.skeleton.parents)[:, player.skeleton.hub, :3, 3]
+    joints = motion_transforms(motion, player.skeleton.parents)
+    points, reach = RestingPoints(player)(motion, joints), scene.garment.mesh.diagonal
+    roots = joints[:, player.skeleton.hub, :3, 3]
     up, above = np.tile([0.0, 1.0, 0.0], (points.shape[1], 1)), points[..., 1] - FLOOR
     assert above.max() < reach
     seen = [proximity(own, high, up, root, reach) for own, high, root in zip(points, above, roots)]

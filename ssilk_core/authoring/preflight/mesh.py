@@ -14,6 +14,7 @@ from .finding import Finding, Findings, index_tuple
 SHELL = (2e-4, 0.015)  # [m] between the layers of cloth with thickness
 SHELL_SHARE, SHELL_SPREAD = 0.8, 3.0  # of its faces that have a layer behind them; between thick and thin places
 LARGE = 0.2  # of a garment's area, from which on an island is cloth, and no button
+LOOKED_AT = 1000  # of an island's faces, drawn: their share is known to some hundredths
 BACK_TO_BACK = -0.7  # cosine between the normals of two layers
 
 
@@ -132,27 +133,31 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
 def two_layers(mesh: Mesh) -> Findings:
     """Yield large islands that are shells: nearly everywhere another layer of them is behind, at about one distance.
 
-    Pleats have layers at many distances. Small islands may be buttons and cords, which are solid.
+    Pleats have layers at many distances. Small islands may be buttons, and what is not much wider than thick, such as
+    a cord, is solid.
     """
-    rays = BlockedRays(mesh.points, mesh.faces)
-    corners, origin = mesh.points[mesh.faces], mesh.points.mean(axis=0)
+    look, corners = _Sight(mesh), mesh.points[mesh.faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(flat, axis=1)
     flat /= areas.clip(1e-30)[:, None]
-    points, starts = ((each - origin).astype(np.float32) for each in (mesh.points, corners.mean(axis=1)))
-    count, island = len(mesh.faces), islands(mesh.faces, mesh.vertex_count)[mesh.faces[:, 0]]
-    low, high = (np.full(count, reach, np.float32) for reach in SHELL)
-    for side in (-1, 1):  # as it is wound, or inside out
-        directions = (side * flat).astype(np.float32)
-        met, away = rays.find(points, starts, directions, low, high, np.full(count, NO_TRIANGLE))
-        backs = (met != NO_TRIANGLE) & (island[met] == island) & (np.sum(flat * flat[met], axis=1) < BACK_TO_BACK)
-        for number in np.unique(island[backs]):
-            own = island == number
-            thin, thick = np.percentile(away[own & backs], (10, 90))
-            is_large = areas[own].sum() >= LARGE * areas.sum()
-            if not is_large or backs[own].mean() < SHELL_SHARE or thick > SHELL_SPREAD * thin:
+    island = islands(mesh.faces, mesh.vertex_count)[mesh.faces[:, 0]]
+    numbers, group = np.unique(island, return_inverse=True)
+    large = np.bincount(group, areas) >= LARGE * areas.sum()
+    for number in numbers[large]:
+        own = np.flatnonzero(island == number)
+        some = np.random.default_rng(0).permutation(own)[:LOOKED_AT]
+        starts, normals = corners[some].mean(axis=1), flat[some]
+        for side in (-1, 1):  # as it is wound, or inside out
+            met, away = look.along(starts, side * normals, *SHELL)
+            opposite = np.sum(normals * flat[met], axis=1) < BACK_TO_BACK
+            backs = (met != NO_TRIANGLE) & (island[met] == number) & opposite
+            if backs.mean() < SHELL_SHARE:
                 continue
-            vertices, apart = np.unique(mesh.faces[own]), 1000 * np.median(away[own & backs])
+            thin, thick = np.percentile(away[backs], (10, 90))
+            middles = starts[backs] + side * away[backs, None] / 2 * normals[backs]
+            if thick > SHELL_SPREAD * thin or look.is_narrow(middles, normals[backs], away[backs]):
+                continue
+            vertices, apart = np.unique(mesh.faces[own]), 1000 * np.median(away[backs])
             yield Finding(
                 severity="warning",
                 code="two-layers",
@@ -166,6 +171,30 @@ def two_layers(mesh: Mesh) -> Findings:
                 elements="vertices",
                 indices=index_tuple(vertices),
             )
+
+
+class _Sight:
+    """Looks for a mesh's triangles along rays."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        self._rays, self._origin = BlockedRays(mesh.points, mesh.faces), mesh.points.mean(axis=0)
+        self._points = (mesh.points - self._origin).astype(np.float32)
+
+    def along(self, starts: Floats, directions: Floats, low: float, high: Floats | float) -> tuple[Ints, Floats]:
+        """Return a triangle that each ray (R, 3) meets from `low` to `high` [m], and where, as `BlockedRays.find`."""
+        count = len(starts)
+        start, direction = (starts - self._origin).astype(np.float32), directions.astype(np.float32)
+        least, most = np.full(count, low, np.float32), np.full(count, high, np.float32)
+        return self._rays.find(self._points, start, direction, least, most, np.full(count, NO_TRIANGLE))
+
+    def is_narrow(self, middles: Floats, normals: Floats, thickness: Floats) -> bool:
+        """Return whether most points (R, 3) midway between layers have a side as near as the layers are apart."""
+        first = np.cross(normals, np.eye(3)[np.abs(normals).argmin(axis=1)])
+        first /= np.linalg.norm(first, axis=1, keepdims=True)
+        second = np.cross(normals, first)
+        sides: list[Floats] = [first, second, -first, -second]
+        met = [self.along(middles, side, 0.0, thickness)[0] != NO_TRIANGLE for side in sides]
+        return bool(np.any(met, axis=0).mean() > 0.5)
 
 
 def distinct_faces(faces: Ints) -> Ints:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,21 +45,23 @@ def onto_place(options: argparse.Namespace) -> tuple[str, str | None]:
 
 
 def read_member(options: argparse.Namespace, location: str, report: Reporter, root: str | None = None) -> Character:
-    """Read another body of the character; a body of its own stage has its garment too, which is none of the body."""
-    from ssilk_usd.reading.character import read_character
+    """Read another body of the character; its stage may have the garment of the character's too, which is no body."""
+    from ssilk_usd.reading.character import WITHOUT, bodies_there, read_character
 
     file, prim = garment_location(options)
-    stage = split_body(str(options.stage))[0]
-    own = is_same_file(split_body(location)[0], stage) and is_same_file(file, stage)
-    root, garment = root or options.root, prim if own else None
-    return read_character(location, root=root, bodies=options.body, garment=garment, report=report)
+    stage, root = split_body(str(options.stage))[0], root or options.root
+    worn = prim if is_same_file(file, stage) else None
+    own = worn if is_same_file(split_body(location)[0], stage) else None
+    bodies = [*options.body, *([f"{WITHOUT}{worn}"] if worn else [])]
+    bodies = bodies_there(location, bodies, root=root, garment=own) if bodies else []
+    return read_character(location, root=root, bodies=bodies, garment=own, report=report)
 
 
-def bodies_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> list[str]:
-    """Return the paths of the bodies that a garment of a list meets, where its stage has others of the list as well.
+def left_out_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> dict[str, list[str]]:
+    """Return what --body leaves out of the bodies that a garment of a list meets, by the tables that it is of.
 
-    Garments that a stage does not mark as such count as bodies, and would be met twice: as bodies that move with the
-    skeleton, and as the garments that they are. Nothing where none would.
+    Garments that a stage does not mark as such count as bodies: another of the list would be met as one, which moves
+    with the skeleton. Tables whose garments count as none are left out.
 
     Args:
         folder: that of the list, to which its paths are relative.
@@ -67,17 +69,42 @@ def bodies_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folde
     Raises:
         SsilkError: the stage has no character.
     """
-    from ssilk_usd.reading.character import bodies_beside
+    from ssilk_usd.reading.character import WITHOUT, unmarked_garments
 
     from ...training.wardrobe.listing import garment_file
 
     table = entry.located(folder)
-    stage, (file, own) = Path(table["stage"]), garment_file(table)
-    if not Path(split_body(str(stage))[0]).is_file():
-        return []  # which is told where it is read
-    others = [garment_file(each.located(folder)) for each in entries if each is not entry]
-    beside = [prim for other, prim in others if prim and is_same_file(other, stage)]
-    return bodies_beside(str(stage), beside, own if file == str(stage) else None) if beside else []
+    stage, (file, own) = str(table["stage"]), garment_file(table)
+    if not Path(split_body(stage)[0]).is_file():
+        return {}  # which is told where it is read
+    places = {each.name: garment_file(each.located(folder)) for each in entries if each is not entry}
+    beside = {name: prim for name, (other, prim) in places.items() if prim and is_same_file(other, stage)}
+    if not beside:
+        return {}
+    found = unmarked_garments(stage, [*beside.values()], own if is_same_file(file, stage) else None)
+    return {name: [f"{WITHOUT}{path}" for path in found[prim]] for name, prim in beside.items() if found[prim]}
+
+
+def bodies_in_list(
+    entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path, report: Reporter
+) -> list[str]:
+    """Return --body for a garment of a list, as `left_out_in_list`; tell which it does not meet as a garment either.
+
+    Raises:
+        SsilkError: the stage has no character.
+    """
+    left_out, known = left_out_in_list(entry, entries, folder), {each.name: each for each in entries}
+    pairs = {name: ((entry, name), (known[name], entry.name)) for name in left_out}
+    unmet = [name for name, pair in pairs.items() if not any(_is_over(*each, known) for each in pair)]
+    if unmet:
+        text = f"{entry.name} does not meet {', '.join(unmet)}: meshes of its stage that are garments of the list"
+        report(Message(f"{text} are no bodies; where one is worn over the other, say so with 'over'"))
+    return [*dict.fromkeys(each for paths in left_out.values() for each in paths)]
+
+
+def _is_over(entry: WardrobeEntry, name: str, known: Mapping[str, WardrobeEntry]) -> bool:
+    """Return whether a garment is worn over that of a name, or over one that is."""
+    return name in entry.over or any(_is_over(known[inner], name, known) for inner in entry.over)
 
 
 def members(options: argparse.Namespace, report: Reporter) -> list[str]:

@@ -36,7 +36,7 @@ def add_garment(verb: argparse.ArgumentParser) -> None:
         metavar="PRIM",
         action="append",
         default=[],
-        help="body mesh (repeatable; default: all under the SkelRoot)",
+        help="body mesh (repeatable; default: all under the SkelRoot, without those that ^PRIM names)",
     )
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from .looped import need_alone
 from .request import BakeRequest
 from .task import BakeTask
 from .world import asked_world
+
+MODELS = 8  # that are kept, to bound memory
 
 
 def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report: Reporter) -> None:
@@ -36,7 +39,7 @@ def tell_impossible(tasks: Sequence[BakeTask], readable: Container[str], report:
     left = [task for task in tasks if all(path in readable for path in task.request.inputs.values())]
     told, known = set[str](), _Known()
     for asked, found in (
-        (_fabric, _in_fabric),
+        (_fabric, known.in_fabric),
         (_body, known.of_body),
         (_range, known.of_range),
         (_shot, known.of_shot),
@@ -72,11 +75,18 @@ class _Known:
     def __init__(self) -> None:
         self._scenes: dict[tuple[object, ...], Scene] = {}
         self._frames: dict[tuple[object, ...], Motion] = {}
+        self._model = lru_cache(MODELS)(load_model)
+
+    def in_fabric(self, request: BakeRequest) -> tuple[Event, ...]:
+        if not (request.fabric or request.material):
+            return ()
+        model = self._model(request.model)
+        return in_fabric(model, request.model, request.fabric, request.material, request.feedback)[1]
 
     def of_body(self, request: BakeRequest) -> tuple[Event, ...]:
         from ssilk_usd.opening.stage import open_stage
 
-        on = worn(load_model(request.model), open_stage(request.stage), request.root)
+        on = worn(self._model(request.model), open_stage(request.stage), request.root)
         self._scenes[_body(request)] = on.scene
         return on.told
 
@@ -118,12 +128,6 @@ def _frames(request: BakeRequest) -> Motion:
 
 def _fabric(request: BakeRequest) -> tuple[object, ...]:
     return request.model, request.feedback, request.fabric, request.material
-
-
-def _in_fabric(request: BakeRequest) -> tuple[Event, ...]:
-    if not (request.fabric or request.material):
-        return ()
-    return in_fabric(load_model(request.model), request.model, request.fabric, request.material, request.feedback)[1]
 
 
 def _body(request: BakeRequest) -> tuple[object, ...]:

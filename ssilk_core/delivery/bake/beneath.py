@@ -42,14 +42,16 @@ class GarmentsBeneath:
 
     Args:
         samples: of each frame.
+        hashes: SHA-256 of some of the files, by name, where they are known.
 
     Raises:
         SsilkError: a file cannot be read, or has other frames than the first.
     """
 
-    def __init__(self, files: Mapping[str, Path], samples: int) -> None:
-        self.files = dict(files)
-        self.hashes = {name: sha256(path) for name, path in self.files.items() if path.suffix != GLB}
+    def __init__(self, files: Mapping[str, Path], samples: int, hashes: Mapping[str, str] | None = None) -> None:
+        self.files, known = dict(files), hashes or {}
+        hashed = [name for name, path in self.files.items() if path.suffix != GLB]
+        self.hashes = {name: known.get(name) or sha256(self.files[name]) for name in hashed}
         self._shots: list[Shot | GlbShot] = [open_shot(path) for path in self.files.values()]
         self.times = self._shots[0].sample_times(samples)
         faces, count = list[Ints](), 0
@@ -121,18 +123,25 @@ def beneath_said(
     for name, file in files.items():
         if not file.is_file():
             raise VerificationError(f"{path}: it was {made} over '{name}', which is not at {file}; bake both again.")
-    for text in changed_beneath(said, path, made):
+    hashes = {name: sha256(files[name]) for name in said.get(OVER_HASHES) or {} if name in files}
+    for text in changed_beneath(said, path, made, hashes):
         report(Message(text, "warning"))
-    return GarmentsBeneath(files, samples) if files else None
+    return GarmentsBeneath(files, samples, hashes) if files else None
 
 
-def changed_beneath(said: Mapping[str, Any], path: Path, made: str) -> list[str]:
-    """Return in words which garments beneath are not what a file was made over; arguments as of `beneath_said`."""
-    hashes, found = said.get(OVER_HASHES) or {}, []
+def changed_beneath(
+    said: Mapping[str, Any], path: Path, made: str, known: Mapping[str, str] | None = None
+) -> list[str]:
+    """Return in words which garments beneath are not what a file was made over; arguments as of `beneath_said`.
+
+    Args:
+        known: SHA-256 of some of their files, by name.
+    """
+    hashes, found, known = said.get(OVER_HASHES) or {}, [], known or {}
     for name, file in _files_said(said, path).items():
         if not file.is_file():
             found.append(f"{path}: it was {made} over '{name}', which is not at {file}; bake both again")
-        elif name in hashes and sha256(file) != hashes[name]:
+        elif name in hashes and (known.get(name) or sha256(file)) != hashes[name]:
             found.append(f"{path}: it was {made} over '{name}' as that was before; bake it again")
     return found
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ...errors import fail
 from ...scene.assets import Floats, Motion, Skeleton
 from ...scene.kinematics import motion_transforms, skinning_matrices
-from ..descriptors import pose_features
+from ..descriptors import PoseFeatures, pose_features
 from ..feedback import bends
 from ..proximity import sees_at
 
@@ -69,17 +69,30 @@ def character_frames(
     """
     world = motion_transforms(motion, skeleton.parents)
     features = pose_features(motion, skeleton, joints, world, kind)
-    down, earlier = (_into(values, features.gravity) for values in (features.down, features.earlier))
-    near = np.zeros((len(down), seen)) if features.proximity is None else features.proximity
+    near = np.zeros((len(world), seen)) if features.proximity is None else features.proximity
     if near.shape[1] != seen:
         fail(motion.path, f"proximity at {near.shape[1] // 3} points", *sees_at(seen))
-    static = np.concatenate([near, features.static, down], axis=1, dtype=np.float32)
-    rates = np.concatenate([earlier, features.dynamic], axis=1, dtype=np.float32)
+    static = np.concatenate([near, *_static(features)], axis=1, dtype=np.float32)
+    rates = np.concatenate([_into(features.earlier, features.gravity), features.dynamic], axis=1, dtype=np.float32)
     missing = HISTORY - lookback
     every = np.maximum(np.arange(-missing, len(world)), 0)
-    matrices, origins = _about_root(world[every], skeleton)
+    matrices, origins = about_root(world[every], skeleton)
     met = None if motion.proximity is None else motion.proximity[every]
     return CharacterFrames(static[lookback:], rates[lookback:], matrices, origins, met)
+
+
+def unseeing(motion: Motion, world: Floats, skeleton: Skeleton, joints: NDArray, kind: str = "relative") -> NDArray:
+    """Return static descriptors of a motion without the proximity of colliders, which comes first, float32 (F, S').
+
+    Args:
+        world: transforms of all joints in its frames (F, J, 4, 4); others as for `character_frames`.
+    """
+    features = pose_features(motion, skeleton, joints, world, kind, moving=False)
+    return np.concatenate(_static(features), axis=1, dtype=np.float32)
+
+
+def _static(features: PoseFeatures) -> tuple[Floats, Floats]:
+    return features.static, _into(features.down, features.gravity)
 
 
 def _into(frames: Floats, gravity: Floats | None) -> Floats:
@@ -90,11 +103,11 @@ def _into(frames: Floats, gravity: Floats | None) -> Floats:
 
 def character_matrices(motion: Motion, skeleton: Skeleton) -> tuple[NDArray, Floats]:
     """Return skinning matrices relative to the root (J, 3, 4, F), float32, and root positions (F, 3) [m]."""
-    return _about_root(motion_transforms(motion, skeleton.parents), skeleton)
+    return about_root(motion_transforms(motion, skeleton.parents), skeleton)
 
 
-def _about_root(world: Floats, skeleton: Skeleton) -> tuple[NDArray, Floats]:
-    """Convert joint-to-world transforms (F, J, 4, 4).
+def about_root(world: Floats, skeleton: Skeleton) -> tuple[NDArray, Floats]:
+    """Return what `character_matrices` does, of joint-to-world transforms (F, J, 4, 4).
 
     Relative to the root, float32 is precise anywhere in the world.
     """

@@ -133,14 +133,14 @@ class SeenCloth:
         np.subtract(away, carried, away)
         np.subtract(away, self.course.bend[self.frame], away)
         if self.course.offsets.shape[1]:
-            self._stop(away, away + carried, now)
+            self._stop(away, carried, now)
         np.matmul(away.T, self.course.turns[self.frame + 2], into.reshape(-1, 3))
         np.divide(into, SATURATION, into)
         np.tanh(into, into)
         np.multiply(into, np.float32(LIMIT), into)
         self.before = now
 
-    def _stop(self, away: NDArray, flight: NDArray, now: NDArray) -> None:
+    def _stop(self, away: NDArray, carried: NDArray, now: NDArray) -> None:
         """Let points (3, M) come no deeper into colliders in free flight than they were in the frame before.
 
         Args:
@@ -148,11 +148,14 @@ class SeenCloth:
         """
         normals, offsets, frame = self.course.normals, self.course.offsets, self.frame + 1
         count, away_from = offsets.shape[1], normals[frame + 1]
+        flight = away[:, :count] + carried[:, :count]
+        np.multiply(flight, away_from, flight)
+        deeper = np.subtract(offsets[frame + 1], np.add.reduce(flight))
+        if not deeper.item(deeper.argmax()) > 0:  # mostly none is inside at all
+            return
         was = offsets[frame] - np.add.reduce(normals[frame] * now[:, :count])
-        deeper = offsets[frame + 1] - np.add.reduce(away_from * flight[:, :count])
         np.subtract(deeper, np.maximum(was, ZERO, out=was), deeper)
-        if deeper.item(deeper.argmax()) > 0:
-            away[:, :count] += away_from * np.maximum(deeper, ZERO, out=deeper)
+        away[:, :count] += away_from * np.maximum(deeper, ZERO, out=deeper)
 
     def _points(self, outputs: NDArray, first: int) -> NDArray:
         """Return points of outputs (2, outputs) in two frames of the course, counted with the two before it."""

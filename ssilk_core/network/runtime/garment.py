@@ -18,7 +18,7 @@ from .decoder import NumpyDecoder
 from .deformer import deformer
 from .feedback import ClothPoints
 from .kinematics import ProxyKinematics
-from .networks import evaluate, layers
+from .networks import Layer, evaluate, layers
 from .skinning import tiles
 from .stepper import NumpyStepper, SoftClamp, SpringStepper, VerletStepper, diverged
 
@@ -52,11 +52,15 @@ class NumpyGarment:
         self.decoder = NumpyDecoder(scene, file.parameters, config)
         self.kinematics = ProxyKinematics(scene.rig, self.skeleton.joint_count)
         self.tiles = tiles(scene, file.parameters)
-        self.stepper: NumpyStepper[Any] | None = None
-        if stepper := STEPPERS[config.scheme]:
-            points = ClothPoints(file, self.decoder)
-            sizes = descriptor_sizes(scene, file.joints, config)
-            self.stepper = stepper(config, file.parameters, *sizes, points)
+
+    @cached_property
+    def stepper(self) -> NumpyStepper[Any] | None:
+        """What takes it from frame to frame; None where each frame is for itself."""
+        file, stepper = self.file, STEPPERS[self.file.config.scheme]
+        if stepper is None:
+            return None
+        sizes = descriptor_sizes(file.scene, file.joints, file.config)
+        return stepper(file.config, file.parameters, *sizes, ClothPoints(file, self.decoder))
 
     @cached_property
     def sparse_skin(self) -> SparseSkin:
@@ -70,8 +74,13 @@ class NumpyGarment:
         return deformer(self.file)
 
     def quasi_static(self, static: NDArray) -> NDArray:
-        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1)."""
-        rest = np.ascontiguousarray(evaluate(self.initialiser, static.T).T)
+        """Return the quasi-static latents (F, latent) of static descriptors (F, S) (Eq. 1).
+
+        Proximity, which comes first in these, may be left out where nothing is near.
+        """
+        first, *others = self.initialiser
+        network = [Layer(first.rows[-1 - static.shape[1] :]), *others]
+        rest = np.ascontiguousarray(evaluate(network, static.T).T)
         SoftClamp(self.file.config.latent_bound, rest.shape)(rest)
         rest[diverged(rest)] = 0
         return rest

@@ -12,7 +12,7 @@ from ...physics.world.felt import ColliderSight
 from ...physics.world.surface import Search, boxes
 from ...scene.assets import Floats, Motion, ShotWorld
 from ..proximity import proximity, proximity_reach, proximity_vertices
-from .character import character_frames
+from .character import about_root, unseeing
 from .garment import NumpyGarment
 from .skinning import picked, skin_garment
 
@@ -26,19 +26,19 @@ class RestingPoints:
         self._garment = garment
         self._tile = picked(garment.tiles, proximity_vertices(garment.file.scene, garment.file.config))
 
-    def __call__(self, motion: Motion) -> Floats:
-        """Return the points in each frame of a motion [m], shape (F, M, 3)."""
-        alone, count = replace(motion, proximity=None), motion.frame_count
-        parts = [self._of(alone.picked(slice(at, at + AT_ONCE))) for at in range(0, count, AT_ONCE)]
-        return np.concatenate(parts)
+    def __call__(self, motion: Motion, joints: Floats) -> Floats:
+        """Return the points in each frame of a motion with transforms of joints (F, J, 4, 4) [m], shape (F, M, 3)."""
+        alone = replace(motion, proximity=None)
+        parts = [slice(at, at + AT_ONCE) for at in range(0, motion.frame_count, AT_ONCE)]
+        return np.concatenate([self._of(alone.picked(part), joints[part]) for part in parts])
 
-    def _of(self, motion: Motion) -> Floats:
+    def _of(self, motion: Motion, joints: Floats) -> Floats:
         garment, file = self._garment, self._garment.file
-        kind, seen = file.config.descriptors, garment.proximity
-        frames = character_frames(motion, garment.skeleton, file.joints, kind=kind, seen=seen)
-        activations, transforms = garment.decoder.decode(garment.quasi_static(frames.static))
-        matrices = garment.kinematics.matrices(transforms, frames.matrices)
-        return skin_garment([self._tile], activations, matrices, frames.origins)
+        static = unseeing(motion, joints, garment.skeleton, file.joints, file.config.descriptors)
+        activations, transforms = garment.decoder.decode(garment.quasi_static(static))
+        character, origins = about_root(joints, garment.skeleton)
+        matrices = garment.kinematics.matrices(transforms, character)
+        return skin_garment([self._tile], activations, matrices, origins)
 
 
 def collider_sight(garment: NumpyGarment, world: ShotWorld, search: Search = boxes) -> ColliderSight:

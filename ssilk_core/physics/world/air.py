@@ -46,13 +46,39 @@ class MovingAir:
 
     def velocities(self, points: Floats, seconds: Floats) -> Floats:
         """Return the velocity of the air [m/s] at points (N, V, 3) at times (N,), shape (N, V, 3)."""
-        wind, gusts = (interpolated(values, seconds, self._fps) for values in (self._air.velocity, self._air.gusts))
+        wind, gusts = self._at(seconds)
         found = np.broadcast_to(wind[:, None], points.shape)
-        if not (gusts > 0).any():
+        if not self.has_gusts:
             return found
-        turned = self._turning * (self._air.begins + seconds)[:, None]
-        phase = (points - self._carried(seconds)[:, None]) @ self._waves.T + (turned + self._phase)[:, None]
-        return found + gusts[:, None, None] * (np.cos(phase) @ self._across)
+        return found + gusts[:, None, None] * (np.cos(2 * np.pi * self._turns(points, seconds)) @ self._across)
+
+    def mean_velocities(self, points: Floats, seconds: Floats) -> Floats:
+        """Return the mean over points of `velocities`, shape (N, 3); cosines, which take most of it, in float32."""
+        wind, gusts = self._at(seconds)
+        if not self.has_gusts:
+            return wind
+        turns = self._turns(points, seconds)
+        turns -= np.rint(turns)
+        mean = np.cos(np.float32(2 * np.pi) * turns.astype(np.float32)).mean(axis=1)
+        return wind + gusts[:, None] * (mean @ self._across)
+
+    @property
+    def has_gusts(self) -> bool:
+        """Whether its velocity depends on the place."""
+        return bool((self._air.gusts > 0).any())
+
+    def _at(self, seconds: Floats) -> tuple[Floats, Floats]:
+        """Return the wind (N, 3) and the speed of gusts (N,) at times [m/s]."""
+        wind, gusts = (interpolated(values, seconds, self._fps) for values in (self._air.velocity, self._air.gusts))
+        return wind, gusts
+
+    def _turns(self, points: Floats, seconds: Floats) -> Floats:
+        """Return the phases of the modes at points (N, V, 3) at times (N,), in turns, shape (N, V, MODES)."""
+        waves = self._waves.T / (2 * np.pi)
+        turned = (self._turning * (self._air.begins + seconds)[:, None] + self._phase) / (2 * np.pi)
+        found: Floats = (points.reshape(-1, 3) @ waves).reshape(*points.shape[:2], -1)
+        found += (turned - self._carried(seconds) @ waves)[:, None]
+        return found
 
     def _carried(self, seconds: Floats) -> Floats:
         """Return how far the wind has carried the air since time zero [m], shape (N, 3).

@@ -20,7 +20,7 @@ import numpy as np
 from ...scene.assets import LOOSE, UP, Floats, Ints, Motion, Scene, ShotWorld
 from ...scene.assets.world import interpolated
 from ...scene.fabrics import Fabric
-from ...scene.kinematics import hub_places, split_at_cuts
+from ...scene.kinematics import hub_places, motion_transforms, split_at_cuts
 from ..constants import GRAVITY
 from .air import MovingAir
 from .colliders import CarriedPoints, ColliderPoser, carried_points, voting_rows
@@ -28,7 +28,7 @@ from .surface import Search, boxes
 
 AT_ONCE = 64  # frames in which air is looked for together, to bound memory
 PLACES = 32  # vertices at which the air is averaged
-Places = Callable[[Motion], Floats]
+Places = Callable[[Motion, Floats], Floats]
 Proximity = Callable[[Floats, Floats, Floats, Floats], Floats]
 
 
@@ -45,9 +45,11 @@ def felt_gravity(world: ShotWorld | None, motion: Motion, scene: Scene, fabric: 
     if world.gravity is not None:
         found = interpolated(world.gravity, seconds, world.fps)
     if world.air and fabric.drag:
-        air, places = MovingAir(world.air, world.fps), carried_points(motion, scene, _loose(scene))
+        air, places = MovingAir(world.air, world.fps), np.zeros((len(seconds), 0, 3))
+        if air.has_gusts:
+            places = carried_points(motion, scene, _loose(scene))
         parts = [slice(at, at + AT_ONCE) for at in range(0, len(seconds), AT_ONCE)]
-        blown = np.concatenate([air.velocities(places[part], seconds[part]).mean(axis=1) for part in parts])
+        blown = np.concatenate([air.mean_velocities(places[part], seconds[part]) for part in parts])
         found = found + fabric.drag / fabric.density * (blown - _root_velocity(motion, scene))
     return found
 
@@ -57,7 +59,8 @@ class ColliderSight:
 
     Args:
         world: its time runs from the first frame of motions.
-        places: takes a motion, and returns the points from which colliders are seen in its frames [m], (F, M, 3).
+        places: takes a motion and the transforms of its joints (F, J, 4, 4), and returns the points from which
+            colliders are seen in its frames [m], (F, M, 3).
         within: distance up to which they count [m].
         see: takes the points of frames (N, M, 3), distances (N, M), directions away from what is nearest (N, M, 3)
             and positions of the root (N, 3), and returns what is seen (N, M, 5); where nothing is near distances are
@@ -75,7 +78,8 @@ class ColliderSight:
     def near(self, motion: Motion, frames: Ints) -> Floats:
         """Return how near colliders are in some frames (N,) of a motion, shape (N, M, 5)."""
         own = motion if len(frames) == motion.frame_count else motion.picked(frames)
-        points, voters = self._places(own), self._voters(own)
+        joints = motion_transforms(own, self._scene.character.skeleton.parents)
+        points, voters = self._places(own, joints), self._voters(joints)
         roots = hub_places(self._scene.character.skeleton, own.rotations, own.translations)
         found = self._poser.nearest(self._world, frames / motion.fps, points, voters, self._within)
         return self._see(points, *found, roots)

@@ -150,10 +150,12 @@ class CollisionSurface:
         on_border[on_edge], on_border[at_vertex] = self._border_edge[edge], self._border_vertex[vertex]
         behind = on_border & (side < 0)
         side[on_border] = 1.0
-        normal = normal * (turned / np.maximum(np.sqrt(_dot(normal, normal)), np.finfo(float).tiny))[:, None]
-        direct = away * (side / np.maximum(length, TOUCHING))[:, None]
-        direction = np.where((length > TOUCHING)[:, None], direct, normal)
-        where = self.part[face], on_border, behind, self.faces[face], weights
+        direction = away * (side / np.maximum(length, TOUCHING))[:, None]
+        if len(touching := np.flatnonzero(length <= TOUCHING)):
+            own = normal[touching]
+            outward = np.broadcast_to(turned, length.shape)[touching]
+            direction[touching] = own * (outward / np.maximum(np.sqrt(_dot(own, own)), np.finfo(float).tiny))[:, None]
+        where = self.part.take(face), on_border, behind, self.faces.take(face, axis=0), weights
         return SurfaceDistance(side * length, direction, *where)
 
     def voted(self, found: SurfaceDistance) -> Floats:
@@ -230,7 +232,7 @@ class PosedSurface:
             garment: the row of each query (M,) in `sides` of several garments (N, C).
         """
         squares, face, nearest = self._nearest(queries)
-        weights = _barycentric(self.points[self.surface.faces[face]], nearest)
+        weights = self._weights(face, nearest)
         turned = np.ones(1)
         if sides is not None:
             part = self.surface.part[face]
@@ -285,13 +287,34 @@ class PosedSurface:
     def _may_hold(low: Floats, high: Floats, least: Floats, most: Floats) -> NDArray[np.bool_]:
         return ((low >= least) & (high <= most)).all(axis=-1)
 
+    def _few(self, count: int) -> bool:
+        """Return whether so many queries need few of the triangles: of a mesh that moves, few are asked for."""
+        return self._is_new and FEW * count < len(self.surface.faces)
+
+    @cached_property
+    def _gradients(self) -> Floats:
+        return _gradients(self.points[self.surface.faces])
+
+    def _weights(self, face: Ints, points: Floats) -> Floats:
+        """Return the barycentric coordinates (M, 3), none negative, of points on faces, shapes (M, 3) and (M,)."""
+        if self._few(len(face)):
+            known = _gradients(self.points[self.surface.faces[face]])
+        else:
+            known = self._gradients.take(face, axis=0)
+        found = np.empty((len(face), 3))
+        for corner in (0, 1):
+            away, along = points - known[:, corner, 0], known[:, corner, 1]
+            np.einsum("mc,mc->m", away, along, out=found[:, corner])
+        np.subtract(1 - found[:, 0], found[:, 1], out=found[:, 2])
+        np.clip(found, 0.0, 1.0, out=found)
+        found /= (found[:, 0] + found[:, 1] + found[:, 2])[:, None]
+        return found
+
     def _at(self, face: Ints, weights: Floats) -> Floats:
         """Return the pseudonormals at points of faces, shape (M, 3)."""
         surface = self.surface
         on_edge, edge, at_vertex, vertex = surface.features(face, weights)
-        if self._is_new and FEW * len(face) < len(
-            surface.faces
-        ):  # of a mesh that moves, few are asked for in a frame
+        if self._few(len(face)):
             edges, vertices = np.zeros(surface._edge_count, dtype=bool), np.zeros(len(self.points), dtype=bool)
             edges[edge], vertices[vertex] = True, True
             around = edges[surface.edge].any(axis=1) | vertices[surface.welded].any(axis=1)
@@ -317,22 +340,15 @@ def _added(place: Ints, values: Floats, count: int) -> Floats:
     return np.stack([np.bincount(place, part, count) for part in values.T], axis=1)
 
 
-def _barycentric(corners: Floats, points: Floats) -> Floats:
-    """Return the barycentric coordinates (M, 3), none negative, of points (M, 3) on triangles (M, 3, 3)."""
-    a, b, c = np.ascontiguousarray(corners.transpose(1, 2, 0))  # along rows, numpy multiplies five times as fast
-    normal, points = _crosses(b - a, c - a), np.ascontiguousarray(points.T)
-    whole = np.maximum((normal * normal).sum(axis=0), np.finfo(float).tiny)
-    u = (_crosses(c - b, points - b) * normal).sum(axis=0) / whole
-    v = (_crosses(a - c, points - c) * normal).sum(axis=0) / whole
-    found = np.stack([u, v, 1 - u - v]).clip(0.0, 1.0)
-    found /= found.sum(axis=0)
-    return np.ascontiguousarray(found.T)
+def _gradients(corners: Floats) -> Floats:
+    """Return of triangles (T, 3, 3) where the first two barycentric coordinates are zero, and their gradients.
 
-
-def _crosses(one: Floats, other: Floats) -> Floats:
-    """Return the cross products of vectors (3, M), shape (3, M)."""
-    (a, b, c), (x, y, z) = one, other
-    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+    Shape (T, 2, 2, 3): of each coordinate the corner after its own, and its gradient in the plane.
+    """
+    a, b, c = corners.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    normal /= np.maximum(_dot(normal, normal), np.finfo(float).tiny)[:, None]
+    return np.stack([b, np.cross(normal, c - b), c, np.cross(normal, a - c)], axis=1).reshape(-1, 2, 2, 3)
 
 
 def _volumes(corners: Floats) -> Floats:

@@ -110,7 +110,8 @@ def test_cloth_with_thickness_is_told_and_other_cloth_is_not():
     for mesh in (shell, replace(shell, faces=faces[:, ::-1])):  # inside out, too
         found = only(meshes.two_layers(mesh))
         assert found.count == 2 * count and "two layers are 5.1 mm apart" in found.found
-    for mesh in (sheet, grid(), replace(shell, faces=faces[: 2 * len(sheet.faces)])):
+    cord = replace(sheet, points=sheet.points * [0.03, 1, 0.03])  # of 10 mm
+    for mesh in (sheet, grid(), cord, replace(shell, faces=faces[: 2 * len(sheet.faces)])):
         assert not list(meshes.two_layers(mesh))
 
 

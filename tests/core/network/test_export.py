@@ -137,9 +137,9 @@ def test_colliders_are_seen_and_where_they_are_is_told(exported, model, scene, t
         found.append(weights[:, 0])
         (expected,) = garment_poses(model, motion, motion.fps)
         np.testing.assert_allclose(found[-1], expected.weights, atol=2e-5)
-        own = RestingPoints(Player(model_file(model, FABRICS["silk"], {})))(plain)
-        hub = scene.character.skeleton.hub
-        roots = motion_transforms(plain, scene.character.skeleton.parents)[:, hub, :3, 3]
+        joints = motion_transforms(plain, scene.character.skeleton.parents)
+        own = RestingPoints(Player(model_file(model, FABRICS["silk"], {})))(plain, joints)
+        roots = joints[:, scene.character.skeleton.hub, :3, 3]
         np.testing.assert_allclose(resting[:, 0] + roots[:, None], own, atol=1e-5)
     assert np.abs(found[0] - found[1]).max() > 1e-3
 

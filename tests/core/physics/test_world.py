@@ -362,6 +362,9 @@ def test_gusts_are_felt_as_their_mean_over_the_cloth(scene, toy_grid) -> None:
     every = np.stack([air.velocity(at, frame / FPS).mean(axis=0) for frame in range(12)])
     np.testing.assert_allclose(felt, fabric.drag / fabric.density * every - [0, 9.81, 0], atol=0.5)
     assert np.ptp(felt, axis=0).max() > 1
+    places, seconds = np.tile(at + [300.0, 0, -200], (12, 1, 1)), 100 + np.arange(12) / FPS
+    mean = air.velocities(places, seconds).mean(axis=1)
+    np.testing.assert_allclose(air.mean_velocities(places, seconds), mean, atol=1e-6)
 
 
 def test_gravity_that_turns_and_grows_in_a_shot_moves_free_cloth_as_implicit_euler_does(scene) -> None:

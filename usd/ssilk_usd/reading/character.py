@@ -32,6 +32,8 @@ from .skeleton import bound_skeleton, character_skeleton, find_skeleton
 from .skin import read_skin, tell_method
 from .spaces import SkelSource
 
+WITHOUT = "^"  # before a body that is left out; no prim's name begins with it
+
 
 @needs_whole_files
 def read_character(
@@ -55,7 +57,7 @@ def read_character(
     Args:
         source: a file or an open stage.
         root: SkelRoot or Skeleton, by path or name, if there are several.
-        bodies: body meshes, by path or name; all if empty.
+        bodies: body meshes, by path or name; all if none is named. `WITHOUT` stands before those that are left out.
         garment: a garment mesh that is not marked as one, by path or name.
         report: receives a warning about each body that does not use linear blend skinning, or whose weights do not
             sum to one.
@@ -67,7 +69,7 @@ def read_character(
     skeleton = character_skeleton(skel)
     order = skeleton.joint_names
     prims = _body_prims(skel, bodies, garment)
-    shown = prims if bodies else rendered(prims)
+    shown = prims if _taken(bodies) else rendered(prims)
     return Character(
         location(skel.root),
         skeleton,
@@ -76,23 +78,34 @@ def read_character(
     )
 
 
-def bodies_beside(source: StageLike, garments: Sequence[str], own: str | None = None) -> list[str]:
-    """Return the paths of a character's bodies where some of its meshes, which count as such, are garments.
+def unmarked_garments(source: StageLike, garments: Sequence[str], own: str | None = None) -> dict[str, list[str]]:
+    """Return for each of a character's garments, by path or name, its meshes that count as bodies: none is marked.
 
     Args:
-        garments: other garments than `own`, by path or name; none of them may be marked as one.
-        own: the garment that is meant, by path or name.
-
-    Returns:
-        Nothing where none of the garments counts as a body, so that none has to be named.
+        own: the garment that is meant, which is none of them.
 
     Raises:
         SsilkError: as `read_character` does.
     """
     skel = find_skeleton(open_stage(source), garment=own)  # which keeps the stage, on which prims live
-    every = rendered(_body_prims(skel, (), own))
-    worn = {prim.GetPath() for name in garments for prim in named(every, name)}
-    return [str(prim.GetPath()) for prim in every if prim.GetPath() not in worn] if worn else []
+    every = _body_prims(skel, (), own)
+    return {name: [str(prim.GetPath()) for prim in named(every, name)] for name in garments}
+
+
+def bodies_there(
+    source: StageLike, bodies: Sequence[str], *, root: str | None = None, garment: str | None = None
+) -> list[str]:
+    """Return `bodies` for another character, which may lack what is left out of them, or have it elsewhere.
+
+    Raises:
+        SsilkError: as `read_character` does, whose arguments these are.
+    """
+    skel, found = find_skeleton(open_stage(source), root=root, garment=garment), [*_taken(bodies)]
+    every = [prim for prim in _meshes(skel) if is_skinned(prim, skel) or carried_by(prim, skel)]
+    for name in _left_out(bodies):
+        prims = named(every, name) or named(every, name.rpartition("/")[2])
+        found += [f"{WITHOUT}{prim.GetPath()}" for prim in prims]
+    return found
 
 
 def has_meshes(stage: Usd.Stage, root: str | None, names: Sequence[str]) -> bool:
@@ -113,23 +126,36 @@ def is_skinned(prim: Usd.Prim, skel: SkelSource) -> bool:
     return bound_skeleton(prim) == skel.prim and inherited(prim, SKEL[0]) is not None
 
 
+def _meshes(skel: SkelSource) -> list[Usd.Prim]:
+    return [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
+
+
+def _taken(bodies: Sequence[str]) -> list[str]:
+    return [name for name in bodies if not name.startswith(WITHOUT)]
+
+
+def _left_out(bodies: Sequence[str]) -> list[str]:
+    return [name.removeprefix(WITHOUT) for name in bodies if name.startswith(WITHOUT)]
+
+
 def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) -> list[Usd.Prim]:
-    every = [prim for prim in Usd.PrimRange(skel.root, PRIMS) if prim.IsA(UsdGeom.Mesh)]
-    garments = named(every, garment) if garment else []
+    every = _meshes(skel)
     meshes = [prim for prim in every if is_skinned(prim, skel)]
-    if not bodies:
-        drawn = [prim for prim in every if is_drawn(prim) and is_body(prim) and prim not in garments]
-        return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
-    meshes = [prim for prim in every if prim in meshes or carried_by(prim, skel)]
-    unknown = next((name for name in bodies if not named(meshes, name)), None)
+    known = [prim for prim in every if prim in meshes or carried_by(prim, skel)] if bodies else []
+    unknown = next((name for name in (*_taken(bodies), *_left_out(bodies)) if not named(known, name)), None)
     if unknown is not None:
         fail(
             location(skel.root),
             f"no mesh '{unknown}' is bound to the skeleton",
-            f"there are {listed(meshes)}",
+            f"there are {listed(known)}",
             "name one of these with --body",
         )
-    return [prim for name in bodies for prim in named(meshes, name)]
+    if taken := _taken(bodies):
+        return [prim for name in taken for prim in named(known, name)]
+    others = [*_left_out(bodies), *filter(None, [garment])]
+    left_out = [prim for name in others for prim in named(every, name)]
+    drawn = [prim for prim in every if is_drawn(prim) and is_body(prim) and prim not in left_out]
+    return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
 
 
 def _read_body(prim: Usd.Prim, skel: SkelSource, order: tuple[str, ...], report: Reporter) -> Body:

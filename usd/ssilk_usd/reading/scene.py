@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 
 from ssilk_core.errors import fail
 from ssilk_core.events import Message, Reporter, silent
-from ssilk_core.files import split_location
+from ssilk_core.files import is_same_file, split_location
 from ssilk_core.scene.assets import Character, Garment, ProxyRig, Skeleton
 
 from ..names import PROXIES
@@ -56,7 +56,8 @@ def read_scene(
     if file and Path(file).suffix in USD_SUFFIXES:
         wardrobe, names = open_stage(file), (prim, None)
         _need_order(stage, wardrobe)
-        character = read_character(stage, root=root, bodies=bodies, report=report)
+        own = prim if is_same_file(file, stage.GetRootLayer().realPath) else None
+        character = read_character(stage, root=root, bodies=bodies, garment=own, report=report)
     else:
         character = read_character(stage, root=root, bodies=bodies, garment=garment, report=report)
         wardrobe, names = stage, (garment, root)
