@@ -15,9 +15,14 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: "end_to_end" not in item.path.parts)
 
 
+def pytest_configure() -> None:
+    """Look for nothing that can be freed while tests are collected: what is loaded stays."""
+    gc.disable()
+
+
 def pytest_collection_finish() -> None:
-    """What is loaded by now stays, and is left out of every search for what can be freed."""
     gc.freeze()
+    gc.enable()
 
 
 def _one_thread() -> None:
