@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Iterator
 
@@ -12,6 +13,16 @@ import pytest
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the files that take longest: one that began last would leave the other processes without work."""
     items.sort(key=lambda item: "end_to_end" not in item.path.parts)
+
+
+def pytest_configure() -> None:
+    """Look for nothing that can be freed while tests are collected: what is loaded stays."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 def _one_thread() -> None:

@@ -23,6 +23,7 @@ from ssilk_core.physics.intersections.pairs import self_intersections
 
 FRAMES = 21
 BAKE = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "bow.usda", "--lbs"]
+MIDDLE = ["--range", "7-13"]  # in which it bends most
 
 
 def write_bow(path) -> None:
@@ -154,7 +155,7 @@ def missing_at_first(monkeypatch):
 
 
 def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first):
-    assert main([*BAKE, "-o", "attempts/", "--certify", "--points"]) == 0
+    assert main([*BAKE, "-o", "attempts/", "--certify", "--points", *MIDDLE]) == 0
     faces, (path,) = skinned("plain.usda")[1], there.glob("attempts/shots/*/*/anim.usdc")
     shot = with_points(path)
     assert not any(len(self_intersections(shot.garment_points(time), faces)) for time in shot.frame_times)
@@ -163,9 +164,9 @@ def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first)
 def test_what_is_hidden_is_what_the_last_attempt_covers(there, missing_at_first, monkeypatch):
     seen, found = [], hiding.covered_polygons
     monkeypatch.setattr(hiding, "covered_polygons", lambda rollout, report: seen.append(rollout) or found(rollout))
-    assert main([*BAKE, "-o", "hidden.usda", "--certify", "--hide-covered"]) == 0
+    assert main([*BAKE, "-o", "hidden.usda", "--certify", "--hide-covered", *MIDDLE]) == 0
     cloth = np.stack(list(seen[-1].vertices()))
-    np.testing.assert_allclose(cloth, skinned("hidden.usda")[0], atol=1e-5)
+    np.testing.assert_allclose(cloth, skinned("hidden.usda")[0][7:14], atol=1e-5)
 
 
 def test_a_bake_without_a_certificate_records_nothing_of_it(there):
@@ -186,7 +187,7 @@ def test_pairs_that_do_not_count_are_told(there, capsys):
 
 
 def test_layers_hold_it_too(there):
-    assert main([*BAKE, "-o", "layers/", "--certify"]) == 0
+    assert main([*BAKE, "-o", "layers/", "--certify", *MIDDLE]) == 0
     (path,) = there.glob("layers/shots/*/*/anim.usdc")
     faces, shot = skinned("plain.usda")[1], Shot(path)
     assert not any(len(self_intersections(shot.garment_points(time), faces)) for time in shot.frame_times)

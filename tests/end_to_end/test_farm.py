@@ -131,13 +131,13 @@ def test_what_every_task_would_refuse_is_refused_when_a_job_is_submitted(farm, c
 
 
 def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
-    """The first chunk fails, those behind it are baked, and the last step says which shot is missing.
+    """A shot fails, the other of its chunk and the next chunk are baked, and the last step says which is missing.
 
     When its motion is whole, the same bundle bakes that shot and finds the others current.
     """
     whole = Path("a.usda").read_bytes()
     Path("a.usda").write_bytes(whole[:300])
-    done = openjd_run(chunk=1)
+    done = openjd_run(chunk=2)
     assert done.returncode != 0 and "openjd_fail: a/model: error:" in done.stdout, done.stdout
     assert "1 of 3 tasks are not done" in done.stdout and "(a/model)" in done.stdout, done.stdout
     assert "largest error" in done.stdout and "openjd_status: bake b/model" in done.stdout, done.stdout

@@ -131,11 +131,21 @@ def same(found: GarmentPose, wanted: GarmentPose, tolerance: float) -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=0, atol=tolerance)
 
 
-def test_it_answers_with_what_a_bake_writes(start):
-    process = start("--latent-iterations", str(ITERATIONS))
+def test_it_answers_with_what_a_bake_writes_and_ends_with_what_comes_in(start):
+    """One process ends in the midst of another motion; one that nobody hears goes on, and says what it cannot use."""
+    process, deaf = start("--latent-iterations", str(ITERATIONS)), start()
+    assert read_message(deaf.stdout).kind == "ready"
+    say(deaf, 0, motion_of("brief.usda"))
+    deaf.stdout.close()
     check_answer(process, "brief.usda")
+    say(process, 4, motion_of("brief.usda"))
     process.stdin.close()
     assert process.wait(PATIENCE) == 0 and process.stderr.read() == b""
+    deaf.stdin.write(b"GET / HTTP/1.1\r\n\r\n")
+    deaf.stdin.flush()
+    assert deaf.wait(PATIENCE) == 2
+    (line,) = deaf.stderr.read().decode().splitlines()
+    assert "error: standard input: a message that cannot be read: it begins with b'GET '" in line
 
 
 def test_it_answers_a_motion_at_another_rate(there):
@@ -185,28 +195,9 @@ def test_few_elements_are_chosen_for_the_first_motion(there):
     same(found, GarmentPose.joined(solved(load_rollout(replace(REQUEST, latent_elements="few"))).latents.poses), 1e-6)
 
 
-def test_it_ends_with_its_pipes_at_any_time(start):
-    motion = motion_of("brief.usda")
+def test_it_ends_before_it_has_said_or_heard_anything(there):
     with served():
-        pass  # before it has said or heard anything
-    late, deaf = start(), start()
-    for process in (late, deaf):
-        assert read_message(process.stdout).kind == "ready"
-        say(process, 0, motion)
-    late.stdin.close()
-    deaf.stdout.close()
-    assert late.wait(PATIENCE) == 0
-    deaf.stdin.close()
-    assert deaf.wait(PATIENCE) == 0
-
-
-def test_what_it_cannot_use_ends_it_with_a_sentence(start):
-    process = start()
-    process.stdin.write(b"GET / HTTP/1.1\r\n\r\n")
-    process.stdin.flush()
-    assert process.wait(PATIENCE) == 2
-    (line,) = process.stderr.read().decode().splitlines()
-    assert "error: standard input: a message that cannot be read: it begins with b'GET '" in line
+        pass
 
 
 @pytest.mark.parametrize(

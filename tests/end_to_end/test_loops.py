@@ -25,13 +25,21 @@ ROUND, FPS = 24, 30.0
 BAKE = ["bake", "lively.safetensors", "--stage", "rigged.usda", "--motion"]
 
 
+@pytest.fixture(scope="module")
+def world(toy, tmp_path_factory):
+    """The toy with a lively model, and with cycle.usda and bakes of it: plain.usdc, and loop.usdc as a loop."""
+    folder = toy.copy(tmp_path_factory.mktemp("loops"))
+    lively(folder / "model.safetensors", folder / "lively.safetensors")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        write_cycle("cycle.usda")
+        baked("plain.usdc"), baked("loop.usdc", "cycle.usda", "--loop")
+    return folder
+
+
 @pytest.fixture
-def stage(toy, tmp_path, monkeypatch):
-    toy.copy(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    lively(tmp_path / "model.safetensors", tmp_path / "lively.safetensors")
-    write_cycle("cycle.usda")
-    return tmp_path
+def stage(copy):
+    return copy
 
 
 def write_cycle(path: str, frames: int = ROUND + 1, turn: float = 0.4, way: float = 0.5) -> None:
@@ -88,7 +96,7 @@ def said(path: str) -> dict:
 
 
 def test_the_last_frame_flows_into_the_first(stage):
-    plain, found = baked("plain.usdc"), baked("loop.usdc", "cycle.usda", "--loop")
+    plain, found = points_of("plain.usdc"), points_of("loop.usdc")
     assert seam_of(plain) > 0.005 > 1e-5 > seam_of(found)
     told = said("loop.usdc")
     assert (
@@ -99,7 +107,6 @@ def test_the_last_frame_flows_into_the_first(stage):
 
 
 def test_a_loop_is_verified_with_its_seam(stage, capsys):
-    baked("plain.usdc"), baked("loop.usdc", "cycle.usda", "--loop")
     assert verify("plain.usdc").seam_mm is None
     found = verify("loop.usdc")
     assert found.seam_mm == pytest.approx(1000 * seam_of(points_of("loop.usdc")), abs=1e-3) and found.seam_mm < 0.01
@@ -110,7 +117,7 @@ def test_a_loop_is_verified_with_its_seam(stage, capsys):
 
 def test_a_round_is_what_many_rounds_come_to(stage):
     write_cycle("long.usda", 10 * ROUND + 1)
-    long, found = baked("long.usdc", "long.usda"), baked("loop.usdc", "cycle.usda", "--loop")
+    long, found = baked("long.usdc", "long.usda"), points_of("loop.usdc")
     late = about_hips(long[9 * ROUND :], "long.usda", list(range(9 * ROUND, 10 * ROUND + 1)))
     own = about_hips(found, "cycle.usda", list(range(ROUND + 1)))
     np.testing.assert_allclose(own, late, atol=1e-3)
@@ -119,7 +126,7 @@ def test_a_round_is_what_many_rounds_come_to(stage):
 
 
 def test_a_cycle_without_the_repeated_frame_is_found_and_told(stage):
-    whole = baked("whole.usdc", "cycle.usda", "--loop")
+    whole = points_of("loop.usdc")
     write_cycle("open.usda", ROUND)
     found = baked("open.usdc", "open.usda", "--loop")
     assert said("open.usdc")["last frame"] == "is one before the first" and len(found) == ROUND
@@ -169,9 +176,9 @@ def test_a_held_span_within_the_round_stays_held(stage, capsys):
 
 def test_a_part_that_is_held_is_held_in_each_round(stage, capsys):
     name = f"ssilk:free:{proxies_of('rigged.usda')[0].rpartition('/')[2]}"
-    free = baked("free.usdc", "cycle.usda", "--loop")
+    free = points_of("loop.usdc")
     hold_parts("cycle.usda", {name: {0: 0.5, 10: 0.0, ROUND: 0.5}})
-    found = baked("loop.usdc", "cycle.usda", "--loop")
+    found = baked("held.usdc", "cycle.usda", "--loop")
     assert seam_of(found) < 1e-5 < 1e-2 < np.abs(found - free).max()
     hold_parts("cycle.usda", {name: {ROUND: 0.75}})
     assert main([*BAKE, "cycle.usda", "-o", "refused.usdc", "--loop"]) == 2
@@ -179,7 +186,7 @@ def test_a_part_that_is_held_is_held_in_each_round(stage, capsys):
 
 
 def test_the_garment_may_say_it_and_layers_keep_it(stage):
-    asked = baked("loop.usdc", "cycle.usda", "--loop")
+    asked = points_of("loop.usdc")
     shot = Usd.Stage.Open("cycle.usda")
     shot.OverridePrim("/Hero/Skirt").CreateAttribute("ssilk:loop", Sdf.ValueTypeNames.Bool).Set(True)
     shot.GetRootLayer().Save()
@@ -221,7 +228,6 @@ def test_a_refined_round_is_told_by_its_own_frames_and_the_network_s_rounds(stag
 
 
 def test_without_a_loop_a_shot_says_nothing_of_it(stage):
-    baked("plain.usdc")
     assert "loop" not in Sdf.Layer.FindOrOpen("plain.usdc").customLayerData["ssilk"]
 
 

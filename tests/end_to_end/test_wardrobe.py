@@ -23,7 +23,7 @@ from ssilk_core.cli import main, wardrobe
 from ssilk_core.cli.main import parser
 from ssilk_core.cli.options.bodies import read_member
 from ssilk_core.cli.options.scene import read_stage
-from ssilk_core.errors import EXIT_WORSE, SsilkError
+from ssilk_core.errors import EXIT_TASKS, EXIT_WORSE, SsilkError
 from ssilk_core.events import Event, GarmentEvent, JsonReporter, Message, Progress, TaskEvent, read_event, silent
 from ssilk_core.files import sha256
 from ssilk_core.network.checkpoint import load_model
@@ -518,33 +518,36 @@ def interrupting(log: Path, word: str) -> Iterator[None]:
     thread.join()
 
 
-def test_an_interrupted_list_goes_on_and_a_failure_is_told(world, capsys):
+OUTFIT = """
+[coat]
+over = ["skirt"]
+set = { valid_frames = 8, iterations = 6 }
+
+[cloak]
+over = ["torn"]
+"""
+
+
+def test_an_interrupted_list_goes_on_from_the_inside_out_and_a_failure_is_told(world, capsys):
+    """Inner garments come first, and what lies over one that failed is not trained."""
+    Path("list.toml").write_text(LIST + OUTFIT)
     command = shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json")
     with interrupting(Path("out/skirt.log"), '"progress"'):
         assert main(command) == 130
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     states = {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
     assert states["skirt"] == "stopped" and Path("out/skirt.resume.safetensors").exists()
-    assert main(command) == 2
+    assert main(command) == EXIT_TASKS
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    skirt, torn = events[-1]["detail"]["garments"]
-    assert (skirt["state"], skirt["iterations"], torn["state"]) == ("finished", 120, "failed")
-    said = [event["said"] for event in events if event["event"] == "garment" and event["name"] == "torn"]
-    assert [event["event"] for event in said] == ["message", "failed"] and "torn.usda" in said[-1]["error"]
+    rows = {row["garment"]: row for row in events[-1]["detail"]["garments"]}
+    states = {name: row["state"] for name, row in rows.items()}
+    assert states == {"skirt": "finished", "coat": "finished", "torn": "failed", "cloak": "failed"}
+    assert rows["skirt"]["iterations"] == 120
+    said = [(event["name"], event["said"]) for event in events if event["event"] == "garment"]
+    torn = [event for name, event in said if name == "torn"]
+    assert [event["event"] for event in torn] == ["message", "failed"] and "torn.usda" in torn[-1]["error"]
     assert any("resumed at iteration" in line for line in Path("out/skirt.log").read_text().splitlines())
     assert load_model("out/skirt.safetensors").provenance["train"]["seed"] == 3
-
-
-def test_an_outfit_is_trained_from_the_inside_out(world, capsys):
-    """Inner garments come first, and what lies over one that failed is not trained."""
-    short = LIST.replace("iterations = 120", "iterations = 6").partition("[skirt]")[0]
-    outfit = '[coat]\nover = ["skirt"]\n[skirt]\n[cloak]\nover = ["torn"]\n[torn]\nmotions = "torn.usda"\n'
-    Path("list.toml").write_text(short + outfit)
-    main(shlex.split("wardrobe list.toml -o out --device cpu --jobs 2 --json"))
-    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    states = {row["garment"]: row["state"] for row in events[-1]["detail"]["garments"]}
-    assert states == {"skirt": "finished", "coat": "finished", "torn": "failed", "cloak": "failed"}
-    said = [(event["name"], event["said"]) for event in events if event["event"] == "garment"]
     ended = next(k for k, (name, event) in enumerate(said) if name == "skirt" and event.get("text") == "finished")
     assert [name for name, _ in said].index("coat") > ended
     (error,) = [event["error"] for name, event in said if name == "cloak"]
