@@ -31,16 +31,18 @@ def near_loop(
     ascending: bool,
     reach: float,
 ) -> tuple[Tensor, ...]:
-    """Return what `PairKind.near` does: frame, first, second and distance of each pair, by frame and first.
+    """Return what `PairKind.near` does: frame, first, second and distance of each pair, by frame.
 
     Args:
         first, second: vertices of what comes first in pairs, and second, shapes (A, 1) and (B, 3), or both (A, 2).
         middles, reaches: of both; pairs whose middles are further apart than the sum of their reaches are not near.
         grid: of the second ones' middles.
         groups: numbers (A,) and (B,); what has the same one is no pair.
-        ascending: whether what comes second in a pair has the greater index.
+        ascending: whether both are the same, and what comes second in a pair has the greater index.
     """
     count, number = len(first), grid.order % len(second)
+    # Of two that are of one sort, the one that comes first in the grid's order looks for the other.
+    place = grid.order.argsort() if ascending else number.new_full((x.shape[-1] * count,), -1)
     none = number.new_zeros(1)
     own, theirs = (none, none) if groups is None else (groups[0], groups[1][number])
     given = (
@@ -54,10 +56,10 @@ def near_loop(
         array(number),
         array(grid.first.flatten(0, 1)),
         array(grid.last.flatten(0, 1)),
+        array(place),
         array(own),
         array(theirs),
         groups is not None,
-        ascending,
         reach,
     )
     found: list[tuple[int, np.ndarray, np.ndarray]] = []
@@ -161,36 +163,34 @@ def _between_edges(x, i, j, k, o):
 
 @compiled
 def _near(
-    x, first, second, points, limits, others, other_limits, number, starts, ends, own, theirs, grouped, ascending,
+    x, first, second, points, limits, others, other_limits, number, starts, ends, place, own, theirs, grouped,
     reach, pairs, distance, start, stop,
 ):  # fmt: skip
     """Write the near pairs of points from `start` on; return how many, and the point that there was no room for."""
     count, held, faces = len(first), 0, first.shape[1] == 1
     for q in range(start, stop):
-        point, begun = q % count, held
+        point, begun, frame = q % count, held, x[q // count]
         px, py, pz, most = points[q, 0], points[q, 1], points[q, 2], limits[point]
         for row in range(starts.shape[1]):
-            for at in range(starts[q, row], ends[q, row]):
-                other = number[at]
-                if ascending and other <= point:
-                    continue
-                if grouped and own[point] == theirs[at]:
-                    continue
+            for at in range(max(starts[q, row], place[q] + 1), ends[q, row]):
                 dx, dy, dz = px - others[at, 0], py - others[at, 1], pz - others[at, 2]
                 limit = most + other_limits[at]
                 if dx * dx + dy * dy + dz * dz > limit * limit:
                     continue
+                if grouped and own[point] == theirs[at]:
+                    continue
+                other = number[at]
                 i, j, k, o = _four(first, second, point, other)
                 if i in (k, o) or (i == j if faces else j in (k, o)):
                     continue
-                frame = x[q // count]
                 dx, dy, dz = _over_face(frame, i, j, k, o) if faces else _between_edges(frame, i, j, k, o)
                 far = dx * dx + dy * dy + dz * dz
                 if far >= reach * reach:
                     continue
                 if held == len(distance):
                     return begun, q
-                pairs[0, held], pairs[1, held], pairs[2, held] = q // count, point, other
+                turned = place[q] >= 0 and other < point
+                pairs[0, held], pairs[1 + turned, held], pairs[2 - turned, held] = q // count, point, other
                 distance[held] = sqrt(far)
                 held += 1
     return held, stop

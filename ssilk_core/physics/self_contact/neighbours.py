@@ -36,8 +36,9 @@ class Grid:
         key, order = theirs.flatten().sort(stable=True)
         steps = torch.arange(-1, 2, device=points.device)
         rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
-        row = (own[..., None] + rows).contiguous()
-        return cls(order, torch.searchsorted(key, row - 1), torch.searchsorted(key, row + 1, right=True))
+        asked, at = own.unique(return_inverse=True)  # many points share a cell
+        row = asked[:, None] + rows
+        return cls(order, torch.searchsorted(key, row - 1)[at], torch.searchsorted(key, row + 1, right=True)[at])
 
 
 def near_pairs(

@@ -343,21 +343,23 @@ class SelfContact:
         return self._joined(x, parts).pressing(x)
 
     def ahead(self, step: Tensor, known: ClothNeighbours) -> tuple[ClothNeighbours, Tensor, ClothContacts]:
-        """Return what may touch ahead of a step (V, 3, N) from the last positions, which share of it each vertex may
-        move so that no pairs meet that are not known (V, N), and which contacts may slow the step further."""
-        x, longest = known.last, (step - step.mean(0)).norm(dim=1).amax(0)
+        """Return what may touch ahead of a step (V, 3, N) from the last positions, the step as far as no pairs can
+        meet that are not known, and which contacts may slow it further.
+
+        The step is cut as a whole. Where each vertex stopped by itself, cloth between those that stop and those that
+        go on would stretch, and its energy would rise in all but a short part of the step.
+        """
+        x, longest = known.last, step.norm(dim=1).amax(0)
         drift = _drift(x, known).amax(0)
-        cut = longest > self._unknown(drift)
-        known = self._anew(x, known, cut & (drift > MOVED * REACH))
+        known = self._anew(x, known, (longest > self._unknown(drift)) & (drift > MOVED * REACH))
         drift = _drift(x, known)
-        most = self._unknown(drift.amax(0))
-        share = torch.where(longest > most, (most / step.norm(dim=1).clamp_min(TINY)).clamp_max(1), 1.0)
-        step, parts = share[:, None] * step, []
+        step = (self._unknown(drift.amax(0)) / longest.clamp_min(TINY)).clamp_max(1) * step
+        parts = []
         for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
             close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER, step))
             now, rest = kind.at((x, self.rest), close)
             parts.append(kind.contacts(now, close, close.side, rest))
-        return known, share, self._joined(x, parts)
+        return known, step, self._joined(x, parts)
 
     def _unknown(self, drift: Tensor) -> Tensor:
         """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, nor so

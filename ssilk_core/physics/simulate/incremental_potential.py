@@ -243,9 +243,8 @@ class IncrementalPotential:
         arrived = torch.zeros(x.shape[-1], dtype=torch.bool, device=x.device)
         for _ in range(ROUNDS):
             assert inputs.neighbours is not None
-            step = target - x
-            neighbours, share, met = self.self_contact.ahead(step, inputs.neighbours)
-            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, share.amin(0) * step)
+            neighbours, step, met = self.self_contact.ahead(target - x, inputs.neighbours)
+            inputs, step = replace(inputs, neighbours=neighbours), met.without_passing(x, step)
             arrived = arrived | (step.norm(dim=1).amax(0) < ARRIVED)
             if bool(arrived.all()):
                 break

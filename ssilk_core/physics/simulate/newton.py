@@ -300,11 +300,11 @@ class Search:
     def _without_passing(self, known: ClothNeighbours, step: Tensor) -> Tensor:
         """Return a step in which cloth does not pass through cloth: slower at some vertices, or in whole frames."""
         x, gradient = self.state.x, self.gradient
-        known, share, contacts = self.potential.self_contact.ahead(step, known)
+        known, step, contacts = self.potential.self_contact.ahead(step, known)
         self.inputs, self.state = replace(self.inputs, neighbours=known), replace(self.state, neighbours=known)
-        slowed, whole = contacts.without_passing(x, share[:, None] * step, YIELDING), share.amin(0) * step
-        steep = (gradient * slowed).sum((0, 1)) < DOWNHILL * (gradient * whole).sum((0, 1))
-        return torch.where(steep, slowed, contacts.allowed(x, whole, YIELDING).amin(0) * whole)
+        slowed = contacts.without_passing(x, step, YIELDING)
+        steep = (gradient * slowed).sum((0, 1)) < DOWNHILL * (gradient * step).sum((0, 1))
+        return torch.where(steep, slowed, contacts.allowed(x, step, YIELDING).amin(0) * step)
 
     def _release_fixed(self, may: Tensor) -> None:
         """Release the fixed vertices of frames (N,) that may, and whose other vertices have converged, once."""
