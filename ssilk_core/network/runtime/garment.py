@@ -79,8 +79,8 @@ class NumpyGarment:
         Proximity, which comes first in these, may be left out where nothing is near.
         """
         first, *others = self.initialiser
-        network = [Layer(first.rows[-1 - static.shape[1] :]), *others]
-        rest = np.ascontiguousarray(evaluate(network, static.T).T)
+        seen = first.rows if static.shape[1] + 1 == len(first.rows) else first.rows[self.proximity :]
+        rest = np.ascontiguousarray(evaluate([Layer(seen), *others], static.T).T)
         SoftClamp(self.file.config.latent_bound, rest.shape)(rest)
         rest[diverged(rest)] = 0
         return rest
