@@ -208,6 +208,42 @@ def test_garments_of_a_list_that_a_stage_does_not_mark_are_no_bodies_of_each_oth
     assert not read_stage(train.parse_args(["train", *words, "-o", "out.safetensors"]), silent)[0].bodies
 
 
+def test_a_body_is_not_left_out_for_the_name_of_a_garment_that_another_body_lacks(toy, tmp_path, monkeypatch):
+    """Many stages call each mesh so, beneath a prim with the object's name."""
+    monkeypatch.chdir(toy.copy(tmp_path))
+    for file, meshes in (("dressed", "Torso Tights"), ("bare", "Torso"), ("also", "Torso Clothes/Tights")):
+        Path(f"{file}.usda").write_text(Path("rigged.usda").read_text())
+        layer = Sdf.Layer.FindOrOpen(f"{file}.usda")
+        for place in [f"/Hero/{mesh}" for mesh in meshes.split()]:
+            for prefix in Sdf.Path(place).GetPrefixes():
+                prim = Sdf.CreatePrimInLayer(layer, prefix)
+                prim.specifier, prim.typeName = Sdf.SpecifierDef, prim.typeName or "Xform"
+            assert Sdf.CopySpec(layer, "/Hero/Body", layer, f"{place}/mesh")
+        layer.Save()
+    train = parser(["train"])
+    words = [
+        "train",
+        "dressed.usda",
+        "--motions",
+        "clip.usda",
+        "-o",
+        "out.safetensors",
+        "--body",
+        "^/Hero/Tights/mesh",
+    ]
+    for garment in ("Skirt", "/Hero/Tights/mesh"):
+        options = train.parse_args([*words, "--garment", garment])
+        bodies = [
+            read_stage(options, silent)[0],
+            *(read_member(options, f"{x}.usda", silent) for x in ("bare", "also")),
+        ]
+        for character in bodies:
+            names = [body.mesh.path.partition(":/Hero/")[2] for body in character.bodies]
+            assert names == ["Body", "Torso/mesh"]
+    with pytest.raises(SsilkError, match=r"--body Body --body \^Body, which leave no mesh"):
+        read_stage(train.parse_args([*words[:-1], "Body", "--body", "^Body"]), silent)
+
+
 def test_a_layer_of_a_stage_is_an_input_of_its_training(toy, tmp_path, monkeypatch):
     """So a training is done again once a body has changed that a stage refers to, as with 'family = true'."""
     monkeypatch.chdir(toy.copy(tmp_path))

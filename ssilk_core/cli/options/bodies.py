@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,14 +46,16 @@ def onto_place(options: argparse.Namespace) -> tuple[str, str | None]:
 
 def read_member(options: argparse.Namespace, location: str, report: Reporter, root: str | None = None) -> Character:
     """Read another body of the character; its stage may have the garment of the character's too, which is no body."""
-    from ssilk_usd.reading.character import WITHOUT, bodies_there, read_character
+    from ssilk_usd.reading.character import WITHOUT, bodies_there, body_names, read_character
 
     file, prim = garment_location(options)
     stage, root = split_body(str(options.stage))[0], root or options.root
     worn = prim if is_same_file(file, stage) else None
     own = worn if is_same_file(split_body(location)[0], stage) else None
     bodies = [*options.body, *([f"{WITHOUT}{worn}"] if worn else [])]
-    bodies = bodies_there(location, bodies, root=root, garment=own) if bodies else []
+    if bodies:
+        kept = body_names(stage, options.body, root=options.root, garment=worn)
+        bodies = bodies_there(location, bodies, kept, root=root, garment=own)
     return read_character(location, root=root, bodies=bodies, garment=own, report=report)
 
 
@@ -74,14 +76,15 @@ def left_out_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], fol
     from ...training.wardrobe.listing import garment_file
 
     table = entry.located(folder)
-    stage, (file, own) = str(table["stage"]), garment_file(table)
-    if not Path(split_body(stage)[0]).is_file():
+    stage, (garment, own) = str(table["stage"]), garment_file(table)
+    file = split_body(stage)[0]
+    if not Path(file).is_file():
         return {}  # which is told where it is read
     places = {each.name: garment_file(each.located(folder)) for each in entries if each is not entry}
-    beside = {name: prim for name, (other, prim) in places.items() if prim and is_same_file(other, stage)}
+    beside = {name: prim for name, (other, prim) in places.items() if prim and is_same_file(other, file)}
     if not beside:
         return {}
-    found = unmarked_garments(stage, [*beside.values()], own if is_same_file(file, stage) else None)
+    found = unmarked_garments(stage, [*beside.values()], own if is_same_file(garment, file) else None)
     return {name: [f"{WITHOUT}{path}" for path in found[prim]] for name, prim in beside.items() if found[prim]}
 
 
@@ -93,18 +96,14 @@ def bodies_in_list(
     Raises:
         SsilkError: the stage has no character.
     """
-    left_out, known = left_out_in_list(entry, entries, folder), {each.name: each for each in entries}
-    pairs = {name: ((entry, name), (known[name], entry.name)) for name in left_out}
-    unmet = [name for name, pair in pairs.items() if not any(_is_over(*each, known) for each in pair)]
-    if unmet:
+    left_out = left_out_in_list(entry, entries, folder)
+    beside = [each for each in entries if each.name in left_out]
+    # Whose models 'over' names is not known here.
+    sure = [] if entry.models(entry.table) else [each for each in beside if not each.models(each.table)]
+    if unmet := [each.name for each in sure if each.name not in entry.over and entry.name not in each.over]:
         text = f"{entry.name} does not meet {', '.join(unmet)}: meshes of its stage that are garments of the list"
         report(Message(f"{text} are no bodies; where one is worn over the other, say so with 'over'"))
     return [*dict.fromkeys(each for paths in left_out.values() for each in paths)]
-
-
-def _is_over(entry: WardrobeEntry, name: str, known: Mapping[str, WardrobeEntry]) -> bool:
-    """Return whether a garment is worn over that of a name, or over one that is."""
-    return name in entry.over or any(_is_over(known[inner], name, known) for inner in entry.over)
 
 
 def members(options: argparse.Namespace, report: Reporter) -> list[str]:

@@ -145,6 +145,7 @@ class SeenCloth:
 
         Args:
             away: of the flight from where the points are carried, changed in place.
+            carried, now: where they are carried, and where they are in the frame before.
         """
         normals, offsets, frame = self.course.normals, self.course.offsets, self.frame + 1
         count, away_from = offsets.shape[1], normals[frame + 1]

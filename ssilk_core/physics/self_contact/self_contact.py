@@ -347,7 +347,8 @@ class SelfContact:
         meet that are not known, and which contacts may slow it further.
 
         The step is cut as a whole. Where each vertex stopped by itself, cloth between those that stop and those that
-        go on would stretch, and its energy would rise in all but a short part of the step.
+        go on would stretch, and its energy would rise in all but a short part of the step. What all move alike
+        counts, too, since contacts may hold some of them back; positions are about the character's root.
         """
         x, longest = known.last, step.norm(dim=1).amax(0)
         drift = _drift(x, known).amax(0)

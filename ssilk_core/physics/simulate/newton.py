@@ -14,7 +14,8 @@ that, and one vertex at such a jump would stop its whole garment. When only a sh
 vertices whose energy rises more than predicted are fixed and the others move on. Once these have converged, all fixed
 vertices are released, once.
 
-Where cloth may not pass through cloth, each step is cut short before it does, vertex by vertex (`self_contact`).
+Where cloth may not pass through cloth, each step is cut to what is known of near cloth, and then short before cloth
+meets, vertex by vertex (`self_contact`).
 """
 
 from __future__ import annotations

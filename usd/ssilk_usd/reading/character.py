@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from pxr import Usd, UsdGeom
 
@@ -92,20 +92,45 @@ def unmarked_garments(source: StageLike, garments: Sequence[str], own: str | Non
     return {name: [str(prim.GetPath()) for prim in named(every, name)] for name in garments}
 
 
-def bodies_there(
+def body_names(
     source: StageLike, bodies: Sequence[str], *, root: str | None = None, garment: str | None = None
+) -> set[str]:
+    """Return the names of a character's body meshes, without paths; arguments and errors as `read_character`."""
+    skel = find_skeleton(open_stage(source), root=root, garment=garment)
+    return {prim.GetName() for prim in _body_prims(skel, bodies, garment)}
+
+
+def bodies_there(
+    source: StageLike,
+    bodies: Sequence[str],
+    kept: Collection[str],
+    *,
+    root: str | None = None,
+    garment: str | None = None,
 ) -> list[str]:
     """Return `bodies` for another character, which may lack what is left out of them, or have it elsewhere.
 
+    Args:
+        kept: names of the first character's bodies: a mesh is not left out for such a name alone.
+
     Raises:
-        SsilkError: as `read_character` does, whose arguments these are.
+        SsilkError: as `read_character` does, whose other arguments these are.
     """
     skel, found = find_skeleton(open_stage(source), root=root, garment=garment), [*_taken(bodies)]
     every = [prim for prim in _meshes(skel) if is_skinned(prim, skel) or carried_by(prim, skel)]
     for name in _left_out(bodies):
-        prims = named(every, name) or named(every, name.rpartition("/")[2])
-        found += [f"{WITHOUT}{prim.GetPath()}" for prim in prims]
+        found += [f"{WITHOUT}{prim.GetPath()}" for prim in named(every, name) or _alike(every, name, kept)]
     return found
+
+
+def _alike(prims: list[Usd.Prim], path: str, kept: Collection[str]) -> list[Usd.Prim]:
+    """Return the prims whose paths end as one of another stage, in as many parts as any of them does."""
+    parts = path.split("/")
+    for first in range(1, len(parts)):
+        end = "/".join(parts[first:])
+        if found := [prim for prim in prims if str(prim.GetPath()).endswith(f"/{end}")]:
+            return found if first + 1 < len(parts) or end not in kept else []
+    return []
 
 
 def has_meshes(stage: Usd.Stage, root: str | None, names: Sequence[str]) -> bool:
@@ -150,10 +175,14 @@ def _body_prims(skel: SkelSource, bodies: Sequence[str], garment: str | None) ->
             f"there are {listed(known)}",
             "name one of these with --body",
         )
+    without = [prim for name in _left_out(bodies) for prim in named(every, name)]
     if taken := _taken(bodies):
-        return [prim for name in taken for prim in named(known, name)]
-    others = [*_left_out(bodies), *filter(None, [garment])]
-    left_out = [prim for name in others for prim in named(every, name)]
+        kept = [prim for name in taken for prim in named(known, name) if prim not in without]
+        if not kept:
+            given, allowed = " ".join(f"--body {name}" for name in bodies), "a body has a mesh at least"
+            fail(location(skel.root), f"{given}, which leave no mesh", allowed, f"leave {WITHOUT}{taken[0]} out")
+        return kept
+    left_out = without + (named(every, garment) if garment else [])
     drawn = [prim for prim in every if is_drawn(prim) and is_body(prim) and prim not in left_out]
     return [prim for prim in drawn if prim in meshes] or [prim for prim in drawn if carried_by(prim, skel)]
 

@@ -43,7 +43,7 @@ def read_scene(
     Args:
         source: the character's file or open stage.
         root: SkelRoot or Skeleton, by path or name, if there are several.
-        bodies: body meshes, by path or name; all if empty.
+        bodies: body meshes, as `read_character` takes them.
         garment: a mesh of the stage, by path or name, or "FILE[:/Prim/Path]" for a garment in its own file.
         report: receives a message about each assumption.
 
