@@ -133,8 +133,8 @@ def degenerate_faces(mesh: Mesh, collapsing: int) -> Findings:
 def two_layers(mesh: Mesh) -> Findings:
     """Yield large islands that are shells: nearly everywhere another layer of them is behind, at about one distance.
 
-    Pleats have layers at many distances. Small islands may be buttons, and what is up to some four times as wide as thick, such as
-    a cord, is solid.
+    Pleats have layers at many distances. Small islands may be buttons, and what is up to some four times as wide as
+    thick, such as a cord, is solid.
     """
     look, corners = _Sight(mesh), mesh.points[mesh.faces]
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
