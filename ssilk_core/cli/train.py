@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from ..devices import default_preset, select_device
 from ..errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_WORSE, fail, fail_unknown
-from ..events import Message, Reporter, Result, TextReporter, format_seconds, silent
+from ..events import Message, Reporter, Result, TextReporter, format_count, format_seconds, silent
 from ..files import split_body
 from ..network.settings import ModelConfig, apply_overrides, setting_names
 from ..scene.fabric_range import FACTORS, FabricRange
@@ -211,7 +211,7 @@ def _compared(total: float, lbs: float) -> str:
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
     """Read everything that the options name; return it as a `TrainJob` on a device."""
-    from ssilk_usd.reading.motion import motion_files, read_motions
+    from ssilk_usd.reading.motion import distinct, motion_files, motion_sources, read_motions
 
     from ..files import sha256
     from ..network.checkpoint import load_model
@@ -232,6 +232,13 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     if fabrics:
         report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
     report(Message("the motions are read"))
+    named = motion_sources(options.motions)
+    known, shared = distinct(named), distinct(motion_sources(options.valid))
+    if len(named) > len(known):
+        report(Message(f"--motions names {len(known)} motions, some of them twice: each counts once", "warning"))
+    if both := len(known.keys() & shared.keys()):
+        found = f"--valid names {format_count(both, 'motions')} that --motions has"
+        report(Message(f"{found}: on these a validation does not tell how unseen motion will look", "warning"))
     motions = read_motions(options.motions, scene.character.skeleton)
     held = read_motions(options.valid, scene.character.skeleton)
     tell_shapes(options, (*motions, *held), report, trained=scene.character)

@@ -786,3 +786,30 @@ def test_one_frame_can_be_baked(toy, tmp_path, monkeypatch):
     stage = Usd.Stage.Open("new.usdc")
     assert stage.GetStartTimeCode() == stage.GetEndTimeCode() == 0
     assert animation(stage).GetRotationsAttr().GetTimeSamples() == [0.0]
+
+
+def test_motions_that_are_named_twice_count_once_and_are_told(toy, tmp_path, monkeypatch):
+    """They would be validated on by what was trained on."""
+    from ssilk_core.cli.main import parser
+    from ssilk_core.cli.train import training_job
+
+    monkeypatch.chdir(toy.copy(tmp_path))
+    Path("walks").mkdir()
+    for name in "abcde":
+        Path(f"walks/{name}.usda").write_text(Path("clip.usda").read_text())
+    Path("runs").symlink_to("walks")
+
+    def job(motions: str, *valid: str):
+        told: list[Any] = []
+        words = ["train", "rigged.usda", "--motions", *motions.split(), "-o", "x.safetensors", *valid, *toy.training]
+        found = training_job(parser(["train"]).parse_args(words), "cpu", told.append)
+        return found, [event.text for event in told if getattr(event, "level", "") == "warning"]
+
+    once, heard = job("walks")
+    assert (len(once.motions), len(once.held_out), heard) == (4, 1, [])
+    twice, heard = job("walks runs walks/a.usda")
+    assert [motion.path for motion in twice.motions] == [motion.path for motion in once.motions] and len(heard) == 1
+    assert "names 5 motions, some of them twice: each counts once" in heard[0]
+    seen, heard = job("walks", "--valid", "runs/b.usda")
+    assert (len(seen.motions), len(seen.held_out), len(heard)) == (5, 1, 1)
+    assert "--valid names 1 motion that --motions has: on these a validation does not tell" in heard[0]

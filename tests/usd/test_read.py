@@ -596,6 +596,9 @@ def test_of_several_animations_one_is_named_with_the_file(tmp_path):
     motions = read_motions([f"{path}:/Other", Path(f"{path}:/Clip")], SKELETON)
     assert [(motion.path, motion.start) for motion in motions] == [(f"{path}:/Other", 5), (f"{path}:/Clip", 0)]
     assert motion_files([Path(f"{path}:/Other"), tmp_path]) == [path, path]
+    (tmp_path / "link").symlink_to(tmp_path)
+    again = read_motions([f"{path}:/Other", f"{path}:/Clip", f"{tmp_path}/link/two.usda:/Other"], SKELETON)
+    assert [motion.path for motion in again] == [motion.path for motion in motions]
     with pytest.raises(SsilkError, match="no SkelAnimation is named '/Hat'"):
         read_motion(f"{path}:/Hat", SKELETON)
 

@@ -44,10 +44,21 @@ _MOST_FRAMES = 200_000  # close to two hours at 30 frames a second
 def read_motions(paths: Iterable[str | Path], skeleton: Skeleton) -> list[Motion]:
     """Read several motions, each given as "file[:/Prim/Path]"; a folder means all USD files in it, sorted by name.
 
+    Each is read once, however often it is named.
+
     Raises:
         SsilkError: a folder has no USD files; also as `read_motion`.
     """
-    return [read_motion(path, skeleton) for path in motion_sources(paths)]
+    return [read_motion(path, skeleton) for path in distinct(motion_sources(paths)).values()]
+
+
+def distinct(sources: Iterable[Path]) -> dict[tuple[Path, str | None], Path]:
+    """Return motions that `motion_sources` found, each once, by its file, links followed, and its prim."""
+    found: dict[tuple[Path, str | None], Path] = {}
+    for source in sources:
+        file, prim = split_location(str(source))
+        found.setdefault((Path(file).resolve(), prim), source)
+    return found
 
 
 def motion_files(paths: Iterable[str | Path]) -> list[Path]:
