@@ -27,10 +27,11 @@ def shade(lit: LitGeometry, hits: Hits, view: Floats, rig: Lighting, lamps: Ints
     geometry, corners = lit.geometry, lit.geometry.faces[hits.faces]
     normals = _mixed(geometry.normals, corners, hits)
     normals /= np.sqrt(_dot(normals, normals))[:, None]
-    smooth = _smooth_points(lit, corners, hits)
     seen_inside = _faces_away(lit, corners, view)
     thin = geometry.thin[corners[:, 0]]
-    normals = np.where((seen_inside & thin)[:, None], -normals, normals)
+    side = np.where(seen_inside & thin, np.float32(-1), np.float32(1))
+    normals *= side[:, None]
+    smooth = _smooth_points(lit, corners, hits, side)
     albedo = _of_side(geometry.outside, geometry.inside, seen_inside, corners, hits)
     light = _of_side(lit.sky_outside, lit.sky_inside, seen_inside & thin, corners, hits)
     light += _key_light(lit, smooth, normals, rig, lamps)[:, None] * KEY
@@ -62,14 +63,15 @@ def _faces_away(lit: LitGeometry, corners: Ints, view: Floats) -> np.ndarray:
     return _dot(np.cross(b - a, c - a), view) > 0
 
 
-def _smooth_points(lit: LitGeometry, corners: Ints, hits: Hits) -> Floats:
+def _smooth_points(lit: LitGeometry, corners: Ints, hits: Hits, side: Floats) -> Floats:
     """Move hits from flat faces onto the curved surface implied by the vertex normals, shape (N, 3).
 
-    Otherwise shadow rays from coarse faces hit adjacent faces, and the shadow's edge shows the triangles
+    They move towards the side that is seen, 1 for the outside and -1 for the inside (N,), where it bulges. Otherwise
+    shadow rays from coarse faces hit adjacent faces, and the shadow's edge shows the triangles
     (Hanika, "Hacking the Shadow Terminator", Ray Tracing Gems II, 2021).
     """
     points = _mixed(lit.geometry.points, corners, hits)
-    corner_normals = lit.geometry.normals[corners]
+    corner_normals = side[:, None, None] * lit.geometry.normals[corners]
     depth = np.minimum(_dot(points[:, None] - lit.geometry.points[corners], corner_normals), 0)
     return points - np.einsum("nk,nkc->nc", hits.barycentric * depth, corner_normals)
 

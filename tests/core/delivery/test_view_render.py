@@ -109,6 +109,23 @@ def test_cloth_is_darker_inside():
     assert inside / outside == pytest.approx(INSIDE_SHADE ** (1 / 2.2), abs=0.04)
 
 
+def test_shadows_on_the_inside_of_cloth_do_not_show_its_faces():
+    """A trough whose inside is seen: coarse faces are lit as fine ones."""
+    pictures = []
+    for columns in (14, 200):
+        angle, height = np.radians(np.linspace(-85, 85, columns)), np.linspace(-1, 1, 7)
+        points = np.array([[np.sin(a), y, -np.cos(a)] for a in angle for y in height])
+        first = (np.arange(columns - 1)[:, None] * 7 + np.arange(6)).reshape(-1)
+        halves = [first, first + 8, first + 7], [first, first + 1, first + 8]
+        trough = Surface(
+            "trough", points, np.concatenate([np.stack(half, 1) for half in halves]), GREY, two_sided=True
+        )
+        pictures.append(render([trough], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW).astype(int))
+    middle = np.s_[HEIGHT // 4 : 3 * HEIGHT // 4, WIDTH // 2 - 42 : WIDTH // 2 + 42]
+    away = np.abs(pictures[0][middle] - pictures[1][middle])
+    assert np.percentile(away, 95) < 10  # all but the edge of the shadow that its rim casts
+
+
 def test_smooth_normals_hide_the_facets():
     coarse = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
     image = render([Surface("ball", coarse.vertices, coarse.faces, GREY)], AHEAD, WIDTH, HEIGHT, ground=FAR_BELOW)
