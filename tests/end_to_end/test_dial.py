@@ -56,6 +56,7 @@ def measured(script, world):
     return json.loads((world / "dial.json").read_text())
 
 
+@pytest.mark.slow
 def test_each_place_is_measured_from_its_own_two_states(measured):
     rows = {(row["split"], row["place"]): row for row in measured["figures"]}
     assert "unfinished" not in measured and len(rows) == len(measured["figures"]) == 2 * 11

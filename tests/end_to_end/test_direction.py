@@ -182,6 +182,7 @@ def test_what_happened_before_the_garment_was_held_is_forgotten(stage):
 @pytest.mark.parametrize(
     "more", [[], ["--refined-output", "points"], ["--feedback"]], ids=["joints", "points", "hero"]
 )
+@pytest.mark.slow
 def test_a_refined_garment_is_held_where_skinning_has_it(stage, more):
     direct("clip.usda", free={8: 0.0, 14: 1.0})
     skinned = baked("lbs.usdc", "clip.usda", "--lbs")

@@ -130,6 +130,7 @@ def test_what_every_task_would_refuse_is_refused_when_a_job_is_submitted(farm, c
     assert capsys.readouterr().err.count("a.usda: poses that are held for 2 frames") == 1
 
 
+@pytest.mark.slow
 def test_a_bundle_runs_unchanged_and_a_bad_shot_ends_no_session(farm):
     """A shot fails, the other of its chunk and the next chunk are baked, and the last step says which is missing.
 

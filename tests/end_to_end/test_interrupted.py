@@ -22,7 +22,7 @@ from safetensors.torch import load_file
 from ssilk_core.cli import main
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE
 from ssilk_core.network.checkpoint import load_model
-from ssilk_core.physics.collision import samples
+from ssilk_core.physics import samples
 
 TRAINED = (EXIT_OK, EXIT_WORSE)  # so few iterations may do no good
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="processes are forked, and killed by a signal")

@@ -216,6 +216,7 @@ def test_python_gets_the_figures(stage):
     assert found.travel_m == pytest.approx(0.5, abs=0.1) and found.closed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("output", ["joints", "points"])
 def test_a_refined_round_is_told_by_its_own_frames_and_the_network_s_rounds(stage, output):
     hold_parts("cycle.usda", {f"ssilk:free:{proxies_of('rigged.usda')[0].rpartition('/')[2]}": {0: 0.5}})

@@ -175,6 +175,7 @@ def codes(found: dict, name: str) -> list[str]:
     return [finding["code"] for finding in found["garments"][name]["findings"]]
 
 
+@pytest.mark.slow
 def test_a_list_is_inspected_settled_apart_trained_and_baked(toy, copy, capsys):
     """From a list whose garments start inside each other to a folder and to one glb of both."""
     write_outfit(toy)
@@ -312,6 +313,7 @@ def test_an_outer_garment_is_refined_over_the_inner_one_as_it_lies_in_its_file(c
         assert len(np.unique(intersections_between(coat, faces, skirt, faces)[:, 0])) < 0.2 * len(faces), frame
 
 
+@pytest.mark.slow
 def test_what_was_refined_over_cloth_that_is_another_now_is_told(copy, capsys):
     """By later bakes into the folder, by remove, verify and report; and it is baked again, also by a farm."""
     coat, few = "layers/shots/walk/coat/anim.usdc", "--refine 1 --range 4-5"

@@ -24,7 +24,7 @@ from ssilk_core.cli import main
 from ssilk_core.delivery.bake import BakeRollout, bake_layers
 from ssilk_core.errors import EXIT_OK, EXIT_WORSE
 from ssilk_core.network.checkpoint import load_model, save_model
-from ssilk_core.physics.collision import samples
+from ssilk_core.physics import samples
 
 EVENTS = {"started", "progress", "message", "checkpoint", "result", "failed"}
 SHOT = "bake model.safetensors --stage rigged.usda --motion clip.usda"
@@ -238,7 +238,7 @@ def test_an_interrupted_training_goes_on_to_the_same_model(world):
     )
     train = [*shlex.split("train rigged.usda --motions clip.usda"), *world.training, *shlex.split(settings)]
     # Contacts are as few as in this process: both have the same loss.
-    code = "import sys; from ssilk_core.cli import main; from ssilk_core.physics.collision import samples;"
+    code = "import sys; from ssilk_core.cli import main; from ssilk_core.physics import samples;"
     code += f"samples.MAX_SPACING = {samples.MAX_SPACING}; sys.exit(main())"
     process = subprocess.Popen(
         [sys.executable, "-c", code, *train, "-o", "halved.safetensors", "--json"],

@@ -453,6 +453,7 @@ def test_a_network_that_sees_colliders_plays_as_the_player_does(stage, capsys):
     np.testing.assert_array_equal(points_of("latent.usdc"), points_of("latent_plain.usdc"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [["--refine", "30"], ["--refine", "30", "--feedback"]], ids=["refine", "feedback"])
 def test_a_refined_skirt_stays_above_the_floor_and_verifies(stage, capsys, more):
     assert main([*BAKE, "plain.usda", "-o", "plain_refined.usdc", *more]) == 0

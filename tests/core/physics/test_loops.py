@@ -129,6 +129,7 @@ def test_results_do_not_depend_on_the_number_of_threads(body, queries):
     assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
 
 
+@pytest.mark.slow
 def test_a_step_depends_on_the_number_of_threads_by_rounding_alone(scene, toy_model, toy_motion, toy_objective):
     """Energies, contact, skinning and proxies, forward and backward; PyTorch splits its products by threads."""
     model = toy_model(scene, translations=True)

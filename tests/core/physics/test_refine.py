@@ -147,7 +147,7 @@ def test_shots_at_once_are_what_each_is_by_itself(scene, rollout) -> None:
     for number, shot in enumerate(shots):
         found = np.stack([frame[number].points for frame in frames if len(frame) > number])
         alone, changes = refined(scene, *shot, ROUGH, iterations=3, feedback=True)
-        assert np.abs(found - alone).max() < 1e-5
+        assert np.abs(found - alone).max() < 1e-4  # steps that do not converge amplify rounding
         assert frames[2][number].change.after == pytest.approx(changes[2].after, rel=1e-4)
     with pytest.raises(SsilkError, match="the longest first"):
         next(refiner.shots_at_once(*zip(*shots[::-1])))
