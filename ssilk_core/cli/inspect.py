@@ -172,7 +172,7 @@ def _on_family(options: argparse.Namespace, inputs: PreflightInput, report: Repo
         return _parameters(inputs)
     from ..authoring.bodies.differences import family_findings
 
-    others = [read_member(options, member, report) for member in members(options, report)]
+    others = [read_member(options, member, inputs.character, report) for member in members(options, report)]
     return list(family_findings([inputs.character, *others]))
 
 

@@ -143,7 +143,7 @@ def _on_other(options: argparse.Namespace, scene: Scene, report: Reporter) -> Sc
 
     path = scene.garment.mesh.path
     file, root = onto_place(options)
-    other = read_member(options, file, report, root)
+    other = read_member(options, file, scene.character, report, root)
     if found := differences(scene.character, other):
         _need_map(options, scene, other, found)
     family = need_family([scene.character, other])

@@ -36,7 +36,7 @@ from .options.numbers import NumberRange
 from .options.scene import add_scene, garment_location, load_scene
 
 if TYPE_CHECKING:
-    from ..scene.assets import Scene
+    from ..scene.assets import Character, Motion, Scene
     from ..scene.family import DressedFamily
     from ..training.job import TrainJob
 
@@ -211,12 +211,12 @@ def _compared(total: float, lbs: float) -> str:
 
 def training_job(options: argparse.Namespace, device: str, report: Reporter):  # type: ignore[no-untyped-def]  # its type is heavy
     """Read everything that the options name; return it as a `TrainJob` on a device."""
-    from ssilk_usd.reading.motion import distinct, motion_files, motion_sources, read_motions
+    from ssilk_usd.reading.motion import motion_files
 
     from ..files import sha256
     from ..network.checkpoint import load_model
     from ..training.inner_garments import InnerModel
-    from ..training.job import TrainJob, split_motions
+    from ..training.job import TrainJob
 
     if not options.preset:
         options.preset = default_preset(device)
@@ -231,20 +231,7 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     fabrics = None if options.fabrics is None else FabricRange.of(fabric, options.fabrics)
     if fabrics:
         report(Message(f"fabrics are drawn as factors of '{fabric.name}': {fabrics.words()}"))
-    report(Message("the motions are read"))
-    named = motion_sources(options.motions)
-    known, shared = distinct(named), distinct(motion_sources(options.valid))
-    if len(named) > len(known):
-        report(Message(f"--motions names {len(known)} motions, some of them twice: each counts once", "warning"))
-    if both := len(known.keys() & shared.keys()):
-        found = f"--valid names {format_count(both, 'motions')} that --motions has"
-        report(Message(f"{found}: on these a validation does not tell how unseen motion will look", "warning"))
-    motions = read_motions(options.motions, scene.character.skeleton)
-    held = read_motions(options.valid, scene.character.skeleton)
-    tell_shapes(options, (*motions, *held), report, trained=scene.character)
-    if not held:
-        motions, held = split_motions(motions)
-        report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
+    motions, held = _read_motions(options, scene.character, report)
     trained = options.stepper_of or options.start_from
     base = load_model(trained) if trained else None
     if base:
@@ -284,6 +271,30 @@ def training_job(options: argparse.Namespace, device: str, report: Reporter):  #
     )
 
 
+def _read_motions(
+    options: argparse.Namespace, character: Character, report: Reporter
+) -> tuple[list[Motion], list[Motion]]:
+    """Read the motions to train on and those to validate on, and tell which are named twice."""
+    from ssilk_usd.reading.motion import distinct, motion_sources, read_motions
+
+    from ..training.job import split_motions
+
+    report(Message("the motions are read"))
+    named, held_out = motion_sources(options.motions), motion_sources(options.valid)
+    known = distinct(named)
+    if len(named) > len(known):
+        report(Message(f"--motions names {len(known)} motions, some of them twice: each counts once", "warning"))
+    if both := len(known.keys() & distinct(held_out).keys()):
+        found = f"--valid names {format_count(both, 'motions')} that --motions has"
+        report(Message(f"{found}: on these a validation does not tell how unseen motion will look", "warning"))
+    motions, held = (read_motions(sources, character.skeleton) for sources in (named, held_out))
+    tell_shapes(options, (*motions, *held), report, trained=character)
+    if not held:
+        motions, held = split_motions(motions)
+        report(Message(f"validating on {len(held)} of {len(motions) + len(held)} motions, training on the rest"))
+    return motions, held
+
+
 def _family(options: argparse.Namespace, others: Sequence[str], scene: Scene, report: Reporter) -> DressedFamily:
     """Return the scene's garment on the bodies of --family, and say what of it stays in one.
 
@@ -294,7 +305,7 @@ def _family(options: argparse.Namespace, others: Sequence[str], scene: Scene, re
     from ..authoring.bodies.differences import need_family
     from ..authoring.preflight.fit import describe_left
 
-    characters = [read_member(options, other, report) for other in others]
+    characters = [read_member(options, other, scene.character, report) for other in others]
     bodies = need_family([scene.character, *characters], trained=True)
     how = ", and graded to each" if options.graded else ""
     report(Message(f"the garment is carried onto {len(characters)} more bodies, along {bodies.size} directions{how}"))

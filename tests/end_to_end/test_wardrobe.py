@@ -198,7 +198,8 @@ def test_garments_of_a_list_that_a_stage_does_not_mark_are_no_bodies_of_each_oth
         words = wardrobe._with_bodies(entry, entries, tmp_path, heard.append).words
         options = train.parse_args(["train", *words, "-o", "out.safetensors"])
         assert options.body == worn[entry.name]
-        for character in (read_stage(options, silent)[0], read_member(options, "heavy.usda", silent)):
+        first = read_stage(options, silent)[0]
+        for character in (first, read_member(options, "heavy.usda", first, silent)):
             assert [body.mesh.path.rpartition("/")[2] for body in character.bodies] == ["Body", "Boots"], entry.name
     assert [event.text.partition(":")[0] for event in heard] == ["skirt does not meet tights, cloak"]
     alone = [entry for entry in entries if entry.name == "cloak"]
@@ -233,11 +234,8 @@ def test_a_body_is_not_left_out_for_the_name_of_a_garment_that_another_body_lack
     ]
     for garment in ("Skirt", "/Hero/Tights/mesh"):
         options = train.parse_args([*words, "--garment", garment])
-        bodies = [
-            read_stage(options, silent)[0],
-            *(read_member(options, f"{x}.usda", silent) for x in ("bare", "also")),
-        ]
-        for character in bodies:
+        first = read_stage(options, silent)[0]
+        for character in (first, *(read_member(options, f"{x}.usda", first, silent) for x in ("bare", "also"))):
             names = [body.mesh.path.partition(":/Hero/")[2] for body in character.bodies]
             assert names == ["Body", "Torso/mesh"]
     with pytest.raises(SsilkError, match=r"--body Body --body \^Body, which leave no mesh"):

@@ -44,9 +44,11 @@ def onto_place(options: argparse.Namespace) -> tuple[str, str | None]:
     return body_of(file, str(options.stage)), root
 
 
-def read_member(options: argparse.Namespace, location: str, report: Reporter, root: str | None = None) -> Character:
-    """Read another body of the character; its stage may have the garment of the character's too, which is no body."""
-    from ssilk_usd.reading.character import WITHOUT, bodies_there, body_names, read_character
+def read_member(
+    options: argparse.Namespace, location: str, first: Character, report: Reporter, root: str | None = None
+) -> Character:
+    """Read another body of the first character; its stage may have that one's garment too, which is no body."""
+    from ssilk_usd.reading.character import WITHOUT, bodies_there, read_character
 
     file, prim = garment_location(options)
     stage, root = split_body(str(options.stage))[0], root or options.root
@@ -54,7 +56,7 @@ def read_member(options: argparse.Namespace, location: str, report: Reporter, ro
     own = worn if is_same_file(split_body(location)[0], stage) else None
     bodies = [*options.body, *([f"{WITHOUT}{worn}"] if worn else [])]
     if bodies:
-        kept = body_names(stage, options.body, root=options.root, garment=worn)
+        kept = {body.mesh.path.rpartition("/")[2] for body in (*first.bodies, *first.stand_ins)}
         bodies = bodies_there(location, bodies, kept, root=root, garment=own)
     return read_character(location, root=root, bodies=bodies, garment=own, report=report)
 

@@ -92,14 +92,6 @@ def unmarked_garments(source: StageLike, garments: Sequence[str], own: str | Non
     return {name: [str(prim.GetPath()) for prim in named(every, name)] for name in garments}
 
 
-def body_names(
-    source: StageLike, bodies: Sequence[str], *, root: str | None = None, garment: str | None = None
-) -> set[str]:
-    """Return the names of a character's body meshes, without paths; arguments and errors as `read_character`."""
-    skel = find_skeleton(open_stage(source), root=root, garment=garment)
-    return {prim.GetName() for prim in _body_prims(skel, bodies, garment)}
-
-
 def bodies_there(
     source: StageLike,
     bodies: Sequence[str],
