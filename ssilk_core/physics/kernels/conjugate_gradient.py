@@ -8,7 +8,6 @@ the programs of the next kernel sum these in a fixed order. The host is not invo
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -17,8 +16,10 @@ import triton.language as tl
 from torch import Tensor
 
 from ..captured import captured, replays, rounded_up
+from .slopes import SlopeTable, summed_slopes
 
 ROWS, FRAMES, WARPS = 16, 32, 4  # rows, maximum number of frames, and warps of one program
+LEAST_SLOPES = 1024  # for which a graph has room
 CHUNK = tl.constexpr(32)  # parts of an inner product summed together
 TINY = tl.constexpr(1.1754943508222875e-38)
 
@@ -37,7 +38,7 @@ class BlockTable:
     columns: Tensor
     places: Tensor
     counts: Tensor
-    captured: dict[tuple[int, int, float], _CapturedSolve] = field(default_factory=dict, init=False)
+    captured: dict[tuple[int, int, int, float], _CapturedSolve] = field(default_factory=dict, init=False)
 
 
 def solve_kernel(
@@ -48,7 +49,7 @@ def solve_kernel(
     reduction: float,
     iterations: int,
     check_every: int,
-    add_product: Callable[[Tensor, Tensor], None] | None = None,
+    slopes: SlopeTable | None = None,
 ) -> tuple[Tensor, int]:
     """Return the result of `simulate.conjugate_gradient.solve`, preconditioned with the inverse diagonal blocks.
 
@@ -56,20 +57,20 @@ def solve_kernel(
         blocks: as stored, shape (S, 3, 3, N), float32.
         inverse: shape (U, 3, 3, N); right: shape (U, 3, N).
         check_every: iterations between convergence checks, which synchronise with the GPU.
-        add_product: adds the product of another matrix with vectors (U, 3, N) to such vectors, or None.
+        slopes: G of a stiffness G'G that is added, or None.
     """
-    if add_product is None and iterations % check_every == 0 and replays(right):
-        capacity = rounded_up(right.shape[-1])
-        key = capacity, check_every, reduction
+    if iterations % check_every == 0 and replays(right):
+        room = 0 if slopes is None else max(LEAST_SLOPES, triton.next_power_of_2(len(slopes.frame)))
+        key = rounded_up(right.shape[-1]), room, check_every, reduction
         if key not in table.captured:
             table.captured[key] = _CapturedSolve(blocks, table, right, *key)
-        return table.captured[key](blocks, inverse, right, iterations)
+        return table.captured[key](blocks, inverse, right, slopes, iterations)
     own = _Search(
-        blocks.contiguous(), table, inverse.contiguous(), right.clone(memory_format=torch.contiguous_format)
+        blocks.contiguous(), table, inverse.contiguous(), right.clone(memory_format=torch.contiguous_format), slopes
     )
     own.begin(reduction)
     for done in range(1, iterations + 1):
-        own.iterate(add_product)
+        own.iterate()
         if done % check_every == 0 and own.has_converged():
             break
     return own.z, done
@@ -82,12 +83,18 @@ class _Search:
         residual: the right side.
     """
 
-    def __init__(self, blocks: Tensor, table: BlockTable, inverse: Tensor, residual: Tensor) -> None:
+    def __init__(
+        self, blocks: Tensor, table: BlockTable, inverse: Tensor, residual: Tensor, slopes: SlopeTable | None
+    ) -> None:
         rows, _, frames = residual.shape
         tile = min(FRAMES, triton.next_power_of_2(frames))
         self.grid = triton.cdiv(rows, ROWS), triton.cdiv(frames, tile)
         self.size = rows, frames, ROWS, tile
         self.blocks, self.table, self.inverse, self.residual = blocks, table, inverse, residual
+        self.slopes = slopes
+        none = table.counts  # read by nobody
+        self.given = (none,) * 5 if slopes is None else (slopes.values, slopes.entries, slopes.first, slopes.last,
+                                                         residual.new_empty(len(slopes.frame)))  # fmt: skip
         self.y, self.step, self.image, self.z = (torch.empty_like(residual) for _ in range(4))
         self.product, self.fresh, self.enough = residual.new_empty(3, frames).unbind()
         self.along, self.left = residual.new_empty(2, self.grid[0], frames).unbind()
@@ -100,15 +107,15 @@ class _Search:
         self.product.copy_((self.residual * self.y).sum((0, 1)))
         self.enough.copy_(self.product * reduction**2)
 
-    def iterate(self, add_product: Callable[[Tensor, Tensor], None] | None = None) -> None:
+    def iterate(self) -> None:
         """Make an iteration."""
         columns, places, counts = self.table.columns, self.table.places, self.table.counts
-        _multiply[self.grid](self.blocks, columns, places, counts, self.step, self.image, self.along,
-                             columns.shape[1], *self.size, num_warps=WARPS)  # fmt: skip
+        if self.slopes is not None:
+            self.slopes.along(self.step, self.given[-1])
+        _multiply[self.grid](self.blocks, columns, places, counts, self.step, self.image, self.along, *self.given,
+                             len(self.given[-1]), columns.shape[1], *self.size, self.slopes is not None,
+                             num_warps=WARPS)  # fmt: skip
         parts = self.grid[0]
-        if add_product is not None:
-            add_product(self.step, self.image)
-            self.along[0], parts = (self.step * self.image).sum((0, 1)), 1
         _descend[self.grid](self.z, self.residual, self.y, self.step, self.image, self.inverse, self.product,
                             self.enough, self.along, self.left, parts, *self.size, num_warps=WARPS)  # fmt: skip
         _turn[self.grid](self.step, self.y, self.product, self.fresh, self.left, self.grid[0], *self.size,
@@ -124,13 +131,22 @@ class _CapturedSolve:
     """A solve in memory of its own, with graphs of its beginning and of some iterations (`physics.captured`)."""
 
     def __init__(
-        self, blocks: Tensor, table: BlockTable, right: Tensor, capacity: int, several: int, reduction: float
+        self,
+        blocks: Tensor,
+        table: BlockTable,
+        right: Tensor,
+        capacity: int,
+        room: int,
+        several: int,
+        reduction: float,
     ) -> None:
+        slopes = SlopeTable.empty(room, len(right), capacity, right.device) if room else None
         own = _Search(
             blocks.new_zeros(*blocks.shape[:-1], capacity),
             table,
             blocks.new_zeros(len(right), 3, 3, capacity),
             right.new_zeros(*right.shape[:-1], capacity),
+            slopes,
         )
         self._own, self._several = own, several + several % 2  # `product` and `fresh` change places in each
 
@@ -141,10 +157,14 @@ class _CapturedSolve:
         device = right.device
         self._begin, self._iterate = captured(lambda: own.begin(reduction), device), captured(iterate, device)
 
-    def __call__(self, blocks: Tensor, inverse: Tensor, right: Tensor, iterations: int) -> tuple[Tensor, int]:
+    def __call__(
+        self, blocks: Tensor, inverse: Tensor, right: Tensor, slopes: SlopeTable | None, iterations: int
+    ) -> tuple[Tensor, int]:
         own, frames = self._own, right.shape[-1]
         for kept, given in ((own.blocks, blocks), (own.inverse, inverse), (own.residual, right)):
             kept[..., :frames].copy_(given)
+        if own.slopes is not None and slopes is not None:
+            own.slopes.put(slopes)
         own.residual[..., frames:].zero_()  # what is solved for nothing has converged
         self._begin.replay()
         done = 0
@@ -192,8 +212,8 @@ def _summed(parts, count, frames, n, block_n: tl.constexpr):
 
 
 @triton.jit
-def _multiply(blocks, columns, places, counts, step, image, along, width, rows, frames,
-              block_u: tl.constexpr, block_n: tl.constexpr):  # fmt: skip
+def _multiply(blocks, columns, places, counts, step, image, along, values, entries, first, last, slips, slopes,
+              width, rows, frames, block_u: tl.constexpr, block_n: tl.constexpr, sloped: tl.constexpr):  # fmt: skip
     u, n, inside, own = _tile(rows, frames, block_u, block_n)
     count = tl.load(counts + u, mask=u < rows, other=0)
     zero = tl.zeros((block_u, block_n), tl.float32)
@@ -212,6 +232,9 @@ def _multiply(blocks, columns, places, counts, step, image, along, width, rows, 
         ax += xx * vx + xy * vy + xz * vz
         ay += yx * vx + yy * vy + yz * vz
         az += zx * vx + zy * vy + zz * vz
+    if sloped:
+        at = u[:, None] * frames + n[None, :]
+        ax, ay, az = summed_slopes(values, entries, first, last, slips, slopes, at, inside, ax, ay, az)
     _store3(image + own, frames, inside, ax, ay, az)
     sx, sy, sz = _load3(step + own, frames, inside)
     tl.store(along + tl.program_id(0) * frames + n, tl.sum(ax * sx + ay * sy + az * sz, axis=0), mask=n < frames)

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from ...errors import fail
 from ...scene.mesh import topology
-from .. import loops
+from .. import kernels, loops
 from ..energy.collision import ContactLaw
 from ..framed import consecutive
 from .cloth import TouchingCloth
@@ -189,9 +189,11 @@ class PairKind:
             middles[0], reaches[0], middles[1], reaches[1], groups=groups, ascending=ascending
         )
         one, other = self.first[first].T, self.second[second].T
-        distance = self.measure(at[torch.cat([one, other]), :, frame].movedim(-1, 1)).distance
+        none = at.new_zeros(len(frame))
+        pairs = KnownPairs(frame, first, second, none, none)
+        distance = self.at([at], pairs)[0].distance
         kept = (distance < reach) & (one[:, None] != other).flatten(0, 1).all(0)
-        return KnownPairs(frame, first, second, distance, torch.zeros_like(distance)).kept(kept)
+        return replace(pairs, distance=distance).kept(kept)
 
     def close(self, x: Tensor, pairs: KnownPairs, moved: Tensor, near: float, step: Tensor | None = None) -> Tensor:
         """Return the rows of pairs that are close at positions x (V, 3, N).
@@ -204,6 +206,11 @@ class PairKind:
         """
         if step is not None:
             moved = moved + step.norm(dim=1) / CLOSING
+        if kernels.available(x.device):
+            from ..kernels.separations import close_kernel
+
+            own = self.first, self.second, pairs.frame, pairs.first, pairs.second, pairs.distance
+            return close_kernel(x, *own, moved, near, step, CLOSING).nonzero()[:, 0]
         moves = moved[self.first].amax(1), moved[self.second].amax(1)
         if loops.available(x.device):
             from ..loops.separations import close_loop
@@ -228,6 +235,11 @@ class PairKind:
 
     def at(self, places: Sequence[Tensor], pairs: KnownPairs) -> list[Separations]:
         """Return how pairs are separated at several positions (V, 3, N), or at (V, 3, 1) for all frames."""
+        if kernels.available(pairs.frame.device):
+            from ..kernels.separations import separations_kernel
+
+            own = self.first, self.second, pairs.frame, pairs.first, pairs.second
+            return [Separations(*separations_kernel(x, *own)) for x in places]
         vertices, none = self.vertices(pairs), torch.zeros_like(pairs.frame)
         corners = [x[vertices, :, pairs.frame if x.shape[-1] > 1 else none] for x in places]
         found, count = self.measure(torch.cat(corners, dim=1).movedim(-1, 1)), len(none)

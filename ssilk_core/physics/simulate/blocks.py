@@ -56,11 +56,17 @@ class BlockMatrix:
             image += added.permute(2, 0, 1)
         return image
 
-    def inverse_diagonal(self) -> Tensor:
-        """Return the inverses of the blocks on the diagonal, shape (U, 3, 3, N)."""
+    def inverse_diagonal(self, added: Tensor | None = None) -> Tensor:
+        """Return the inverses of the blocks on the diagonal, shape (U, 3, 3, N).
+
+        Args:
+            added: to these blocks, in place of those of `contacts`.
+        """
         diagonal = self.blocks[: self.pattern.count]
-        if self.contacts is not None:
-            diagonal = diagonal + self.contacts.diagonal
+        if added is None and self.contacts is not None:
+            added = self.contacts.diagonal
+        if added is not None:
+            diagonal = diagonal + added
         return inverse_blocks(diagonal.permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
 
     def solve(
@@ -78,8 +84,8 @@ class BlockMatrix:
             from ..kernels.conjugate_gradient import solve_kernel
 
             table = self.pattern.table
-            added = None if self.contacts is None else self.contacts.add_product
-            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every, added)
+            slopes = None if self.contacts is None else self.contacts.table
+            return solve_kernel(self.blocks, table, inverse, right, reduction, iterations, check_every, slopes)
         inverse = inverse.permute(3, 0, 1, 2)
         z, count = solve(
             lambda v: self @ v,

@@ -15,8 +15,8 @@ class CapturedPotential:
     Attributes:
         state: returns the energy, and the tensors of the distance to the body, where there is one.
         gradient: also of that distance; returns what `IncrementalPotential.gradient` does.
-        hessian: also of the other arguments of `IncrementalPotential.hessian`; returns the stored blocks, and the
-            inverses of those on the diagonal.
+        hessian: also of what touching adds to blocks on the diagonal, or None, and the other arguments of
+            `IncrementalPotential.hessian`; returns the stored blocks, and the inverses of those on the diagonal.
     """
 
     state: Captured

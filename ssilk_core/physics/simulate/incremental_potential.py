@@ -172,9 +172,9 @@ class IncrementalPotential:
         def gradient(x: Tensor, inputs: StepInputs, distance: SmoothedDistance | None) -> list[Tensor]:
             return [self.gradient(x, inputs, distance)]
 
-        def hessian(x: Tensor, inputs: StepInputs, *others: Any) -> list[Tensor]:
+        def hessian(x: Tensor, inputs: StepInputs, touching: Tensor | None, *others: Any) -> list[Tensor]:
             matrix = self.hessian(x, inputs, *others)
-            return [matrix.blocks, matrix.inverse_diagonal()]
+            return [matrix.blocks, matrix.inverse_diagonal(touching)]
 
         return CapturedPotential(Captured(state), Captured(gradient), Captured(hessian))
 

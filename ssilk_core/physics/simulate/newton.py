@@ -348,9 +348,10 @@ def newton_step(
     right = -gradient[potential.free].float()
     x, others = state.x, (state.body_distance, fixed, exact_hessian)
     if potential.replays(x, inputs):
-        blocks, inverse = potential.captured.hessian(x, inputs.alone, *others)
         touching = potential.touching_stiffness(x, inputs)
-        matrix = BlockMatrix(potential.block_pattern, blocks, touching, None if touching else inverse)
+        added = None if touching is None else touching.diagonal
+        blocks, inverse = potential.captured.hessian(x, inputs.alone, added, *others)
+        matrix = BlockMatrix(potential.block_pattern, blocks, touching, inverse)
     else:
         matrix = potential.hessian(x, inputs, *others)
     z, count = matrix.solve(right, reduction, cg_iterations)

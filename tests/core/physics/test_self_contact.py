@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -13,9 +13,12 @@ from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
+from ssilk_core.physics.kernels.separations import close_kernel, separations_kernel
+from ssilk_core.physics.kernels.slopes import SlopeTable
 from ssilk_core.physics.self_contact import ClothContacts, ClothNeighbours, SelfContact, TouchingCloth
+from ssilk_core.physics.self_contact.contacts import CLOSING
 from ssilk_core.physics.self_contact.neighbours import near_pairs
-from ssilk_core.physics.self_contact.pairs import between_edges, over_faces
+from ssilk_core.physics.self_contact.pairs import Separations, between_edges, over_faces
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.blocks import BlockMatrix, BlockPattern
 from ssilk_core.physics.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
@@ -104,6 +107,31 @@ def test_compiled_loops_find_the_pairs_that_the_reference_finds(scene, toy_grid,
     assert {*zip(*(each.tolist() for each in compiled[4:6]))} == {*zip(*(each.tolist() for each in expected[4:6]))}
     for own, other in zip([*compiled[:4], *compiled[6:]], [*expected[:4], *expected[6:]]):
         torch.testing.assert_close(own, other, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_kernels_find_what_the_reference_finds(scene, toy_grid, monkeypatch, name):
+    contact, x, _ = crumpled(toy_grid, scene, 3)
+    kind, x = getattr(contact, name), 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    moved, step = 0.004 * random(len(x), 3, seed=4), 0.02 * (random(*x.shape, seed=3) - 0.5)
+    monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
+    pairs = kind.near(x, contact.reach)
+    own = [each.to(DEVICE) for each in (kind.first, kind.second, pairs.frame, pairs.first, pairs.second)]
+    for places in (x, x[..., :1]):
+        (expected,) = kind.at([places], pairs)
+        found = Separations(*separations_kernel(places.to(DEVICE), *own))
+        assert expected.facing.any() and not expected.facing.all()
+        for field in fields(Separations):
+            value = getattr(found, field.name).cpu()
+            torch.testing.assert_close(value, getattr(expected, field.name), rtol=0, atol=1e-11, msg=field.name)
+    sizes = set()
+    for ahead in (None, step):
+        rows = kind.close(x, pairs, moved, START, ahead)
+        nearer = moved if ahead is None else moved + ahead.norm(dim=1) / CLOSING
+        given = pairs.distance.to(DEVICE), nearer.to(DEVICE), START, None if ahead is None else ahead.to(DEVICE)
+        assert torch.equal(close_kernel(x.to(DEVICE), *own, *given, CLOSING).cpu().nonzero()[:, 0], rows)
+        sizes.add(len(rows))
+    assert len(sizes) == 2 and min(sizes) > 10
 
 
 @pytest.mark.parametrize("name", ["_faces", "_edges"])
@@ -375,13 +403,16 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     right = random(vertices, 3, frames_of, seed=9).float()
     inverse = inverse_blocks((blocks + contacts.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
     table = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, DEVICE).table
-    there = ContactStiffness(*(each.to(DEVICE) for each in (contacts.rows, contacts.columns, contacts.diagonal)))
+    there = [each.to(DEVICE) for each in (contacts.vertices, contacts.frame, contacts.values)]
+    slopes = SlopeTable.of(*there, vertices, frames_of)
+    torch.testing.assert_close(slopes.diagonal().cpu(), contacts.diagonal)
     given = blocks.to(DEVICE), table, inverse.to(DEVICE), right.to(DEVICE)
-    by_kernel, _ = solve_kernel(*given, 1e-6, 96, CHECK_EVERY, there.add_product)
+    by_kernel, _ = solve_kernel(*given, 1e-6, 96, CHECK_EVERY, slopes)
     monkeypatch.setattr("ssilk_core.physics.kernels.available", lambda device: False)
     found, _ = matrix.solve(right, 1e-6, 96)
     size = 3 * vertices * frames_of
-    stiffness = contacts.columns.to_dense().double() @ contacts.rows.to_dense().double()
+    rows, columns = contacts.matrices
+    stiffness = columns.to_dense().double() @ rows.to_dense().double()
     dense = 3 * torch.eye(size, dtype=torch.float64) + stiffness
     expected = torch.linalg.solve(dense, right.double().flatten()).view_as(right).float()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
