@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How vertices are separated from faces, and edges from edges; references: `self_contact.pairs` and `PairKind.close`.
+"""How vertices are separated from faces, and edges from edges; reference: `self_contact.pairs`.
 
 A program owns a block of pairs, each in a frame of its own.
 """
@@ -17,6 +17,11 @@ from .vectors import cross, dot
 BLOCK = 128  # pairs of one program
 TINY = tl.constexpr(1e-24)
 PARALLEL = tl.constexpr(1e-4)  # as in `pairs`
+# Arguments whose sizes and addresses differ from call to call: kernels are not compiled for each kind of these.
+VARYING = [
+    "count", "found", "total", "offset", "frame", "one", "other", "known", "side", "sides", "numbers", "facing",
+    "whole", "seconds", "vertices", "coefficients", "direction", "slack", "begun", "area", "pairs", "distance",
+]  # fmt: skip
 
 
 def separations_kernel(
@@ -39,39 +44,7 @@ def separations_kernel(
     return numbers[:4], numbers[10], numbers[4:7], facing, numbers[7:10], numbers[11]
 
 
-def close_kernel(
-    x: Tensor,
-    first: Tensor,
-    second: Tensor,
-    frame: Tensor,
-    one: Tensor,
-    other: Tensor,
-    known: Tensor,
-    moved: Tensor,
-    near: float,
-    step: Tensor | None,
-    closing: float,
-) -> Tensor:
-    """Return which pairs `PairKind.close` keeps, bool (P,).
-
-    Args:
-        first, second, frame, one, other: as `separations_kernel` takes them.
-        known: distance of each pair where it was found, shape (P,).
-        moved, near, step: as `PairKind.close` takes them, with what the step adds to `moved`.
-        closing: share of the distance by which pairs may come nearer in the step.
-    """
-    x, moved, count = x.contiguous(), moved.contiguous(), len(frame)
-    steps = x if step is None else step.contiguous()
-    found = torch.empty(count, dtype=torch.bool, device=x.device)
-    if count:
-        _close[(triton.cdiv(count, BLOCK),)](
-            x, first, second, frame, one, other, known, moved, steps, found, near, closing, count, x.shape[-1],
-            step is not None, first.shape[1] == 1, BLOCK, num_warps=4,
-        )  # fmt: skip
-    return found
-
-
-@triton.jit
+@triton.jit(do_not_specialize=VARYING, do_not_specialize_on_alignment=VARYING)
 def _separations(
     x, first, second, frame, one, other, numbers, facing, count, frames,
     several: tl.constexpr, faces: tl.constexpr, block: tl.constexpr,
@@ -81,8 +54,8 @@ def _separations(
     f = n * 0
     if several:
         f = tl.load(frame + n, mask=inside, other=0)
-    i, j, k, o = _four(first, second, one, other, n, inside, faces)
-    rx, ry, rz, ax, ay, az, nx, ny, nz, c1, c2, c3, faced = _apart(x + f, frames, i, j, k, o, faces)
+    _p, _q, i, j, k, o = four_vertices(first, second, one, other, n, inside, faces)
+    rx, ry, rz, ax, ay, az, nx, ny, nz, c1, c2, c3, faced = apart(x + f, frames, i, j, k, o, faces)
     distance, across = tl.sqrt(dot(rx, ry, rz, rx, ry, rz)), tl.sqrt(dot(nx, ny, nz, nx, ny, nz))
     away, across = tl.maximum(distance, TINY), tl.maximum(across, TINY)
     nx, ny, nz = nx / across, ny / across, nz / across
@@ -103,46 +76,8 @@ def _separations(
 
 
 @triton.jit
-def _close(
-    x, first, second, frame, one, other, known, moved, step, found, near, closing, count, frames,
-    steps: tl.constexpr, faces: tl.constexpr, block: tl.constexpr,
-):  # fmt: skip
-    n = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
-    inside = n < count
-    f = tl.load(frame + n, mask=inside, other=0)
-    i, j, k, o = _four(first, second, one, other, n, inside, faces)
-    mi, mj, mk, mo = (
-        tl.load(moved + i * frames + f),
-        tl.load(moved + j * frames + f),
-        tl.load(moved + k * frames + f),
-        tl.load(moved + o * frames + f),
-    )
-    nearer = mi + tl.maximum(mj, tl.maximum(mk, mo)) if faces else tl.maximum(mi, mj) + tl.maximum(mk, mo)
-    may = inside & (tl.load(known + n, mask=inside, other=float("inf")) - nearer < near)
-    if tl.max(may.to(tl.int32), axis=0) == 0:
-        tl.store(found + n, may, mask=inside)
-    else:
-        rx, ry, rz = _apart(x + f, frames, i, j, k, o, faces)[:3]
-        square = dot(rx, ry, rz, rx, ry, rz)
-        kept = tl.sqrt(square) < near
-        if steps:
-            ai, aj, ak, ao = (
-                _along(step + f, frames, i, rx, ry, rz),
-                _along(step + f, frames, j, rx, ry, rz),
-                _along(step + f, frames, k, rx, ry, rz),
-                _along(step + f, frames, o, rx, ry, rz),
-            )
-            if faces:
-                lowest, highest = ai, tl.maximum(aj, tl.maximum(ak, ao))
-            else:
-                lowest, highest = tl.minimum(ai, aj), tl.maximum(ak, ao)
-            kept = kept | (tl.maximum(highest, 0.0) - tl.minimum(lowest, 0.0) > closing * square)
-        tl.store(found + n, may & kept, mask=inside)
-
-
-@triton.jit
-def _four(first, second, one, other, n, inside, faces: tl.constexpr):
-    """The four vertices of pairs."""
+def four_vertices(first, second, one, other, n, inside, faces: tl.constexpr):
+    """What comes first and second in pairs, and their four vertices."""
     p = tl.load(one + n, mask=inside, other=0)
     q = tl.load(other + n, mask=inside, other=0)
     first += p * (1 if faces else 2)
@@ -152,29 +87,23 @@ def _four(first, second, one, other, n, inside, faces: tl.constexpr):
         j, k = tl.load(second), tl.load(second + 1)
     else:
         j, k = tl.load(first + 1), tl.load(second)
-    return i, j, k, o
+    return p, q, i, j, k, o
 
 
 @triton.jit
-def _at(x, frames, v):
+def at_vertex(x, frames, v):
     """The three coordinates of vertices, each in its own frame."""
     return tl.load(x + v * 3 * frames), tl.load(x + (v * 3 + 1) * frames), tl.load(x + (v * 3 + 2) * frames)
 
 
 @triton.jit
-def _along(step, frames, v, rx, ry, rz):
-    sx, sy, sz = _at(step, frames, v)
-    return dot(rx, ry, rz, sx, sy, sz)
-
-
-@triton.jit
-def _apart(x, frames, i, j, k, o, faces: tl.constexpr):
+def apart(x, frames, i, j, k, o, faces: tl.constexpr):
     """The vector between the nearest points, the arm between the first corners, the normal (not of unit length), the
     coefficients of all but the first corner, and whether the points lie within."""
-    ix, iy, iz = _at(x, frames, i)
-    jx, jy, jz = _at(x, frames, j)
-    kx, ky, kz = _at(x, frames, k)
-    ox, oy, oz = _at(x, frames, o)
+    ix, iy, iz = at_vertex(x, frames, i)
+    jx, jy, jz = at_vertex(x, frames, j)
+    kx, ky, kz = at_vertex(x, frames, k)
+    ox, oy, oz = at_vertex(x, frames, o)
     if faces:
         ux, uy, uz, vx, vy, vz = kx - jx, ky - jy, kz - jz, ox - jx, oy - jy, oz - jz
         ax, ay, az = ix - jx, iy - jy, iz - jz

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .. import kernels
 from ..energy.collision import ContactLaw
 from ..framed import consecutive
 from .neighbours import places_among
@@ -54,7 +55,7 @@ class Slopes:
 
 @dataclass(frozen=True, eq=False)
 class ClothContacts:
-    """Contacts of P pairs in N frames, by ascending frame.
+    """Contacts of P pairs in N frames.
 
     Attributes:
         law: how pressure depends on the gap, which is measured from each pair's own start.
@@ -82,6 +83,10 @@ class ClothContacts:
 
     def along(self, x: Tensor) -> Tensor:
         """Return vectors (V, 3, N) along each direction, shape (4, P)."""
+        if kernels.available(x.device):
+            from ..kernels.cloth_contacts import along_kernel
+
+            return along_kernel(x, self.vertices, self.frame, self.direction)
         return (self.direction * x[self.vertices, :, self.frame].movedim(-1, 1)).sum(1)
 
     def gap(self, x: Tensor) -> Tensor:
@@ -90,15 +95,17 @@ class ClothContacts:
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy of each frame [J], shape (N,)."""
-        own = self.pressing(x)
-        energy = own.area * self.law.energy(own._relative(x))
-        return energy.new_zeros(self.frames).index_put_((own.frame,), energy, accumulate=True)
+        energy = self._by_kernel(x, "ENERGY")
+        if energy is None:
+            energy = self.area * self.law.energy(self._relative(x))
+        return energy.new_zeros(self.frames).index_put_((self.frame,), energy, accumulate=True)
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
-        own = self.pressing(x)
-        force = (-own.pressure(x) * own.coefficients)[:, None] * own.direction
-        return at_vertices(force, own.vertices, own.frame, x)
+        force = self._by_kernel(x, "FORCE")
+        if force is None:
+            force = (-self.pressure(x) * self.coefficients)[:, None] * self.direction
+        return at_vertices(force, self.vertices, self.frame, x)
 
     def stiffness(self, x: Tensor) -> Tensor:
         """Return the second derivative of each contact's energy by its gap [N/m], shape (P,)."""
@@ -110,9 +117,19 @@ class ClothContacts:
 
     def slopes(self, x: Tensor) -> Slopes:
         """Return what the Hessian at x is made of."""
-        own = self.pressing(x)
-        values = (own.stiffness(x).sqrt() * own.coefficients)[:, None] * own.direction
-        return Slopes(own.frame, own.vertices, values)
+        values = self._by_kernel(x, "SLOPES")
+        if values is None:
+            values = (self.stiffness(x).sqrt() * self.coefficients)[:, None] * self.direction
+        return Slopes(self.frame, self.vertices, values)
+
+    def _by_kernel(self, x: Tensor, what: str) -> Tensor | None:
+        """Return what `pressed_kernel` does, where kernels run."""
+        if not kernels.available(x.device):
+            return None
+        from ..kernels import cloth_contacts
+
+        rows = self.vertices, self.frame, self.coefficients, self.direction, self.start, self.area
+        return cloth_contacts.pressed_kernel(x, self.law, *rows, getattr(cloth_contacts, what))
 
     def allowed(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
         """Return by which share of a step (V, 3, N) each vertex may move, shape (V, N).
@@ -121,6 +138,11 @@ class ClothContacts:
         to each other by at most `CLOSING` of their gap. Those that are hardly apart may do so by
         `yielding` [m].
         """
+        if kernels.available(x.device):
+            from ..kernels.cloth_contacts import allowed_kernel
+
+            rows = self.vertices, self.frame, self.coefficients, self.second, self.direction, self.slack
+            return allowed_kernel(x, step, *rows, CLOSING, yielding)
         along = self.along(step)
         first = along.masked_fill(self.second, torch.inf).amin(0)
         closing = along.masked_fill(~self.second, -torch.inf).amax(0) - first
@@ -146,7 +168,12 @@ class ClothContacts:
         return torch.where(done, step, near.allowed(x, step, yielding).amin(0) * step)
 
     def _meeting(self, x: Tensor, step: Tensor, yielding: float) -> ClothContacts:
-        """Return those that may slow a step, or one in which some vertices are slower; no other changes `allowed`."""
+        """Return those that may slow a step, or one in which some vertices are slower; no other changes `allowed`.
+
+        Where kernels run all are returned, since that takes less time.
+        """
+        if kernels.available(x.device):
+            return self
         along = self.along(step)
         first = along.masked_fill(self.second, 0.0).clamp_max(0).amin(0)
         closing = along.masked_fill(~self.second, 0.0).clamp_min(0).amax(0) - first

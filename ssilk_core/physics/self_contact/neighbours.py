@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from .. import kernels
+
 AT_ONCE = 1 << 24  # pairs in memory before distances are compared
 MOST_CELLS = 1 << 16  # of the grid along an axis, so that cells of many frames have numbers of 64 bits
 
@@ -36,6 +38,9 @@ class Grid:
         key, order = theirs.flatten().sort(stable=True)
         steps = torch.arange(-1, 2, device=points.device)
         rows = ((steps[:, None] * cells[1] + steps) * cells[2]).flatten()
+        if kernels.available(points.device):
+            row = own.contiguous()[..., None] + rows
+            return cls(order, torch.searchsorted(key, row - 1), torch.searchsorted(key, row + 1, right=True))
         asked, at = own.unique(return_inverse=True)  # many points share a cell
         row = asked[:, None] + rows
         return cls(order, torch.searchsorted(key, row - 1)[at], torch.searchsorted(key, row + 1, right=True)[at])

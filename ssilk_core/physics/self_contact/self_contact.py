@@ -136,10 +136,12 @@ class ClothNeighbours:
 
     def replace_frames(self, frames: Tensor, other: ClothNeighbours) -> ClothNeighbours:
         """Return those with frames (M,), in ascending order, replaced by those of another."""
+        if len(frames) == self.at.shape[-1]:
+            return other
         kept = torch.ones(self.at.shape[-1], dtype=torch.bool, device=self.at.device)
         kept[frames] = False
         own = kept.nonzero()[:, 0]
-        return ClothNeighbours.joined([(own, self.select(own)), (frames, other)]) if len(own) else other
+        return ClothNeighbours.joined([(own, self.select(own)), (frames, other)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +180,14 @@ class PairKind:
         middles, ascending = (at[self.first].mean(1), at[self.second].mean(1)), self.first is self.second
         groups = None if garment is None else (garment[self.first[:, 0]], garment[self.second[:, 0]])
         reaches = self.first_reach + reach, self.second_reach
-        if loops.available(at.device):
-            from ..loops.separations import near_loop
+        if kernels.available(at.device) or loops.available(at.device):
+            if kernels.available(at.device):
+                from ..kernels.near_pairs import near_kernel as find
+            else:
+                from ..loops.separations import near_loop as find
 
             grid = Grid.of(middles[1], middles[0], float(reaches[0].max() + reaches[1].max()))
-            found = near_loop(at, self.first, self.second, middles, reaches, grid, groups, ascending, reach)
+            found = find(at, self.first, self.second, middles, reaches, grid, groups, ascending, reach)
             frame, first, second, distance = found
             return KnownPairs(frame, first, second, distance, torch.zeros_like(distance))
         frame, first, second = near_pairs(
@@ -206,11 +211,6 @@ class PairKind:
         """
         if step is not None:
             moved = moved + step.norm(dim=1) / CLOSING
-        if kernels.available(x.device):
-            from ..kernels.separations import close_kernel
-
-            own = self.first, self.second, pairs.frame, pairs.first, pairs.second, pairs.distance
-            return close_kernel(x, *own, moved, near, step, CLOSING).nonzero()[:, 0]
         moves = moved[self.first].amax(1), moved[self.second].amax(1)
         if loops.available(x.device):
             from ..loops.separations import close_loop
@@ -333,26 +333,13 @@ class SelfContact:
         What lies further on the wrong side than contact begins belongs there from now on.
         """
         known = self.around(x, known)
-        drift, parts, pairs = _drift(x, known), [], []
-        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            rows = kind.close(x, own, drift, self.law.start)
-            close = own.kept(rows)
-            now, last, rest = kind.at((x, known.last, self.rest), close)
-            side = _sides(close, last)
-            wrong = now.facing & (side * now.height < 0) & (side * now.height >= -self.law.start)
-            side = torch.where(wrong, side, 0)
-            pairs.append(replace(own, side=torch.zeros_like(own.side).index_copy_(0, rows, side)))
-            parts.append(kind.contacts(now, close, side, rest))
-        return ClothNeighbours(x, known.at, *pairs), self._joined(x, parts).pressing(x)
+        sides, found = self._touching(known, x, _drift(x, known), self.law.start, known.last, settled=True)
+        pairs = (replace(own, side=side) for (_, own), side in zip(self._parts(known), sides))
+        return ClothNeighbours(x, known.at, *pairs), found
 
     def contacts(self, x: Tensor, known: ClothNeighbours) -> ClothContacts:
         """Return the contacts at positions x, among pairs that are known around them."""
-        drift, parts = _drift(x, known), []
-        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER))
-            now, last, rest = kind.at((x, known.last, self.rest), close)
-            parts.append(kind.contacts(now, close, _sides(close, last), rest))
-        return self._joined(x, parts).pressing(x)
+        return self._touching(known, x, _drift(x, known), self.law.start + DEEPER, known.last)[1]
 
     def ahead(self, step: Tensor, known: ClothNeighbours) -> tuple[ClothNeighbours, Tensor, ClothContacts]:
         """Return what may touch ahead of a step (V, 3, N) from the last positions, the step as far as no pairs can
@@ -367,12 +354,52 @@ class SelfContact:
         known = self._anew(x, known, (longest > self._unknown(drift)) & (drift > MOVED * REACH))
         drift = _drift(x, known)
         step = (self._unknown(drift.amax(0)) / longest.clamp_min(TINY)).clamp_max(1) * step
-        parts = []
-        for kind, own in ((self._faces, known.faces), (self._edges, known.edges)):
-            close = own.kept(kind.close(x, own, drift, self.law.start + DEEPER, step))
-            now, rest = kind.at((x, self.rest), close)
-            parts.append(kind.contacts(now, close, close.side, rest))
-        return known, step, self._joined(x, parts)
+        return known, step, self._touching(known, x, drift, self.law.start + DEEPER, step=step)[1]
+
+    def _parts(self, known: ClothNeighbours) -> tuple[tuple[PairKind, KnownPairs], tuple[PairKind, KnownPairs]]:
+        """Return the kinds of pairs with what is known of them."""
+        return (self._faces, known.faces), (self._edges, known.edges)
+
+    def _touching(
+        self,
+        known: ClothNeighbours,
+        x: Tensor,
+        moved: Tensor,
+        near: float,
+        last: Tensor | None = None,
+        *,
+        settled: bool = False,
+        step: Tensor | None = None,
+    ) -> tuple[list[Tensor], ClothContacts]:
+        """Return the sides of the known pairs at positions x, and the contacts of those that are close there.
+
+        Args:
+            moved, near, step: as `PairKind.close` takes them; without a step, contacts are those that press.
+            last: positions at which pairs without a side have theirs; None where these have none.
+            settled: whether only those keep a side that are on the wrong one, and not deeper than contact begins.
+        """
+        if kernels.available(x.device):
+            from ..kernels.cloth_contacts import contacts_kernel
+
+            reach = moved if step is None else moved + step.norm(dim=1) / CLOSING
+            sides, found = contacts_kernel(
+                self._parts(known), x, last, self.rest, reach, near, start=self.law.start, closer=CLOSER, slack=SLACK,
+                garment=self._garment, settled=settled, step=step, closing=CLOSING,
+            )  # fmt: skip
+            return sides, ClothContacts(self.law, x.shape[-1], *found)
+        sides, parts = [], []
+        for kind, own in self._parts(known):
+            rows = kind.close(x, own, moved, near, step)
+            close = own.kept(rows)
+            now, rest, *before = kind.at([x, self.rest] if last is None else [x, self.rest, last], close)
+            side = _sides(close, before[0]) if before else close.side
+            if settled:
+                wrong = now.facing & (side * now.height < 0) & (side * now.height >= -self.law.start)
+                side = torch.where(wrong, side, 0)
+            sides.append(torch.zeros_like(own.side).index_copy_(0, rows, side))
+            parts.append(kind.contacts(now, close, side, rest))
+        joined = self._joined(x, parts)
+        return sides, joined.pressing(x) if step is None else joined
 
     def _unknown(self, drift: Tensor) -> Tensor:
         """Return how far each vertex may move after a drift (N,) [m], shape (N,): not to what is not known, nor so
@@ -380,11 +407,10 @@ class SelfContact:
         return torch.minimum(0.5 * CLOSING * (self.reach - 2 * drift), LEFT * REACH - drift)
 
     def _joined(self, x: Tensor, parts: Sequence[tuple[Tensor, ...]]) -> ClothContacts:
-        """Return contacts of both kinds, by ascending frame."""
+        """Return contacts of both kinds."""
         joined = [torch.cat(part, dim=-1) for part in zip(*parts)]
-        order = joined[0].argsort(stable=True)
-        slack = self._slack(joined[1], joined[5])
-        return ClothContacts(self.law, x.shape[-1], *(part[..., order] for part in [*joined, slack]))
+        joined.append(self._slack(joined[1], joined[5]))
+        return ClothContacts(self.law, x.shape[-1], *joined)
 
     def _slack(self, vertices: Tensor, start: Tensor) -> Tensor:
         """Return by which pairs that begin to touch later may come nearer, however near they are [m], shape (P,).

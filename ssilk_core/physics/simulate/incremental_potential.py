@@ -144,7 +144,7 @@ class IncrementalPotential:
         """Take the elastic elements and the free vertices of a Hessian."""
         self._hessian = hessian
         self.membrane, self.hinges, self.free = hessian.membrane, hessian.hinges, hessian.free
-        for name in ("_elastic_tables", "captured"):
+        for name in ("_elastic_tables", "_place", "captured"):
             self.__dict__.pop(name, None)
 
     @property
@@ -434,10 +434,16 @@ class IncrementalPotential:
         """Return the Hessian of what touches, or None where nothing could."""
         if not inputs.touching:
             return None
-        place = torch.full((len(x),), -1, device=x.device)
-        place[self.free] = torch.arange(len(self.free), device=x.device)
-        slopes = Slopes.joined(*(part.slopes(x) for part in inputs.touching))
-        return ContactStiffness.of(slopes, x.shape[-1], place, len(self.free))
+        parts = [part.slopes(x) for part in inputs.touching]
+        slopes = parts[0] if len(parts) == 1 else Slopes.joined(*parts)
+        return ContactStiffness.of(slopes, x.shape[-1], self._place, len(self.free))
+
+    @cached_property
+    def _place(self) -> Tensor:
+        """The place of each vertex among the free ones, -1 for others, shape (V,)."""
+        place = torch.full((len(self.mass),), -1, device=self.free.device)
+        place[self.free] = torch.arange(len(self.free), device=self.free.device)
+        return place
 
     def residual(self, gradient: Tensor) -> Tensor:
         """Return the RMS acceleration, over the free mass, that a gradient (V, 3, N) leaves, in units of g: (N,)."""

@@ -13,12 +13,12 @@ from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
-from ssilk_core.physics.kernels.separations import close_kernel, separations_kernel
+from ssilk_core.physics.kernels.separations import separations_kernel
 from ssilk_core.physics.kernels.slopes import SlopeTable
 from ssilk_core.physics.self_contact import ClothContacts, ClothNeighbours, SelfContact, TouchingCloth
-from ssilk_core.physics.self_contact.contacts import CLOSING
 from ssilk_core.physics.self_contact.neighbours import near_pairs
 from ssilk_core.physics.self_contact.pairs import Separations, between_edges, over_faces
+from ssilk_core.physics.self_contact.self_contact import KnownPairs
 from ssilk_core.physics.simulate import SimulationOptions, Simulator
 from ssilk_core.physics.simulate.blocks import BlockMatrix, BlockPattern
 from ssilk_core.physics.simulate.conjugate_gradient import CHECK_EVERY, inverse_blocks
@@ -81,6 +81,28 @@ def test_near_pairs_are_those_of_all_distances():
 
 
 @pytest.mark.parametrize("name", ["_faces", "_edges"])
+def test_kernels_find_the_near_pairs_that_the_reference_finds(scene, toy_grid, monkeypatch, name):
+    monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
+
+    def found(device: torch.device, halves: bool) -> list[torch.Tensor]:
+        contact, x, _ = crumpled(toy_grid, scene, 2, device, (4, 3))
+        x = (0.4 * x + 0.004 * random(*x.shape, seed=2)).to(device)
+        half = (torch.arange(len(x), device=device) < 6).long() if halves else None
+        pairs = getattr(contact, name).near(x, contact.reach, half)
+        order = ((pairs.frame * 10**4 + pairs.first) * 10**4 + pairs.second).argsort()
+        assert (pairs.frame.diff() >= 0).all()
+        return [getattr(pairs, each.name)[order].cpu() for each in fields(pairs)]
+
+    expected = [found(CPU, halves) for halves in (False, True)]
+    monkeypatch.setattr("ssilk_core.physics.kernels.available", lambda device: True)
+    by_kernel = [found(DEVICE, halves) for halves in (False, True)]
+    assert len(expected[0][0]) > len(expected[1][0]) > 10
+    for own, other in zip(by_kernel, expected):
+        for mine, theirs in zip(own, other, strict=True):
+            torch.testing.assert_close(mine, theirs, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["_faces", "_edges"])
 def test_compiled_loops_find_the_pairs_that_the_reference_finds(scene, toy_grid, monkeypatch, name):
     contact, x, _ = crumpled(toy_grid, scene, 3)
     kind, x = getattr(contact, name), 0.4 * x + 0.004 * random(*x.shape, seed=2)
@@ -113,7 +135,6 @@ def test_compiled_loops_find_the_pairs_that_the_reference_finds(scene, toy_grid,
 def test_kernels_find_what_the_reference_finds(scene, toy_grid, monkeypatch, name):
     contact, x, _ = crumpled(toy_grid, scene, 3)
     kind, x = getattr(contact, name), 0.4 * x + 0.004 * random(*x.shape, seed=2)
-    moved, step = 0.004 * random(len(x), 3, seed=4), 0.02 * (random(*x.shape, seed=3) - 0.5)
     monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
     pairs = kind.near(x, contact.reach)
     own = [each.to(DEVICE) for each in (kind.first, kind.second, pairs.frame, pairs.first, pairs.second)]
@@ -124,14 +145,46 @@ def test_kernels_find_what_the_reference_finds(scene, toy_grid, monkeypatch, nam
         for field in fields(Separations):
             value = getattr(found, field.name).cpu()
             torch.testing.assert_close(value, getattr(expected, field.name), rtol=0, atol=1e-11, msg=field.name)
-    sizes = set()
-    for ahead in (None, step):
-        rows = kind.close(x, pairs, moved, START, ahead)
-        nearer = moved if ahead is None else moved + ahead.norm(dim=1) / CLOSING
-        given = pairs.distance.to(DEVICE), nearer.to(DEVICE), START, None if ahead is None else ahead.to(DEVICE)
-        assert torch.equal(close_kernel(x.to(DEVICE), *own, *given, CLOSING).cpu().nonzero()[:, 0], rows)
-        sizes.add(len(rows))
-    assert len(sizes) == 2 and min(sizes) > 10
+
+
+def on_device(known: ClothNeighbours, device: torch.device) -> ClothNeighbours:
+    faces, edges = (
+        KnownPairs(*(getattr(pairs, each.name).to(device) for each in fields(pairs)))
+        for pairs in (known.faces, known.edges)
+    )
+    return ClothNeighbours(known.last.to(device), known.at.to(device), faces, edges)
+
+
+def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, monkeypatch):
+    contact, x, _ = crumpled(toy_grid, scene, 2, size=(5, 3))
+    monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
+    x = 0.4 * x + 0.004 * random(*x.shape, seed=2)
+    known = contact.neighbours(x, x)
+    _, before = contact.moved(x + 1e-3 * random(*x.shape, seed=5), known)
+    step = 0.02 * (random(*x.shape, seed=3) - 0.5)
+    tried = x + 6e-3 * torch.nn.functional.normalize(random(*x.shape, seed=4) - 0.5, dim=1)
+
+    def found(device: torch.device) -> list[torch.Tensor]:
+        own = crumpled(toy_grid, scene, 2, device, (5, 3))[0]
+        around = on_device(known, device)
+        there, pressed = own.moved(tried.to(device), around)
+        others = own.contacts((0.3 * x + 0.7 * tried).to(device), there)
+        ahead = own._touching(there, there.last, 0 * there.last[:, 0], START, step=step.to(device))[1]
+        rows = []
+        for each in (pressed, others, ahead):
+            at, towards = tried.to(device), step.to(device)
+            rows += [each.frame, each.vertices, each.coefficients, each.second, each.direction, each.start, each.area]
+            rows += [each.slack, each.energy(at), each.gradient(at), each.slopes(at).values, each.along(towards)]
+            rows += [each.allowed(at, towards), each.without_passing(at, towards, 1e-3)]
+        return [value.cpu() for value in [there.faces.side, there.edges.side, *rows]]
+
+    expected = found(CPU)
+    monkeypatch.setattr("ssilk_core.physics.kernels.available", lambda device: True)
+    by_kernel = found(DEVICE)
+    assert len(before.frame) > 50 and all(len(expected[n]) > 50 for n in (2, 16, 30))
+    assert expected[0].any() and expected[1].any() and (expected[14] < 1).any()
+    for own, other in zip(by_kernel, expected, strict=True):
+        torch.testing.assert_close(own, other, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["_faces", "_edges"])
@@ -245,9 +298,11 @@ def test_pinned_and_tight_cloth_does_not_touch_itself(layers):
     assert not len(contact.contacts(x, contact.neighbours(x, x)).frame)
 
 
-def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np.ndarray]:
+def crumpled(
+    toy_grid, scene, count: int, device: torch.device = CPU, size: tuple[int, int] = (9, 4)
+) -> tuple[SelfContact, torch.Tensor, np.ndarray]:
     """A sheet in zigzag folds 8 mm apart, in frames that are folded more or less."""
-    points, faces = toy_grid(9, 4, height=0.4, width=0.15)
+    points, faces = toy_grid(*size, height=0.05 * (size[0] - 1), width=0.05 * (size[1] - 1))
     worn = dressed(scene, points, faces, np.zeros(len(points), dtype=bool))
     rows = np.round(-points[:, 1] / 0.05).astype(int)
     found = []
@@ -256,7 +311,7 @@ def crumpled(toy_grid, scene, count: int) -> tuple[SelfContact, torch.Tensor, np
         folded[:, 1], folded[:, 2] = -0.008 * (1 + 0.1 * n) * rows, np.where(rows % 2, 0.049, 0.0)
         found.append(folded)
     return (
-        SelfContact(TouchingCloth.of(worn, FABRIC), CPU, torch.float64),
+        SelfContact(TouchingCloth.of(worn, FABRIC), device, torch.float64),
         torch.as_tensor(np.stack(found, axis=-1)),
         faces,
     )
