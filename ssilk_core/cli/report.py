@@ -118,7 +118,7 @@ def _shot(
 
     from ..delivery.bake.met import props_of
     from ..delivery.bake.outfit import changed_since, stated_over
-    from ..delivery.bake.stated import stated_sunk
+    from ..delivery.bake.stated import stated_skin, stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
 
@@ -137,9 +137,10 @@ def _shot(
         fail(str(path), "the shot has no frames", "at least one is needed")
     others = {index for index, mesh in enumerate(shot.meshes) if mesh.is_garment or mesh.is_rider}
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
-    sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
+    places = {each.index: shot.meshes[each.index].path for each in garments}
     props = props or props_of(path, report)
-    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props, over=stated_over(path))
+    sunk, skin, over = stated_sunk(path, places), stated_skin(path, places), stated_over(path)
+    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, skin=skin, props=props, over=over)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     if isinstance(certificate := said.get("certificate"), Mapping):
         sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))

@@ -140,7 +140,7 @@ def _look_sources(mesh: Mesh, stage: Usd.Stage) -> Iterator[LookSource]:
 def _without_look(mesh: Mesh, stage: Usd.Stage, source: str) -> str:
     """Return why a mesh has no look in a stage, which meshes come near, and what to do."""
     name = mesh.path.rpartition("/")[2]
-    counts = mesh.vertex_count, len(mesh.polygon_counts)
+    counts = mesh.vertex_count, len(np.asarray(mesh.polygon_counts))
     text = f"it is {mesh.path} of {_sizes(*counts)}, and {source} has no such mesh"
     near = list[tuple[tuple[bool, ...], str]]()
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
