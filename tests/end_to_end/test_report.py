@@ -101,6 +101,7 @@ def test_a_browser_draws_the_page_and_fetches_nothing(pages, name, tmp_path):
         ("{shot} -o {out}.html --stage {stage} --motion {clip}", "shots hold their character"),
         ("{model} -o {out}.html --stage {stage}", "one of --stage and --motion"),
         ("{out}/none.usda -o {out}.html", "there is no such file"),
+        ("{layers} -o {out}.html", "name the stage of a shot, such as "),
         ("{stage} -o {out}.html --figures {stage}", "not a JSON file"),
         ("{shot} -o {out}.html --figures {other}", "not figures of a known kind"),
     ],
@@ -109,6 +110,9 @@ def test_bad_input_is_one_sentence(toy, tmp_path, capsys, words, said):
     (tmp_path / "other.json").write_text(json.dumps({"a": 1}))
     files = {"shot": "shot.usda", "model": "model.safetensors", "stage": "rigged.usda", "clip": "clip.usda"}
     names = {name: toy.folder / file for name, file in files.items()}
+    (tmp_path / "layers/shots/walk").mkdir(parents=True)
+    (tmp_path / "layers/shots/walk/shot.usda").touch()
+    names["layers"] = tmp_path / "layers"
     filled = words.format(**names, out=tmp_path / "out", other=tmp_path / "other.json").split()
     assert main(["report", *filled]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "out.html").exists()
