@@ -35,6 +35,7 @@ from ..events import Message, Reporter, Result, Started
 from .options.bodies import BODIES, named_bodies
 from .options.fabric import add_known_fabric
 from .options.files import check_output
+from .options.motions import need_motion_folder
 
 if TYPE_CHECKING:
     import torch
@@ -284,9 +285,7 @@ def _listed(options: argparse.Namespace) -> ListedClips:
     from ..quality.evaluation.splits import SPLITS, chosen, read_index, splits_of
 
     folder: Path = options.motions
-    if not folder.is_dir():
-        found = "a file, and no folder" if folder.exists() else "there is no such folder"
-        fail(str(folder), found, "a folder of motion files is needed")
+    need_motion_folder(folder)
     files = {path.stem: path for path in motion_files([folder])}
     index = read_index(options.index) if options.index else []
     splits = splits_of(index, options.clips) if options.index else {"all": options.clips or list(files)}

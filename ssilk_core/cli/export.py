@@ -74,7 +74,9 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     export_onnx(model, output)
     static, rates = descriptor_sizes(file.scene, file.joints, file.config)
     seen = proximity_vertices(file.scene, file.config).tolist()
-    near = {"sees colliders at vertices": seen, "and up to [m]": proximity_reach(file.scene)} if seen else {}
+    near = (
+        {"sees colliders at vertices": seen, "sees colliders up to [m]": proximity_reach(file.scene)} if seen else {}
+    )
     report(
         Result(
             "export",

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..errors import did_you_mean, fail
 from ..files import split_body, split_location
 from ..scene.shape_weights import ALLOWED, is_shapes, need_weights
+from .options.files import LIST
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ MODEL = Kind("model file", "a file of 'ssilk train' is needed")
 MOTIONS = Kind("file or folder", "motions are USD files or folders of them", folder=True)
 SHOT = Kind("file", "each motion of a shot is a USD file")
 CHARACTER = Kind("file", "a USD stage with a character is needed")
+GARMENTS = Kind("list of garments", "a TOML file with one table for each garment is needed")
 KINDS = {
     "model": MODEL,
     "models": MODEL,
@@ -44,6 +46,9 @@ KINDS = {
 OF_STAGE = ("family", "onto")
 """Options that also take weights of shapes alone, which are of the command's stage."""
 
+LISTED = {"bake": "model", "farm": "model", "inspect": "stage"}
+"""By verbs, the input that may also be a list of garments."""
+
 INDEPENDENT = ("bake", "farm")
 """Verbs with tasks: where one of several inputs is missing, the others are baked."""
 
@@ -60,8 +65,9 @@ def need_inputs(options: argparse.Namespace) -> None:
         for each in values:
             if name in OF_STAGE and is_shapes(str(each)):
                 continue
+            is_list = LISTED.get(options.verb) == name and split_location(str(each))[0].endswith(LIST)
             meant = _shape_meant(str(each), options.stage) if name in OF_STAGE else ""
-            need_input(str(each), kind, meant)
+            need_input(str(each), GARMENTS if is_list else kind, meant)
 
 
 def _shape_meant(named: str, stage: Path) -> str:

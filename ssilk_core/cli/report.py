@@ -91,9 +91,12 @@ def _told(figures: dict[str, Any]) -> dict[str, object]:
 
 
 def _check(options: argparse.Namespace) -> None:
+    from ..delivery.bake.shots import need_no_folder
+
     if options.output.suffix != ".html":
         fail(str(options.output), "not a name for a page", "it ends in .html")
     check_output(options.output, options.subject, *options.figures)
+    need_no_folder(options.subject, "a model or a shot is needed")
     if not options.subject.is_file():
         fail(str(options.subject), "there is no such file", "a model or a shot is needed")
     if bool(options.stage) != bool(options.motion):
@@ -118,16 +121,18 @@ def _shot(
 
     from ..delivery.bake.met import props_of
     from ..delivery.bake.outfit import changed_since, stated_over
-    from ..delivery.bake.stated import stated_sunk
+    from ..delivery.bake.shots import layers_of
+    from ..delivery.bake.stated import stated_skin, stated_sunk
     from ..delivery.report.page import Section, facts
     from ..delivery.report.shots import ShotGarment, shot_sections
 
     shot = Shot(open_with_full_bodies(path))  # cloth is measured against all of the body
     parts = read_parts(shot)
     report(Started("report", len(shot.frame_times)))
-    said = read_provenance(path)
+    origins = {each: read_provenance(each) for each in (path, *layers_of(path))}
+    said = origins[path] | {layer.parent.name: each for layer, each in origins.items() if layer != path}
     garments = [
-        ShotGarment(index, part.mesh, _fabric(part.record), *_sewn(path, said, part, file, report))
+        ShotGarment(index, part.mesh, _fabric(part.record), *_sewn(path, origins, part, file, report))
         for index, (mesh, part) in enumerate(zip(shot.meshes, parts))
         if mesh.is_garment
     ]
@@ -137,9 +142,10 @@ def _shot(
         fail(str(path), "the shot has no frames", "at least one is needed")
     others = {index for index, mesh in enumerate(shot.meshes) if mesh.is_garment or mesh.is_rider}
     bodies = {index: part.mesh for index, part in enumerate(parts) if index not in others}
-    sunk = stated_sunk(path, {each.index: shot.meshes[each.index].path for each in garments})
+    places = {each.index: shot.meshes[each.index].path for each in garments}
     props = props or props_of(path, report)
-    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, props=props, over=stated_over(path))
+    sunk, skin, over = stated_sunk(path, places), stated_skin(path, places), stated_over(path)
+    sections = shot_sections(shot, garments, bodies, report, sunk=sunk, skin=skin, props=props, over=over)
     records = {str(part.mesh.path): asdict(part.record) for part in parts if part.record}
     if isinstance(certificate := said.get("certificate"), Mapping):
         sections.insert(1, Section("Certificate", f"<p>{escape(str(certificate.get('found')))}</p>"))
@@ -151,14 +157,14 @@ def _shot(
 
 
 def _sewn(
-    path: Path, said: Mapping[str, Any], part: ShotPart, file: ModelFile | None, report: Reporter
+    path: Path, origins: Mapping[Path, Mapping[str, Any]], part: ShotPart, file: ModelFile | None, report: Reporter
 ) -> tuple[Mesh, str]:
     """Return a garment in the rest shape of its energies, and what there is to say of that."""
     from ..delivery.report.sewn import model_of, sewn_mesh
 
     if part.record is None or not part.record.model_hash:
         return part.mesh, ""
-    file = file or model_of(path, said, part.record.model_hash)
+    file = file or model_of(origins, part.record.model_hash)
     if file is not None:
         sewn = sewn_mesh(part.mesh, file)
         where, body = "was put onto another skeleton", "the body of its training"

@@ -60,13 +60,11 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     from ssilk_usd.units import StageUnits
 
     from ..delivery.bake import cache_origin, motion_at, riders_of, skin_trajectories
-    from ..delivery.targets import fit, joint_names
+    from ..delivery.targets import check_suffix, fit, joint_names
     from ..scene.decomposition import FitTolerance
 
     target, where = TARGETS[options.target], options.motion or split_location(options.cache)[0]
-    if options.output.suffix not in target.suffixes:
-        suffix, allowed = options.output.suffix, ", ".join(target.suffixes)
-        fail(str(options.output), f"the suffix is '{suffix}'", f"{options.target} takes {allowed}")
+    check_suffix(options.output, options.target)
     inputs = (options.stage, options.model, split_location(options.cache)[0], split_location(where)[0])
     check_output(options.output, *inputs)
     deformer = _deformer(options, report)

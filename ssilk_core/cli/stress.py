@@ -11,12 +11,13 @@ each body of a family: cases then have the name of the body's stage in front.
 from __future__ import annotations
 
 import argparse
+import time
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import EXIT_OK, EXIT_VERIFICATION, fail
-from ..events import Countdown, Message, Reporter, Result, Started
+from ..events import Message, Progress, Reporter, Result, Started
 from .options.bodies import BODIES, named_bodies
 from .options.fabric import add_known_fabric, asked_known_fabric
 from .options.files import check_output
@@ -69,7 +70,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     found = {outcome.label: outcome for outcome in known}
     missing = [case for case in cases if case.label not in found]
     report(Started("stress", len(missing)))
-    told = Countdown(len(missing), report)
+    began = time.monotonic()
+
+    def tell_progress(done: int) -> None:
+        """Tell the time left: cases take from nothing to minutes, so that what each is expected to take counts."""
+        over, left = (sum(case.seconds for case in part) for part in (missing[:done], missing[done:]))
+        seconds = (time.monotonic() - began) * left / over if over else None
+        report(Progress(done, len(missing), seconds))
 
     def write(*, finished: bool) -> None:
         order = [replace(case, body=body).label for body in subjects for case in CASES]
@@ -77,12 +84,13 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
         kept.write({"model": options.model.name}, rows, finished=finished)
 
     try:
-        for case in missing:
+        for number, case in enumerate(missing):
+            tell_progress(number)
             outcome = found[case.label] = case.run(subjects[case.body])
             if not case.allows(outcome.verdict):
                 report(Message(f"{case.label} {outcome.verdict}: {outcome.said}", "warning"))
             write(finished=False)
-            told()
+        tell_progress(len(missing))
     except KeyboardInterrupt:
         kept.tell_kept(len(found), report)
         raise

@@ -27,6 +27,7 @@ from ..events import Reporter, Result, Started
 from ._measured import measured_inputs
 from .options.fabric import add_known_fabric, asked_known_fabric
 from .options.files import check_output
+from .options.motions import need_motion_folder
 from .options.numbers import NumberRange
 
 if TYPE_CHECKING:
@@ -244,9 +245,7 @@ class Bench:
         from ssilk_usd.reading.motion import motion_files
 
         folder: Path = self.options.motions
-        if not folder.is_dir():
-            found = "a file, and no folder" if folder.exists() else "there is no such folder"
-            fail(str(folder), found, "a folder of motion files is needed")
+        need_motion_folder(folder)
         files = {path.stem: path for path in motion_files([folder])}
         names = self.options.clips or list(files)[:CLIPS]
         missing = sorted(set(names) - files.keys())

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import count
+from pathlib import Path
 from typing import Literal
 
 from ..errors import fail
@@ -64,6 +65,15 @@ TARGETS = {
         about="one glTF binary, a single set",
     ),
 }
+
+
+def check_suffix(path: Path, name: str) -> None:
+    """Raise `SsilkError` if target `name` takes no file of such a suffix, and say which ones do."""
+    allowed = TARGETS[name].suffixes
+    if path.suffix not in allowed:
+        others = [f"--target {other}" for other, target in TARGETS.items() if path.suffix in target.suffixes]
+        todo = f"{' or '.join(others)} writes it" if others else ""
+        fail(str(path), f"the suffix is '{path.suffix}'", f"{name} takes {', '.join(allowed)}", todo)
 
 
 def check_influences(found: int, name: str, model: str) -> None:

@@ -71,24 +71,20 @@ def affordable_validations(config: TrainConfig, seconds: float, scoring: float) 
     return max(1, min(asked, int(VALIDATION_SHARE * seconds / scoring))) if scoring > 0 else asked
 
 
-def timed_pace(stepper: Stepper, config: TrainConfig, left: Callable[[], float], where: str) -> Pace:
+def timed_pace(stepper: Stepper, config: TrainConfig, check: Callable[[Pace], object] = lambda _: None) -> Pace:
     """Time a few steps of each phase; the stepper must not be used afterwards.
 
     Args:
-        left: returns the time left for steps [s].
-        where: names the run.
-
-    Raises:
-        SsilkError: after any step, that its pace leaves too little time; the other phase is expected to take
-            `CAUTION` of what its frames do.
+        check: called after any step with the pace so far: the other phase is expected to take `CAUTION` of what its
+            frames do.
     """
     frames = config.pretraining_batch, trained_frames(config)
 
     def check_static(seconds: float) -> None:
-        check_possible(Pace(seconds, CAUTION * seconds * frames[1] / frames[0]), config, left(), where)
+        check(Pace(seconds, CAUTION * seconds * frames[1] / frames[0]))
 
     def check_dynamic(seconds: float) -> None:
-        check_possible(Pace(static or seconds, seconds), config, left(), where)
+        check(Pace(static or seconds, seconds))
 
     static = _seconds(stepper, 0, check_static) if config.static_iterations else 0.0
     dynamic = _seconds(stepper, config.static_iterations, check_dynamic)

@@ -16,7 +16,8 @@ from .state import RunState
 from .step_times import StepTimes
 
 PACE_INTERVAL = 5.0  # [s] between measurements of the speed on a processor
-OF_A_MODEL = 2.0  # duration of a model's validation over that of linear blend skinning, until one was measured
+OF_A_MODEL = 1.5  # duration of a model's validation over that of linear blend skinning, until one was measured
+LONG_STATIC = 5.0  # [s] of static training, from which on the steps that come after it are timed ahead
 MORE_TIME = 0.1  # of the minutes: what has to be left for a run that is done to go on
 
 
@@ -41,6 +42,7 @@ class RunClock:
         self._validated = False
         self.pace: Pace | None = None
         self._times = StepTimes(trained_frames(job.train) / job.train.pretraining_batch)
+        self._foreseen = False  # whether that ratio was measured
         self.start()
 
     @property
@@ -91,6 +93,19 @@ class RunClock:
         iteration = self.state.iteration
         is_static = iteration <= self.schedule.static_iterations
         self._times.took(is_static, iteration, self.state.seconds + time.monotonic() - self._since)
+
+    @property
+    def lacks_dynamic(self) -> bool:
+        """Whether long static training has told what its steps take, and nothing has told that of dynamic ones."""
+        each, config = self._times.static, self.schedule
+        known = self._foreseen or self.pace is not None or config.static_iterations >= config.iterations
+        return each is not None and not known and each * config.static_iterations > LONG_STATIC
+
+    def foresee(self, pace: Pace) -> None:
+        """Take in how long steps take that were timed ahead, both kinds in one moment, for what dynamic ones will."""
+        self._foreseen = True
+        if pace.static and pace.dynamic:
+            self._times.ratio = pace.dynamic / pace.static
 
     def seconds_left(self) -> float | None:
         """Return how long the run still takes, with its validations [s]; None while nothing is known."""

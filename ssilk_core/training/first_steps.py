@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Steps before a run whose minutes are planned by the time of its steps."""
+"""Steps and validations before those that are timed: the first ones load or compile what the others find ready."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from ..network.model.network import GarmentModel
 from .parts import TrainingParts
 from .settings import TrainConfig
 
@@ -22,5 +23,9 @@ def compile_loops(parts: TrainingParts, config: TrainConfig) -> None:
     for iteration in {0, config.static_iterations}:
         stepper.run(iteration)
     model.load_state_dict(before)
-    clip = parts.validator.clips[0]
-    parts.validator.frame_terms(clip[:VALIDATED_FRAMES], model)
+    try_validation(parts, model)
+
+
+def try_validation(parts: TrainingParts, model: GarmentModel | None = None) -> None:
+    """Validate a few frames of a model, or of linear blend skinning without one."""
+    parts.validator.frame_terms(parts.validator.clips[0][:VALIDATED_FRAMES], model)

@@ -19,11 +19,11 @@ from ..errors import fail
 from ..events import Checkpoint, Message, Progress, Reporter, Started, format_count
 from ..physics import loops
 from ..scene.kinematics import MAX_JOINT_SPEED, split_at_cuts
-from .budget import VALIDATION_SHARE, timed_pace
+from .budget import VALIDATION_SHARE, Pace, check_possible, timed_pace
 from .clock import RunClock
 from .curve import CurvePoint, append_point
 from .divergence import CHECK_INTERVAL, DIVERGENCE_WINDOW, DivergenceMonitor
-from .first_steps import compile_loops
+from .first_steps import compile_loops, try_validation
 from .fitting_batch import FittingBatch, need_enough_minutes
 from .job import TrainJob
 from .memory import fits_in_memory
@@ -132,25 +132,43 @@ class TrainingRun:
 
     def _score_lbs(self) -> Score:
         """Return the score of linear blend skinning, whose validation is the first to be timed."""
-        began = time.monotonic()
         count = format_count(len(self.job.held_out), "motions")
         self.report(Message(f"linear blend skinning is scored on {count} to validate on, to compare with"))
+        try_validation(self.parts)
+        began = time.monotonic()
         score = self.parts.validator.lbs_score()
         self.clock.scored_lbs(time.monotonic() - began)
         return score
 
     def _plan(self, minutes: float) -> None:
-        """Choose the number of iterations by timing a few steps; the model is restored afterwards."""
-        model, config, where = self.parts.model, self.config, str(self.job.output)
+        """Choose the number of iterations by timing a few steps."""
+        config, where = self.config, str(self.job.output)
         self.report(Message("a few steps are timed, to plan as many as fit into the minutes"))
+        pace = self._timed(lambda pace: check_possible(pace, config, self.clock.training_time_left(), where))
+        self.clock.plan(pace, minutes)
+        self.report(Message(f"about {self.state.planned} iterations are planned for {minutes:g} minutes"))
+
+    def _timed(self, check: Callable[[Pace], object] = lambda _: None) -> Pace:
+        """Time a few steps, as `timed_pace` does; the model is restored afterwards."""
+        model = self.parts.model
         before = {name: value.clone() for name, value in model.state_dict().items()}
-        stepper = self.parts.stepper(config, self.job.train.seed)
-        pace = timed_pace(stepper, config, self.clock.training_time_left, where)
+        stepper = self.parts.stepper(self.config, self.job.train.seed)
+        pace = timed_pace(stepper, self.config, check)
         del stepper
         self._empty_memory()
         model.load_state_dict(before)
-        self.clock.plan(pace, minutes)
-        self.report(Message(f"about {self.state.planned} iterations are planned for {minutes:g} minutes"))
+        return pace
+
+    def _foresee(self) -> None:
+        """Time dynamic steps in the midst of static ones, for the time that is left; nothing is learnt from them.
+
+        On a processor they may take several times what their frames do: they also look for cloth within cloth. On a
+        GPU the frames tell enough, and graphs would be captured twice. In a group not all would stop at once.
+        """
+        with self.clock.paused():
+            if loops.available(self.device):
+                compile_loops(self.parts, self.config)
+            self.clock.foresee(self._timed())
 
     def _measure_pace(self) -> None:
         """Measure the speed since the last check, and plan again."""
@@ -220,6 +238,8 @@ class TrainingRun:
         # On a processor steps are long, and those launched are done.
         if self.device.type == "cpu" and self.clock.measurement_due:
             self._measure_pace()
+        if self.device.type == "cpu" and self.group.size == 1 and self.clock.lacks_dynamic:
+            self._foresee()
 
     def check(self) -> None:
         """Report progress and skipped steps, follow the clock, and recover if training diverges."""

@@ -25,12 +25,17 @@ class StepTimes:
 
     def left(self, static: int, dynamic: int) -> float | None:
         """Return how long so many steps of each phase take [s]; None while nothing is known."""
-        of_static, of_dynamic = self._each(True), self._each(False)
+        of_static, of_dynamic = self.static, self._each(False)
         if of_dynamic is None:
             of_dynamic = of_static and of_static * self.ratio
         if of_dynamic is None:
             return None
         return static * (of_dynamic / self.ratio if of_static is None else of_static) + dynamic * of_dynamic
+
+    @property
+    def static(self) -> float | None:
+        """The mean duration of a static step [s]; None before the second one of this process."""
+        return self._each(True)
 
     def _each(self, is_static: bool) -> float | None:
         """Return the mean duration of a step [s], from the second of a phase on; None before that."""

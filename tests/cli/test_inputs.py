@@ -46,6 +46,23 @@ def test_a_mistyped_name_is_told_with_the_file_that_it_resembles(tmp_path):
         need_input(elsewhere, MODEL)
 
 
+def test_a_list_that_is_missing_is_told_as_one_where_a_list_is_taken(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "garments.toml").touch()
+    world = ["--stage", "s.usda", "--motion", "m.usda", "-o", "layers"]
+    for words in (
+        ["bake", "garment.toml", *world],
+        ["bake", "garment.toml:/Hero", *world],
+        ["inspect", "garment.toml"],
+    ):
+        assert main(words) == 2
+        told = capsys.readouterr().err
+        assert "there is no such list of garments; a TOML file with one table for each" in told
+        assert "did you mean 'garments.toml'?" in told
+    assert main(["evaluate", "garment.toml", "--stage", "s.usda", "--motions", "m.usda"]) == 2
+    assert "there is no such model file; a file of 'ssilk train' is needed" in capsys.readouterr().err
+
+
 def test_a_shape_without_a_weight_is_told(tmp_path):
     (tmp_path / "hero.usda").touch()
     need_input(f"{tmp_path}/hero.usda:tall=1", CHARACTER)

@@ -106,6 +106,15 @@ def test_inspect_names_what_keeps_a_body_out_of_the_family(world, capsys):
     assert "taller.usda" in told and "Hips/Spine/Skull" in told and not Path("out.usda").exists()
 
 
+def test_what_a_member_has_not_to_leave_out_is_told(world, capsys):
+    layer = Sdf.Layer.FindOrOpen("hero.usda")
+    assert Sdf.CopySpec(layer, "/Hero/Body", layer, "/Hero/Hood") and layer.Save()
+    assert run("inspect hero.usda --garment Skirt --family taller.usda --body ^Hood") == 0
+    said = "taller.usda:/Hero: there is no Hood to leave out with --body; what counts as its body is Body"
+    told = capsys.readouterr()
+    assert said in told.out + told.err
+
+
 def test_a_file_of_the_family_that_is_not_there_is_told(world, capsys):
     assert run("inspect hero.usda --garment Skirt --family tallest.usda") == 2
     assert "there is no such file" in capsys.readouterr().err

@@ -213,6 +213,8 @@ def test_the_draft_is_trained_and_filmed_beside_what_ships(drafted):
     commands = typed(said)
     both = [*("rig", "bake", "bake", "view", "view"), *("train", "bake", "view", "view")]
     assert [command[0] for command in commands] == both
+    rates = [command[command.index("--fps") + 1] for command in (commands[4], commands[-1])]
+    assert rates == ["15", "30"] and "has every second frame" in said
     names = ("lbs.usdc", "cape_draft.usdc", "cape_shipped.usdc")
     assert commands[-1][1:4] == [str(folder / name) for name in names]
     made = ("cape_stage.usdc", "lbs.usdc", "cape_shipped.usdc", "shipped.png", "shipped.mp4")

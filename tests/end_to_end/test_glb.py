@@ -262,6 +262,7 @@ def test_what_a_glb_cannot_hold_is_refused_and_what_viewers_miss_is_told(copy, c
     assert run(f"{bake} --target glb --refine 1 --refined-output points -o new.glb") == 2
     assert "a glb holds joints and morph targets" in capsys.readouterr().err
     assert run(f"{bake} --target glb -o new.usdc") == 2 and run(f"{bake} -o new.glb") == 2
+    assert "usd takes .usdc, .usd, .usda, .usdz; --target glb or --target glb4 writes it" in capsys.readouterr().err
     assert run(f"{bake} --target glb -o layers") == 2 and "it takes .glb" in capsys.readouterr().err
     assert not list(Path().glob("*new*"))
     assert run(f"{bake} --target glb -o new.glb") == 0 and "--target glb4" in capsys.readouterr().err

@@ -81,10 +81,32 @@ def start(there) -> Iterator[Callable[..., subprocess.Popen]]:
 
 @dataclass(frozen=True)
 class Served:
-    """The other ends of the pipes of a service, under the names that a process has for them."""
+    """The other ends of the pipes of a service, under the names that a process has for them.
+
+    Attributes:
+        unheard: set once the service has written what nobody reads.
+    """
 
     stdin: BinaryIO
     stdout: BinaryIO
+    unheard: threading.Event
+
+
+class Unheard:
+    """The end of a pipe to write to, which knows that nobody reads the other one."""
+
+    def __init__(self, pipe: BinaryIO) -> None:
+        self.pipe, self.found_out = pipe, threading.Event()
+
+    def write(self, data: bytes) -> None:
+        try:
+            self.pipe.write(data)
+        except BrokenPipeError:
+            self.found_out.set()
+            raise
+
+    def flush(self) -> None:
+        self.pipe.flush()
 
 
 @contextmanager
@@ -94,13 +116,15 @@ def served(**options: object) -> Iterator[Served]:
     (asked, stdin), (stdout, told) = os.pipe(), os.pipe()
     with ExitStack() as stack:
         incoming, outgoing = (stack.enter_context(open(*end, buffering=0)) for end in ((asked, "rb"), (told, "wb")))
-        thread = threading.Thread(target=serve, args=(garment, incoming, outgoing), daemon=True)
+        ended: list[None] = []
+        told_to = Unheard(outgoing)
+        thread = threading.Thread(target=lambda: ended.append(serve(garment, incoming, told_to)), daemon=True)
         thread.start()
         with open(stdout, "rb") as heard, open(stdin, "wb") as said:
-            yield Served(said, heard)
+            yield Served(said, heard, told_to.found_out)
             said.close()
             thread.join(PATIENCE)
-        assert not thread.is_alive()
+        assert ended == [None]  # neither does it go on, nor does an error end it
 
 
 def say(process: subprocess.Popen | Served, number: int, motion: Motion) -> None:
@@ -195,9 +219,14 @@ def test_few_elements_are_chosen_for_the_first_motion(there):
     same(found, GarmentPose.joined(solved(load_rollout(replace(REQUEST, latent_elements="few"))).latents.poses), 1e-6)
 
 
-def test_it_ends_before_it_has_said_or_heard_anything(there):
+def test_it_ends_with_its_input_before_it_has_heard_anything_and_where_nobody_hears_it(there):
     with served():
         pass
+    with served() as deaf:
+        assert read_message(deaf.stdout).kind == "ready"
+        deaf.stdout.close()
+        say(deaf, 0, motion_of("brief.usda"))
+        assert deaf.unheard.wait(PATIENCE)
 
 
 @pytest.mark.parametrize(

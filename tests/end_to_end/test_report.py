@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ssilk_usd.reading.facts import read_provenance
 
 from ssilk_core.cli import main
+from ssilk_core.delivery.bake.opened import add_provenance
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 SIZE = 900, 1200  # [pixels]
@@ -29,7 +31,10 @@ def pages(toy, tmp_path_factory) -> Path:
     model, stage = str(toy.folder / "model.safetensors"), str(toy.folder / "rigged.usda")
     stress = ["stress", model, "--stage", stage, "--quick", "--only", "upside", "NaN", "-o", str(figures)]
     assert main(stress) == 0
-    shot = ["report", str(toy.folder / "shot.usda"), "-o", str(folder / "shot.html"), "--figures", str(figures)]
+    counted = shutil.copy(toy.folder / "shot.usda", folder)
+    said = read_provenance(counted)["shown_skin"]
+    add_provenance(Path(counted), {"shown_skin": {**said, "pierced": 0.25, "limbs": {"Head": 0.125}}})
+    shot = ["report", counted, "-o", str(folder / "shot.html"), "--figures", str(figures)]
     assert main(shot) == 0
     motion = str(toy.folder / "clip.usda")
     assert main(["report", model, "--stage", stage, "--motion", motion, "-o", str(folder / "model.html")]) == 0
@@ -63,6 +68,8 @@ def test_a_page_holds_what_was_asked_for(pages):
     assert model.headings == [*opening, "Training", "Provenance"]
     text = (pages / "shot.html").read_text()
     assert "model_sha256" in text and "first number 7" in text
+    through = "A limb is through the cloth in 25.0 % of the frames (Head in 12.5 %), as its bake counted."
+    assert through in text.partition("Provenance")[0]
 
 
 @pytest.mark.skipif(BROWSER is None, reason="no Chromium or Chrome is installed")
@@ -94,6 +101,7 @@ def test_a_browser_draws_the_page_and_fetches_nothing(pages, name, tmp_path):
         ("{shot} -o {out}.html --stage {stage} --motion {clip}", "shots hold their character"),
         ("{model} -o {out}.html --stage {stage}", "one of --stage and --motion"),
         ("{out}/none.usda -o {out}.html", "there is no such file"),
+        ("{layers} -o {out}.html", "name the stage of a shot, such as "),
         ("{stage} -o {out}.html --figures {stage}", "not a JSON file"),
         ("{shot} -o {out}.html --figures {other}", "not figures of a known kind"),
     ],
@@ -102,6 +110,9 @@ def test_bad_input_is_one_sentence(toy, tmp_path, capsys, words, said):
     (tmp_path / "other.json").write_text(json.dumps({"a": 1}))
     files = {"shot": "shot.usda", "model": "model.safetensors", "stage": "rigged.usda", "clip": "clip.usda"}
     names = {name: toy.folder / file for name, file in files.items()}
+    (tmp_path / "layers/shots/walk").mkdir(parents=True)
+    (tmp_path / "layers/shots/walk/shot.usda").touch()
+    names["layers"] = tmp_path / "layers"
     filled = words.format(**names, out=tmp_path / "out", other=tmp_path / "other.json").split()
     assert main(["report", *filled]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "out.html").exists()

@@ -12,15 +12,19 @@ def stress(toy, *words: str) -> int:
 
 
 def test_figures_of_every_case_that_was_asked_for(toy, tmp_path, capsys):
-    assert stress(toy, "--only", "motion: NaN", "upside", "precision: float16", "-o", str(tmp_path / "out.json")) == 0
+    words = ("--only", "motion: NaN", "upside", "precision: float16", "-o", str(tmp_path / "out.json"))
+    assert stress(toy, *words, "--json") == 0
     document = json.loads((tmp_path / "out.json").read_text())
     found = {outcome["name"]: outcome for outcome in document["outcomes"]}
     assert len(found) == 3 and document["inputs"]["quick"] and document["model"] == "model.safetensors"
     assert found["NaN in frame 7"]["verdict"] == "refuses"
     assert found["upside down"]["measured"]["extent"]["finite"]
     assert 0 < found["float16"]["measured"]["error"] < 0.2
-    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("| motion: ")]
-    assert len(lines) == 2
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    texts = [event["text"] for event in told if event["event"] == "message"]
+    assert sum(line.startswith("| motion: ") for text in texts for line in text.splitlines()) == 2
+    left = [(event["done"], event["seconds_left"]) for event in told if event["event"] == "progress"]
+    assert left[0] == (0, None) and left[3] == (3, 0) and left[1][1] > left[2][1] > 0
 
 
 def test_an_interrupted_run_goes_on(toy, tmp_path, capsys, monkeypatch):

@@ -109,7 +109,10 @@ def test_models_are_put_on_one_table(world, capsys, no_clock):
         ("--frames 3", "'3' is not a whole number from 4 to 1e+06"),
         ("-o trade.txt", "it ends in .json"),
         ("-o model.json --stage nowhere.usda", "nowhere.usda: there is no such file"),
-        ("--motions clip.usda", "clip.usda: a file, and no folder"),
+        (
+            "--motions clip.usda",
+            "a folder of motion files is needed; name its folder, and this one with --clips clip",
+        ),
     ],
 )
 def test_what_cannot_be_is_said_in_one_sentence(world, capsys, options, message):

@@ -115,6 +115,7 @@ WRONG = {
     "unknown": ("[cape]\nsteps = 3", "table 'cape', key 'steps': no such key; it is one of stage, garment, motions"),
     "default": ("[defaults]\nstage = 3\n[cape]", "table 'defaults', key 'stage': 3; the path of a stage is needed"),
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
+    "fabric": ('[cape]\nfabric = "silkk"', "wool, leather is needed; did you mean 'silk'?"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, light, final, paper is"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
     "over": (

@@ -185,8 +185,10 @@ def test_bakes_count_the_cloth_in_the_colliders_of_their_shot(stage, capsys):
     assert main(layers) == 0 and "current" in capsys.readouterr().err
     for shot, page in ("shot.usdc", "file"), ("layers/shots/floored/shot.usda", "layers"):
         assert main(["report", shot, "-o", f"{page}.html"]) == 0
-        assert ": cloth in colliders: " in capsys.readouterr().err
+        told = capsys.readouterr().err
+        assert ": cloth in colliders: " in told and "its model is not where" not in told
         assert "it is inside colliders" in (text := (stage / f"{page}.html").read_text())
+        assert "request.model" in text.partition("Provenance")[2]
         assert "of its vertices were more than 5 mm inside colliders on average" in text and "/Set/Floor" in text
     assert main(["report", "layers/shots/plain/shot.usda", "-o", "plain.html"]) == 0
     assert "colliders" not in capsys.readouterr().err and "inside colliders" not in (stage / "plain.html").read_text()

@@ -504,6 +504,9 @@ def test_several_garments_need_a_name():
     with pytest.raises(SsilkError, match=r"several garments: /Shirt, /Set/Pants"):
         read_garment(stage, SKELETON)
     assert read_garment(stage, SKELETON, garment="Pants").mesh.path.endswith(":/Set/Pants")
+    plain_mesh(stage, "/Set/Belt")
+    with pytest.raises(SsilkError, match=r"several meshes are, or lie beneath, 'Set': /Set/Pants, /Set/Belt; one is"):
+        read_garment(stage, SKELETON, garment="Set")
 
 
 # Motions

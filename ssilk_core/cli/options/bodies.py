@@ -47,18 +47,26 @@ def onto_place(options: argparse.Namespace) -> tuple[str, str | None]:
 def read_member(
     options: argparse.Namespace, location: str, first: Character, report: Reporter, root: str | None = None
 ) -> Character:
-    """Read another body of the first character; its stage may have that one's garment too, which is no body."""
+    """Read another body of the first character; its stage may have that one's garment too, which is no body.
+
+    It may lack what --body leaves out, which is told.
+    """
     from ssilk_usd.reading.character import WITHOUT, bodies_there, read_character
 
     file, prim = garment_location(options)
     stage, root = split_body(str(options.stage))[0], root or options.root
     worn = prim if is_same_file(file, stage) else None
     own = worn if is_same_file(split_body(location)[0], stage) else None
-    bodies = [*options.body, *([f"{WITHOUT}{worn}"] if worn else [])]
-    if bodies:
-        kept = {body.mesh.path.rpartition("/")[2] for body in (*first.bodies, *first.stand_ins)}
-        bodies = bodies_there(location, bodies, kept, root=root, garment=own)
-    return read_character(location, root=root, bodies=bodies, garment=own, report=report)
+    kept = {body.mesh.path.rpartition("/")[2] for body in (*first.bodies, *first.stand_ins)}
+    asked = [*options.body, *([f"{WITHOUT}{worn}"] if worn else [])]
+    there = {name: bodies_there(location, [name], kept, root=root, garment=own) for name in asked}
+    bodies = [each for found in there.values() for each in found]
+    member = read_character(location, root=root, bodies=bodies, garment=own, report=report)
+    if missing := [name.removeprefix(WITHOUT) for name in dict.fromkeys(options.body) if not there[name]]:
+        count = ", ".join(body.mesh.path.rpartition("/")[2] for body in (*member.bodies, *member.stand_ins))
+        text = f"there is no {' and no '.join(missing)} to leave out with --body"
+        report(Message(f"{member.path}: {text}; what counts as its body is {count or 'no mesh'}"))
+    return member
 
 
 def left_out_in_list(entry: WardrobeEntry, entries: Sequence[WardrobeEntry], folder: Path) -> dict[str, list[str]]:

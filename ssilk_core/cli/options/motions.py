@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ...errors import fail
 from ...events import Message, Reporter
 from ...scene.assets.reshaped import reshaped
 from ...scene.posed_alike import shaped_as_in_stage
@@ -24,6 +25,16 @@ def add_range(verb: argparse.ArgumentParser, what: str, default: str) -> None:
         help=f"{what}, as time codes of the motion, such as 1001-1100, or 'all' that have samples (default: "
         f"{default}); --range=-3-5 where FIRST is negative",
     )
+
+
+def need_motion_folder(folder: Path) -> None:
+    """Raise `SsilkError` where --motions names no folder; for one of its files, say how that is chosen."""
+    needed = "a folder of motion files is needed"
+    if folder.is_file():
+        todo = f"name its folder, and this one with --clips {folder.stem}"
+        fail(str(folder), "a file, and no folder", needed, todo)
+    if not folder.is_dir():
+        fail(str(folder), "there is no such folder", needed)
 
 
 def tell_shapes(

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ...events import Countdown, Message, Reporter, silent
+import numpy as np
+
+from ...events import Countdown, Message, Reporter, format_count, silent
 from .computed_frames import SolvedLatents
 from .result import LatentSummary
 from .rollout import BakeRollout
@@ -23,6 +25,7 @@ def solved(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
     loop = rollout.in_loop(rollout.loop, roller) if rollout.loop else None
     poses = (loop.pose,) if loop else tuple(rollout.network_poses(roller))
     found = roller.tally
+    moves = 1000 * np.array(found.figures["step_left"] or [0.0])
     summary = LatentSummary(
         iterations=rollout.request.latent_iterations,
         elements=rollout.request.latent_elements,
@@ -30,13 +33,28 @@ def solved(rollout: BakeRollout, report: Reporter = silent) -> BakeRollout:
         energy_before_j=found.mean("start_energy"),
         energy_j=found.mean("energy"),
         left=found.mean("left_share"),
+        step_left_mm=float(np.median(moves)),
+        largest_step_left_mm=float(moves.max()),
         unconverged=found.unconverged,
         failed=found.failed,
     )
-    if found.failed:
-        text = f"{found.failed} of {found.frames} frames are not solved: no step lowers their energy"
-        report(Message(f"{rollout.request.motion}: {text}; they stay where the solver came", "warning"))
+    _tell(summary, rollout.request.motion, report)
     return replace(rollout, latents=SolvedLatents(poses, summary, loop))
+
+
+def _tell(summary: LatentSummary, motion: str, report: Reporter) -> None:
+    """Say what the picture lacks of frames that are solved in full, and what brings it nearer."""
+    if summary.unconverged:
+        words = f"{motion}: frames are solved in {format_count(summary.iterations, 'iterations')}, not in full"
+        far = f"cloth may still move by {summary.step_left_mm:.2g} mm in half of them"
+        worst = f"and by {summary.largest_step_left_mm:.2g} mm in the worst"
+        todo = f"where that shows, '--latent-iterations {2 * summary.iterations}' lowers it, in more time"
+        report(Message(f"{words}: {far}, {worst}; {todo}"))
+    if summary.failed:
+        text = f"in {summary.failed} of {format_count(summary.frames, 'frames')} no step lowers the energy further"
+        report(
+            Message(f"{motion}: {text}, as where cloth is inside the body; look at the skin that shows", "warning")
+        )
 
 
 def _frames_to_solve(rollout: BakeRollout) -> int:

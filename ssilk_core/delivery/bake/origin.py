@@ -16,6 +16,7 @@ from .opened import provenance_of
 from .record import RECORD
 from .request import AT, BakeRequest, split_start
 from .rollout import BakeRollout
+from .shots import need_no_folder
 
 REFINED = "refined"  # what a shot says of its refinement, under this name
 COLLIDERS = "colliders"  # what a shot says of those that its cloth met, under this name
@@ -122,6 +123,7 @@ def read_origin(
         SsilkError: no such shot, one that does not say how it was baked, or an input that is not found.
     """
     allowed = "a shot written by 'ssilk bake' is needed"
+    need_no_folder(shot, allowed)
     if not shot.is_file():
         fail(str(shot), "there is no such shot", allowed)
     provenance = provenance_of(shot) if provenance is None else provenance

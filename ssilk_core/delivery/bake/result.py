@@ -180,6 +180,8 @@ class LatentSummary:
         frames: that were solved.
         energy_before_j, energy_j: mean energies of the best of the starts and of the solution [J].
         left: mean share of the energy that the solver's model still promised, of that and what was gained.
+        step_left_mm, largest_step_left_mm: how far the cloth of a frame may still move, at most (RMS over the mass),
+            the median over frames and the largest [mm].
         unconverged: frames with more left than the tolerance.
         failed: frames among them whose last line search found nothing lower.
     """
@@ -190,11 +192,18 @@ class LatentSummary:
     energy_before_j: float
     energy_j: float
     left: float
+    step_left_mm: float
+    largest_step_left_mm: float
     unconverged: int
     failed: int
 
     def to_metadata(self) -> dict[str, float | str]:
         """Return figures of four digits, as a shot stores them."""
+        counts = {"frames not converged": self.unconverged, "line searches that failed": self.failed}
+        return {**self.figures(), **counts}
+
+    def figures(self) -> dict[str, float | str]:
+        """Return figures for people: how far frames have come, not the counts of the solver."""
         return {
             "iterations": self.iterations,
             "elements": self.elements,
@@ -202,8 +211,8 @@ class LatentSummary:
             "energy before [J]": float(f"{self.energy_before_j:.4g}"),
             "energy [J]": float(f"{self.energy_j:.4g}"),
             "left of the gain": float(f"{self.left:.4g}"),
-            "frames not converged": self.unconverged,
-            "line searches that failed": self.failed,
+            "left to move, median [mm]": float(f"{self.step_left_mm:.4g}"),
+            "left to move, at most [mm]": float(f"{self.largest_step_left_mm:.4g}"),
         }
 
 
@@ -390,7 +399,7 @@ class BakeResult:
         if self.current:
             return {kind: str(self.path), "current": True}
         refined = self.refinement.figures() if self.refinement else {}
-        latent = self.latent.to_metadata() if self.latent else {}
+        latent = self.latent.figures() if self.latent else {}
         loop = self.loop.to_metadata() if self.loop else {}
         return {
             kind: str(self.path),

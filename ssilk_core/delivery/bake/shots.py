@@ -137,6 +137,21 @@ def place_of(stage: Path) -> tuple[Path, str]:
     return home.parent.parent, home.name
 
 
+def layers_of(stage: Path) -> list[Path]:
+    """Return the layers of the garments in the stage of a shot of layers; none for any other file."""
+    if not is_stage(stage):
+        return []
+    return [stage.parent / name / ANIMATION for name, record in finished(*place_of(stage)).items() if record]
+
+
+def need_no_folder(path: Path, allowed: str) -> None:
+    """Raise `SsilkError` for a folder in place of a shot, and name a stage in it if it is one of layers."""
+    if path.is_dir():
+        stages = sorted(path.glob(f"shots/*/{STAGE}"))
+        todo = f"name the stage of a shot, such as {stages[0]}" if stages else ""
+        fail(str(path), "a folder, and no shot", allowed, todo)
+
+
 def finished(folder: Path, shot: str) -> dict[str, TaskRecord | None]:
     """Return the records of the garments that are finished in a shot, by name; None for one that is damaged."""
     home = folder / "shots" / shot

@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 from ...errors import fail
 from ...physics.intersections.figures import NOT_COUNTED, SelfIntersections
@@ -15,6 +16,8 @@ from ...scene.plain import from_plain
 from .entered import EnteredCloth
 from .opened import provenance_of
 from .shots import finished, is_stage, place_of
+
+Counts = TypeVar("Counts", ShownSkin, SunkCloth)
 
 # Under these names.
 SHOWN_SKIN, INTERSECTIONS, SUNK, ENTERED = "shown_skin", "intersections", "sunk_cloth", "riders_in_cloth"
@@ -46,7 +49,13 @@ class ShotCounts:
 
 
 def stated_sunk(path: Path, garments: Mapping[int, str]) -> dict[int, SunkCloth]:
-    """Return what bakes counted inside colliders, of garments of a shot or of a stage of layers that have it.
+    """Return what bakes counted inside colliders; arguments and errors are those of `stated_skin`."""
+    what = "cloth inside colliders"
+    return _stated(path, garments, SUNK, what, lambda said: from_plain(SunkCloth, {"colliders": {}, **said}))
+
+
+def stated_skin(path: Path, garments: Mapping[int, str]) -> dict[int, ShownSkin]:
+    """Return what bakes counted of skin and limbs, of garments of a shot or of a stage of layers that have it.
 
     Args:
         garments: paths of their meshes in the stage, by any number.
@@ -54,17 +63,24 @@ def stated_sunk(path: Path, garments: Mapping[int, str]) -> dict[int, SunkCloth]
     Raises:
         SsilkError: not a readable shot, or it says so otherwise than this version does.
     """
+    none: dict[str, object] = {"regions": {}, "limbs": {}}  # USD keeps no empty dictionaries
+    return _stated(path, garments, SHOWN_SKIN, "skin", lambda said: from_plain(ShownSkin, {**none, **said}))
+
+
+def _stated(
+    path: Path, garments: Mapping[int, str], name: str, what: str, parsed: Callable[[Mapping[str, object]], Counts]
+) -> dict[int, Counts]:
     if is_stage(path):
+        field = {SUNK: "sunk", SHOWN_SKIN: "shown_skin"}[name]
         records = finished(*place_of(path))
-        results = {name: record.result.sunk for name, record in records.items() if record and record.result.sunk}
-        named = {number: prim.split("/")[2:3] for number, prim in garments.items()}
-        return {number: results[name[0]] for number, name in named.items() if name and name[0] in results}
-    said = provenance_of(path).get(SUNK)
+        results = {shot: getattr(record.result, field) for shot, record in records.items() if record}
+        prims = {number: prim.split("/")[2:3] for number, prim in garments.items()}
+        return {number: found for number, prim in prims.items() if prim and (found := results.get(prim[0]))}
+    said = provenance_of(path).get(name)
     if not isinstance(said, Mapping) or "none" in said or len(garments) != 1:
         return {}
     try:
-        found = from_plain(SunkCloth, {"colliders": {}, **said})
+        found = parsed(said)
     except (TypeError, ValueError) as error:
-        fail(str(path), f"its cloth inside colliders is told in another way ({error})", "a shot of this version",
-             "bake it again")  # fmt: skip
+        fail(str(path), f"its {what} is told in another way ({error})", "a shot of this version", "bake it again")
     return dict.fromkeys(garments, found)

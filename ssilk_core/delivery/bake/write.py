@@ -13,7 +13,7 @@ from ...events import Message, Reporter, Result, Started, silent
 from ...files import need_not_input, need_writable, replacing, split_location
 from ...scene.kinematics import lbs_deformer, lbs_poses
 from ...scene.riders import RiderJoints
-from ..targets import GLB
+from ..targets import GLB, check_suffix
 from .beneath import left_out, tell_left_out
 from .certificate.certified import certified, proven
 from .certificate.requirements import need_certifier
@@ -132,9 +132,7 @@ def result_of(
 
 def _check_output(request: BakeRequest, path: Path) -> None:
     """Raise `SsilkError` where the target does not take the file, or it cannot be written."""
-    suffixes = request.receiver.suffixes
-    if path.suffix not in suffixes:
-        fail(str(path), f"the suffix is '{path.suffix}'", f"{request.target} takes {', '.join(suffixes)}")
+    check_suffix(path, request.target)
     if path.suffix == GLB and request.writes_points:
         fail(str(path), "refined points", "a glb holds joints and morph targets", "use --refined-output joints")
     need_writable(path)

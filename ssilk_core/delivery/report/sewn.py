@@ -22,15 +22,14 @@ from ...scene.assets import Mesh
 SAME = 1e-4  # [m] between points of a garment that lies where it was trained
 
 
-def model_of(shot: Path, said: Mapping[str, Any], digest: str) -> ModelFile | None:
+def model_of(origins: Mapping[Path, Mapping[str, Any]], digest: str) -> ModelFile | None:
     """Return the model that moves a garment of a shot; None where it is not where the shot was baked from.
 
     Args:
-        said: the shot's provenance, which names models by paths from its folder.
+        origins: provenance of the shot's file, or of each of its layers, which names models by paths from its folder.
         digest: SHA-256 of the model, as the garment states it.
     """
-    for named in dict.fromkeys(_models(said)):
-        path = shot.parent / named
+    for path in dict.fromkeys(file.parent / named for file, said in origins.items() for named in _models(said)):
         if path.is_file() and sha256(path) == digest:
             try:
                 return load_model(path)

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from html import escape
 
 import numpy as np
 
 from ...events import Countdown, Message, Reporter, silent
 from ...physics.intersections.figures import LayerFigures
+from ...physics.skin.figures import ShownSkin
 from ...physics.world.sunk import SunkCloth
 from ...quality.charts import ChartPanel, svg_chart
 from ...scene.assets import Floats, Mesh
@@ -60,6 +61,7 @@ def shot_sections(
     report: Reporter = silent,
     *,
     sunk: Mapping[int, SunkCloth] | None = None,
+    skin: Mapping[int, ShownSkin] | None = None,
     props: ShotProps | None = None,
     over: Sequence[LayerFigures] = (),
 ) -> list[Section]:
@@ -70,6 +72,7 @@ def shot_sections(
         garments: those to measure.
         bodies: the meshes that garments collide with, at rest, by their index in the player.
         sunk: what bakes counted inside colliders, of garments that had any, likewise.
+        skin: what they counted of skin, for limbs through the cloth, which points alone do not tell.
         props: these colliders.
         over: what bakes counted of garments over one another; counted here where there is none.
     """
@@ -88,7 +91,7 @@ def shot_sections(
     first, *others = [
         part
         for each, meter in zip(garments, meters)
-        for part in _sections(player, each, meter, (sunk or {}).get(each.index), props)
+        for part in _sections(player, each, meter, (sunk or {}).get(each.index), (skin or {}).get(each.index), props)
     ]
     pairs = over or layers.figures("the shot")
     between = [layers_section(pairs)] if pairs else []
@@ -101,7 +104,12 @@ def _playing(player: ShotPlayer, props: ShotProps | None, report: Reporter) -> s
 
 
 def _sections(
-    player: ShotPlayer, garment: ShotGarment, meter: TermsMeter, sunk: SunkCloth | None, props: ShotProps | None
+    player: ShotPlayer,
+    garment: ShotGarment,
+    meter: TermsMeter,
+    sunk: SunkCloth | None,
+    skin: ShownSkin | None,
+    props: ShotProps | None,
 ) -> list[Section]:
     values = {name: np.array(found) for name, found in meter.values.items()}
     bad = values["total"] - values["gravity"]  # a raised garment is no worse
@@ -143,6 +151,8 @@ def _sections(
         for frame, letter in marks.items()
     )
     found = meter.shown_skin(name)
+    if found and skin:
+        found = replace(found, pierced=skin.pierced, limbs=skin.limbs)
     charts += table(("", "mean", "median", "95 %", "most"), rows)
     charts += f'<p class="note">{escape(garment.note)}</p>' if garment.note else ""
     lost = [time for time, finite in zip(player.frame_times, meter.finite) if not finite]

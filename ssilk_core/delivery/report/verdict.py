@@ -61,6 +61,8 @@ def verdict(
         seen = f"{share}, and {shown[worst]:.2f} % {when(worst)}{where}"
         bare = f"{100 * shown_skin.bare:.1f} % is bare, {100 * shown_skin.worst_bare:.1f} % at most."
         words.append(f"{seen if shown[worst] else 'No covered skin shows'}; {bare}")
+        if shown_skin.pierced is not None:
+            words.append(f"{_limbs(shown_skin.pierced, shown_skin.limbs)}, as its bake counted.")
     else:
         words.append("Skin was not measured, because the garment covers none.")
     if intersections.worst:
@@ -95,3 +97,11 @@ def verdict(
     lines = "".join(f"<li>{escape(each)}</li>" for each in words)
     note = f'<p class="note">{f"{COUNTED} " if shown_skin else ""}{CLOCK}</p>'
     return Section(f"{name}: verdict", f"<p><strong>{escape(first)}</strong></p><ul>{lines}</ul>{note}")
+
+
+def _limbs(pierced: float, limbs: Mapping[str, float]) -> str:
+    """Return in how many frames a limb is through the cloth, and which."""
+    if not pierced:
+        return "No limb is through the cloth"
+    most = ", ".join(f"{joint} in {100 * share:.1f} %" for joint, share in limbs.items())
+    return f"A limb is through the cloth in {100 * pierced:.1f} % of the frames ({most})"

@@ -19,7 +19,7 @@ from .memory import LatentMemory
 from .options import LatentOptions
 from .shots import LatentFrame, LatentShots
 
-FIGURES = "start_energy", "energy", "left_share"  # of `LatentSolution`
+FIGURES = "start_energy", "energy", "left_share", "step_left"  # of `LatentSolution`
 
 
 @dataclass

@@ -53,6 +53,8 @@ class LatentSolution:
         energy, start_energy: at x, and at the best of the starts [J], shape (N,).
         left: by how much the quadratic model says that the energy could still fall [J], shape (N,); with the forces
             at x, and the Jacobian and Hessian of the last iteration.
+        step_left: how far the cloth may still move to the model's minimum, at most (RMS over the mass) [m], shape
+            (N,): a step d promises at least m d^2 / (2 dt^2), its inertia alone.
         allowed: what may be left of a frame that has converged [J], shape (N,).
         failed: the last line search found nothing lower although there was more to gain, shape (N,).
         iterations: that moved the frame, shape (N,).
@@ -63,6 +65,7 @@ class LatentSolution:
     energy: Tensor
     start_energy: Tensor
     left: Tensor
+    step_left: Tensor
     allowed: Tensor
     failed: Tensor
     iterations: Tensor
@@ -170,7 +173,7 @@ class LatentSolver:
         energy, none = state.energy, torch.zeros_like(state.energy, dtype=torch.long)
         left = torch.full_like(energy, torch.inf, dtype=torch.float64)
         failed = torch.zeros_like(none, dtype=torch.bool)
-        return LatentSolution(z, state.x, energy, energy, left, torch.zeros_like(left), failed, none)
+        return LatentSolution(z, state.x, energy, energy, left, left, torch.zeros_like(left), failed, none)
 
     def allowed(self, energy: Tensor, dt: float | Tensor) -> Tensor:
         """Return what may be left of frames that have converged [J], (N,); their `energy` resolves nothing finer."""
@@ -301,6 +304,7 @@ class _LatentSearch:
             energy=state.energy,
             start_energy=self.start.energy,
             left=left,
+            step_left=(2 * left.clamp_min(0) / self.solver.free_mass.sum().double()).sqrt() * self.inputs.dt,
             allowed=self.allowed,
             failed=self.failed,
             iterations=self.iterations,

@@ -58,6 +58,7 @@ class Case:
         measure: runs the case; it raises `SsilkError` if the product refuses the input.
         allowed: verdicts that are acceptable.
         body: name of the body of a family that it runs on, where there are several.
+        seconds: about what it takes with the cape that ships on one core, by which the time left is told [s].
     """
 
     group: str
@@ -65,6 +66,7 @@ class Case:
     measure: Measure
     allowed: tuple[Verdict, ...] = ("works",)
     body: str = ""
+    seconds: float = 3.0
 
     @property
     def label(self) -> str:
@@ -108,27 +110,40 @@ STIFFNESSES = (1e-3, 1.0, 1e3, 1e6)  # [N/m]
 SLIVER_HEIGHTS = (1e-2, 1e-4, 1e-6, 1e-8, 0.0)  # ratio of height to base
 VERTEX_COUNTS = (100, 10_000, 200_000)
 FACTORS = (0.1, 10.0)  # of each stiffness
+SIMULATED, SIMULATED_PROP, TRIED = 30.0, 320.0, 7.0  # [s]: a few steps of the simulator, with a prop, of training
+LONGEST = 4e-3  # [s] of a frame of a long rollout
 PRECISIONS = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 
 CASES = (
-    *(Case("length", f"{count:,} frames", roll_out_frames(count)) for count in (10_000, 100_000)),
-    *(Case("rate", f"{fps} frames per second", bake_at_rate(fps)) for fps in FRAME_RATES),
+    *(
+        Case("length", f"{count:,} frames", roll_out_frames(count), seconds=LONGEST * count)
+        for count in (10_000, 100_000)
+    ),
+    *(Case("rate", f"{fps} frames per second", bake_at_rate(fps), seconds=4 + fps / 20) for fps in FRAME_RATES),
     *(
         Case("gravity", name, roll_out_gravity(factor))
         for name, factor in (("none", 0.0), ("tenfold", 10.0), ("upwards", -1.0))
     ),
-    Case("gravity", "none, simulated", simulate_gravity(0.0), MAY_FALL_BACK),
-    Case("gravity", "tenfold, simulated", simulate_gravity(10.0), MAY_FALL_BACK),
+    Case("gravity", "none, simulated", simulate_gravity(0.0), MAY_FALL_BACK, seconds=SIMULATED),
+    Case("gravity", "tenfold, simulated", simulate_gravity(10.0), MAY_FALL_BACK, seconds=SIMULATED),
     Case("gravity", "sideways", roll_out_rotated(FORWARD, angle=pi / 2)),
     *(Case("wind", f"{speed:g} m/s", roll_out_wind(steady(speed))) for speed in (20.0, 60.0)),
     Case("wind", "60 m/s from one frame to the next", roll_out_wind(switched(60.0))),
     Case("wind", "40 m/s with gusts of 20 m/s", roll_out_wind(steady(40.0), 20.0)),
-    Case("wind", "60 m/s, simulated", simulate_wind(60.0), MAY_FALL_BACK),
+    Case("wind", "60 m/s, simulated", simulate_wind(60.0), MAY_FALL_BACK, seconds=SIMULATED),
     Case("wind", "101 m/s", roll_out_wind(steady(101.0)), ("refuses",)),
     Case("props", "through the body at 2 m/s", roll_out_prop(passing(2.0))),
     Case("props", "in one frame amid cloth", roll_out_prop(appearing)),
-    Case("props", "through the body at 10 m/s, simulated", simulate_prop(passing(10.0)), MAY_FALL_BACK),
-    Case("props", "in one frame amid cloth, simulated", simulate_prop(appearing), MAY_FALL_BACK),
+    Case(
+        "props",
+        "through the body at 10 m/s, simulated",
+        simulate_prop(passing(10.0)),
+        MAY_FALL_BACK,
+        seconds=SIMULATED_PROP,
+    ),
+    Case(
+        "props", "in one frame amid cloth, simulated", simulate_prop(appearing), MAY_FALL_BACK, seconds=SIMULATED_PROP
+    ),
     Case("motion", "upside down", roll_out_rotated(FORWARD, angle=pi)),
     Case("motion", "a teleport of 30 m each second", roll_out_path(jumps)),
     Case("motion", "a ride at 50 m/s", roll_out_path(ride)),
@@ -141,9 +156,9 @@ CASES = (
     Case("motion", "poses of any joint angles", roll_out_random_poses(0.5)),
     Case("motion", "other such poses in each frame", roll_out_random_poses(1e-3)),
     Case("motion", "NaN in frame 7", roll_out_nan(7), ("refuses",)),
-    *(Case("size", f"{metres:g} m", train_at_size(metres)) for metres in (1e-3, 100.0)),
+    *(Case("size", f"{metres:g} m", train_at_size(metres), seconds=2 * TRIED) for metres in (1e-3, 100.0)),
     *(Case("size", f"{metres:g} m high, played", roll_out_height(metres), MAY_FALL_BACK) for metres in (0.01, 20.0)),
-    *(Case("fabric", f"{stiffness:g} N/m", train_fabric(stiffness)) for stiffness in STIFFNESSES),
+    *(Case("fabric", f"{stiffness:g} N/m", train_fabric(stiffness), seconds=TRIED) for stiffness in STIFFNESSES),
     *(
         Case("fabric", f"{name} times {factor:g}, played", roll_out_fabric(**{name: factor}))
         for name in ("stretch", "shear", "bending", "density", "drag")
@@ -152,24 +167,36 @@ CASES = (
     Case("fabric", "bending times 0.001, density times 1000, played", roll_out_fabric(bending=1e-3, density=1e3)),
     Case("fabric", "no density, played", roll_out_fabric(density=0.0), ("refuses",)),
     *(
-        Case("slivers", f"{height:g} as high as long", train_slivers(height), (*MAY_FALL_BACK, "refuses"))
+        Case(
+            "slivers",
+            f"{height:g} as high as long",
+            train_slivers(height),
+            (*MAY_FALL_BACK, "refuses"),
+            seconds=TRIED,
+        )
         for height in SLIVER_HEIGHTS
     ),
     *(
-        Case("simulator", f"{stiffness:g} N/m", simulate_fabric(stiffness), MAY_FALL_BACK)
+        Case("simulator", f"{stiffness:g} N/m", simulate_fabric(stiffness), MAY_FALL_BACK, seconds=SIMULATED)
         for stiffness in STIFFNESSES
     ),
     *(
-        Case("simulator", f"{name} times {factor:g}", simulate_factor(name, factor), MAY_FALL_BACK)
+        Case("simulator", f"{name} times {factor:g}", simulate_factor(name, factor), MAY_FALL_BACK, seconds=SIMULATED)
         for name in ("stretch", "shear", "bending", "contact", "tether", "stitch")
         for factor in FACTORS
     ),
-    *(Case("simulator", f"friction {value:g}", simulate_friction(value), MAY_FALL_BACK) for value in (0.0, 2.0)),
-    Case("simulator", "slivers 0.0001 as high as long", simulate_slivers(1e-4), MAY_FALL_BACK),
-    *(Case("vertices", f"{count:,}", train_vertex_count(count)) for count in VERTEX_COUNTS),
-    Case("vertices", "50,000, played", roll_out_vertices(50_000)),
     *(
-        Case("precision", str(dtype).removeprefix("torch."), roll_out_precision(dtype), MAY_FALL_BACK)
+        Case("simulator", f"friction {value:g}", simulate_friction(value), MAY_FALL_BACK, seconds=SIMULATED)
+        for value in (0.0, 2.0)
+    ),
+    Case("simulator", "slivers 0.0001 as high as long", simulate_slivers(1e-4), MAY_FALL_BACK, seconds=SIMULATED),
+    *(
+        Case("vertices", f"{count:,}", train_vertex_count(count), seconds=TRIED + count / 5_000)
+        for count in VERTEX_COUNTS
+    ),
+    Case("vertices", "50,000, played", roll_out_vertices(50_000), seconds=25.0),
+    *(
+        Case("precision", str(dtype).removeprefix("torch."), roll_out_precision(dtype), MAY_FALL_BACK, seconds=12.0)
         for dtype in PRECISIONS
     ),
 )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...errors import fail, fail_unknown
+from ...errors import did_you_mean, fail, fail_unknown
 from ...files import relative_path, replacing, split_location
 from ...scene.fabrics import FABRICS
 from ...scene.shape_weights import is_shapes
@@ -216,7 +216,8 @@ def _need_table(path: Path, name: str, table: Any) -> None:
         if key not in KEYS:
             fail_unknown(where, "no such key", key, KEYS)
         if not KEYS[key].fits(value):
-            fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed")
+            near = did_you_mean(value, FABRICS) if key == "fabric" and isinstance(value, str) else ""
+            fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed", near)
 
 
 def _joined(defaults: dict[str, Any], table: dict[str, Any]) -> dict[str, Any]:

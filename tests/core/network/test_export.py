@@ -123,7 +123,7 @@ def test_what_goes_in_and_comes_out_is_told(exported, model):
 def test_colliders_are_seen_and_where_they_are_is_told(exported, model, scene, toy_motion):
     session, told = exported
     assert told["sees colliders at vertices"] == proximity_vertices(scene, model.config).tolist()
-    assert told["and up to [m]"] == pytest.approx(proximity_reach(scene))
+    assert told["sees colliders up to [m]"] == pytest.approx(proximity_reach(scene))
     plain = toy_motion(scene, FRAMES)
     dice = np.random.default_rng(4)
     away = dice.normal(size=(FRAMES, POINTS, 3))

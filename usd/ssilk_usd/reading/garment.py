@@ -127,7 +127,8 @@ def find_garment(stage: Usd.Stage, garment: str | None = None, root: str | None 
         tops = [top.GetPath() for top, skeleton in skeletons(stage) if named([top, skeleton], root)]
         found = [prim for prim in found if any(prim.GetPath().HasPrefix(top) for top in tops)] or found
     if len(found) != 1:
-        fail(where, f"there are several garments: {listed(found)}", "one is needed", "choose one with --garment")
+        many = "there are several garments" if garment is None else f"several meshes are, or lie beneath, '{garment}'"
+        fail(where, f"{many}: {listed(found)}", "one is needed", "choose one with --garment")
     return found[0]
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, Vt
 
 from ssilk_core.errors import SsilkError
+from ssilk_core.events import format_count
 from ssilk_core.files import split_body, split_location
 from ssilk_core.scene.assets import Garment, Ints, Mesh
 
@@ -29,6 +30,7 @@ from .look_above import OTHER_PRIMVARS, PURPOSES, bound_material_path, inherited
 from .look_spaces import keep_colour_space, move_spaces
 
 LOOKS = "Looks"  # scope of materials beneath the root
+NEAR = 3  # meshes that are told where none is the one
 _OTHERS = {
     "points", "faceVertexCounts", "faceVertexIndices", "holeIndices", "orientation", "extent", "xformOpOrder",
     "visibility", "purpose", "proxyPrim",
@@ -135,6 +137,35 @@ def _look_sources(mesh: Mesh, stage: Usd.Stage) -> Iterator[LookSource]:
             yield LookSource(prim, corners, faces)
 
 
+def _without_look(mesh: Mesh, stage: Usd.Stage, source: str) -> str:
+    """Return why a mesh has no look in a stage, which meshes come near, and what to do."""
+    name = mesh.path.rpartition("/")[2]
+    counts = mesh.vertex_count, len(np.asarray(mesh.polygon_counts))
+    text = f"it is {mesh.path} of {_sizes(*counts)}, and {source} has no such mesh"
+    near = list[tuple[tuple[bool, ...], str]]()
+    for prim in Usd.PrimRange(stage.GetPseudoRoot(), PRIMS):
+        if not prim.IsA(UsdGeom.Mesh):
+            continue
+        shape = UsdGeom.Mesh(prim)
+        own = [len(each.Get(EARLIEST) or ()) for each in (shape.GetPointsAttr(), shape.GetFaceVertexCountsAttr())]
+        alike = prim.GetName() == name, *(own[at] == counts[at] for at in range(2)), is_garment(prim)
+        if any(alike):
+            marked = ", marked as a garment" if is_garment(prim) else ""
+            others = " in another order" if own == [*counts] else ""
+            near.append((alike, f"{prim.GetPath()} ({_sizes(*own)}{others}{marked})"))
+    if not near:
+        todo = f"'ssilk rig STAGE --onto {source}' writes a stage that has it"
+        return f"{text}; {todo}, for its own body 'ssilk rig {source} --garment FILE'"
+    near.sort(key=lambda each: each[0], reverse=True)
+    found = ", ".join(each for _, each in near[:NEAR])
+    todo = f"name a stage with {name}, or the model of the garment that is meant; train it anew if it has changed"
+    return f"{text}; what comes near is {found}; {todo}"
+
+
+def _sizes(points: int, faces: int) -> str:
+    return f"{format_count(points, 'points')} and {format_count(faces, 'polygons')}"
+
+
 def copy_looks(
     stage: Usd.Stage, root: Sdf.Path, source: str, meshes: Sequence[tuple[Mesh, Sdf.Path]], output: str | Path
 ) -> LeftOut:
@@ -153,10 +184,7 @@ def copy_looks(
     found = [(mesh, path, look_source(mesh, opened)) for mesh, path in meshes]
     for mesh, _, look in found:
         if look is None:
-            text = f"its look, if it had any: {source} has no mesh of its polygons"
-            todo = f"'ssilk rig STAGE --onto {source}' writes a stage that has it"
-            todo += f", for its own body 'ssilk rig {source} --garment FILE'"
-            left.add(mesh.path.rpartition("/")[2], f"{text}; {todo}")
+            left.add(mesh.path.rpartition("/")[2], f"its look, if it had any: {_without_look(mesh, opened, source)}")
         elif twin := _twin(mesh, look, opened):
             text = f"its look, unless it is that of {look.prim.GetPath()}: {twin.GetPath()} has the same polygons"
             left.add(mesh.path.rpartition("/")[2], text)
