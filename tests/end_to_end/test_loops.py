@@ -153,7 +153,7 @@ def test_a_round_is_told_of_a_shot_with_more_shapes_than_the_network_has(stage):
 @pytest.mark.parametrize(
     "more",
     [["--hold", "2"], ["--fps", "60"], ["--fps", "27.5"], ["--samples-per-frame", "2"], ["--quality", "game"],
-     ["--wind", "0,0,0"], ["--latent-iterations", "1"], ["--refine", "2"]],
+     ["--wind", "0,0,0"], ["--latent-iterations", "1"], pytest.param(["--refine", "2"], marks=pytest.mark.slow)],
     ids=["twos", "rate", "odd rate", "samples", "game", "air", "latents", "refined"],
 )  # fmt: skip
 def test_a_loop_goes_with_other_wishes(stage, more):
