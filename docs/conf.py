@@ -17,6 +17,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "usd")]
 project = html_title = "SSILK"
 root_doc = "docs/index"
 include_patterns = ["docs/*.md", "benchmarks/README.md", "CHANGELOG.md"]
+exclude_patterns = [".*", "build"]  # environments have tens of thousands of files, which it would match
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 highlight_language = "none"

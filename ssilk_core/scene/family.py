@@ -29,7 +29,8 @@ SAME_ROTATION = 1e-3  # between entries of bind rotations, as for bakes
 SAME_BONES = 1e-3  # [m]
 STORED_POINTS = 512  # of a body, in model files
 MOST_DIRECTIONS = 64
-STEPS = 2000  # to find the nearest point of a hull; each costs a product with the members
+STEPS = 2000  # at most, to find the nearest point of a hull; each costs a product with the members
+SAME_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,6 +263,8 @@ class BodyFamily:
         ahead, momentum = shares, 1.0
         for _ in range(STEPS):
             new = _onto_simplex(ahead - step * (gram @ ahead - pull))
+            if np.abs(new - ahead).max() < SAME_SHARE:
+                return new @ self.members  # a step leaves what is nearest where it is
             faster = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
             ahead = new + (momentum - 1) / faster * (new - shares)
             shares, momentum = new, faster

@@ -234,6 +234,7 @@ def test_a_garment_that_ships_over_another_fits_it(garment):
     assert not (model.scene.classes == PINNED).any()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("brief")
 def test_an_outfit_is_baked_and_filmed_and_its_list_written(tmp_path, capsys):
     assert main(["demo", "--garment", "cape_over_dress", "-o", str(tmp_path)]) == 0

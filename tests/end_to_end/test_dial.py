@@ -56,6 +56,14 @@ def measured(script, world):
     return json.loads((world / "dial.json").read_text())
 
 
+@pytest.fixture(scope="module")
+def few(script, world):
+    """Figures of some places, and the options that ask for these."""
+    options = f"errors {OPTIONS} --places network game crowd"
+    script(f"{options} --output few.json")
+    return json.loads((world / "few.json").read_text()), options
+
+
 @pytest.mark.slow
 def test_each_place_is_measured_from_its_own_two_states(measured):
     rows = {(row["split"], row["place"]): row for row in measured["figures"]}
@@ -70,8 +78,9 @@ def test_each_place_is_measured_from_its_own_two_states(measured):
         assert all(len(rows[split, place]["total"]) == 1 and rows[split, place]["lost"] == 0 for place in SOLVERS)
 
 
-def test_what_was_cut_off_goes_on(measured, script, world, capsys):
+def test_what_was_cut_off_goes_on(few, script, world):
     """Rows that are there stay as they are; the missing place alone is measured, to the same figures."""
+    measured, options = few
     cut = {**measured, "unfinished": "yes"}
     cut["figures"] = [
         {**row, "total": [7.0]} if row["place"] == "game" else row
@@ -79,7 +88,7 @@ def test_what_was_cut_off_goes_on(measured, script, world, capsys):
         if row["place"] != "crowd"
     ]
     (world / "cut.json").write_text(json.dumps(cut))
-    script(f"errors {OPTIONS} --output cut.json")
+    script(f"{options} --output cut.json")
     found = json.loads((world / "cut.json").read_text())
     assert "unfinished" not in found and len(found["figures"]) == len(measured["figures"])
     for row, known in zip(found["figures"], measured["figures"]):
@@ -89,12 +98,13 @@ def test_what_was_cut_off_goes_on(measured, script, world, capsys):
             assert row["distance"]["4"] == pytest.approx(known["distance"]["4"], rel=1e-3)
 
 
-def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(measured, script, world):
+def test_a_place_that_was_cut_off_between_its_splits_is_measured_in_both(few, script, world):
+    measured, options = few
     cut = {**measured, "unfinished": "yes"}
     gone = (("flips", "crowd"), ("flips", "simulator, 1 mm off"))
     cut["figures"] = [row for row in measured["figures"] if (row["split"], row["place"]) not in gone]
     (world / "between.json").write_text(json.dumps(cut))
-    script(f"errors {OPTIONS} --output between.json")
+    script(f"{options} --output between.json")
     found = json.loads((world / "between.json").read_text())
     names = [(row["split"], row["place"]) for row in found["figures"]]
     assert "unfinished" not in found and names == [(row["split"], row["place"]) for row in measured["figures"]]

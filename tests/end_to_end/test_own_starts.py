@@ -46,6 +46,7 @@ def script(world, monkeypatch) -> Callable[[str, str], None]:
     return run
 
 
+@pytest.mark.slow
 def test_methods_are_measured_from_their_own_starts(script, world, capsys):
     """Two models that are one: every window and every seed tells the same, and skinning stands beside them."""
     script("own_starts", f"--model model.safetensors other.safetensors {PLACE} --motions clips --windows 2 "

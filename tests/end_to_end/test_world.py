@@ -255,6 +255,7 @@ def played_meshes(page: str) -> list[dict[str, object]]:
     return json.loads(html.unescape(about[1]))["meshes"]
 
 
+@pytest.mark.slow
 def test_pages_simulations_and_skinned_caches_count_and_show_colliders_as_bakes_do(stage, capsys):
     clip = Usd.Stage.Open("floored.usda")
     box = UsdGeom.Cube.Define(clip, "/Set/Box")

@@ -164,7 +164,7 @@ def test_no_stepper_can_drive_the_state_out_of_its_bound(scheme, answer):
     config = ModelConfig(latent=2, scheme=scheme)
     step = integrator(config)
     z = [torch.zeros(1, 2), torch.zeros(1, 2)]
-    for count in range(1000):
+    for count in range(300):
         says = Says(answer if count // 50 % 2 else -answer)
         z = [z[-1], step(says, z[-2], z[-1], REST, POSE)]
         assert z[-1].abs().max() <= config.latent_bound

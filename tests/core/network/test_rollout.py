@@ -178,10 +178,10 @@ def test_decoded_vertices_are_what_a_file_reader_deforms_even_far_away(model, sc
     np.testing.assert_allclose(found, deform(model.deformer(), motion, part), atol=1e-5)
 
 
-def test_thousands_of_frames_of_a_loop_stay_where_they_are(model, scene, toy_motion):
+def test_a_thousand_frames_of_a_loop_stay_where_they_are(model, scene, toy_motion):
     """With random weights: no bound is learned, all are built in."""
     loop = toy_motion(scene, 200)
-    times = 15
+    times = 5
     motion = Motion("/loop", 30.0, np.tile(loop.rotations, (times, 1, 1)), np.tile(loop.translations, (times, 1, 1)))
     model = type(model)(scene, model.config, model.joints, 5)
     generator = torch.Generator().manual_seed(5)
@@ -194,7 +194,7 @@ def test_thousands_of_frames_of_a_loop_stay_where_they_are(model, scene, toy_mot
         extent.append(np.abs(vertices).max(axis=(1, 2)))
         weights.append((pose.weights.min(), pose.weights.max()))
     extent = np.concatenate(extent)
-    assert extent.shape == (3_000,) and np.isfinite(extent).all()
-    first, last = extent[:600].max(), extent[-600:].max()
+    assert extent.shape == (1_000,) and np.isfinite(extent).all()
+    first, last = extent[:200].max(), extent[-200:].max()
     assert last < 1.5 * first
     assert np.min(weights) >= 0 and np.max(weights) <= 1

@@ -334,6 +334,7 @@ def _origins(takes: Sequence[Take]) -> Tensor:
     return torch.as_tensor(np.stack([take.motion.translations[0, 0] for take in takes], axis=1))
 
 
+@pytest.mark.slow
 def test_the_simulator_comes_to_rest_at_its_own_minimum(scene, dressed, motion):
     """Played over a stop in thick air like any other method: calm at the end, where forces balance."""
     dressed = EvaluationScene(scene, replace(dressed.fabric, drag=1.2), FPS, CPU)

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Two processes that train one garment on the toy scene: one gradient, the same parameters, and exact resuming.
 
-The processes run this file as a script and leave what they found; the tests look at that.
+This file, run as a script, forks them, so that both have what it imported; they leave what they found, and the tests
+look at that.
 """
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import pickle
 import socket
@@ -113,7 +115,8 @@ def resumed(job: TrainJob, group: ProcessGroup) -> list[tuple[bool, int]]:
     return [(trained.finished, trained.iterations) for trained in ends]
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, rank: str) -> None:
+    os.environ |= {"RANK": rank, "LOCAL_RANK": rank}
     torch.set_num_threads(1)
     training.CHECK_INTERVAL = 4  # iterations after which processes agree to stop
     job: TrainJob = pickle.loads((folder / "job").read_bytes())
@@ -155,9 +158,7 @@ def together(job) -> list[dict]:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     told = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": "2", "OMP_NUM_THREADS": "1"}
-    environments = [{**os.environ, **told, "RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
-    processes = [subprocess.Popen([sys.executable, __file__, folder], env=env) for env in environments]
-    assert [process.wait(100) for process in processes] == [0, 0]
+    subprocess.run([sys.executable, __file__, folder], env={**os.environ, **told}, timeout=100, check=True)
     return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
 
 
@@ -278,4 +279,11 @@ def test_each_process_of_a_group_tells_that_a_model_is_worse_than_none(tmp_path,
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    torch.optim.SGD([torch.zeros(1)])  # imports what optimisers need, which takes seconds
+    fork = multiprocessing.get_context("fork")
+    processes = [fork.Process(target=main, args=(Path(sys.argv[1]), rank)) for rank in "01"]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    sys.exit(any(process.exitcode for process in processes))
