@@ -30,6 +30,7 @@ TABLES: dict[str, Callable[[], str]] = {
         results.playing, results.extremes, dial.dial,
         farm.cluster, farm.fuzzed, farm.disturbed, farm.disk, farm.disk_workers, farm.large_job,
         guides.targets, guides.growth, guides.presets, guides.drape, guides.bodies, guides.peers,
+        guides.self_contact,
     )
 }  # fmt: skip
 MARKED = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -99,6 +99,17 @@ def peers() -> str:
     return table(header, rows, 3)
 
 
+def self_contact() -> str:
+    """Cloth that is kept apart beside cloth that passes through cloth, two clips at once on a GPU."""
+    rows = []
+    for cloth, found in result("self_contact_cuda")["cape"].items():
+        times = 1e3 * np.quantile(found["seconds"], (0.5, 0.25, 0.75))
+        shares = f"{percent(np.mean(found['shares']), 2)}, {percent(np.max(found['shares']), 1)}"
+        rows.append([cloth, *map(digits, map(float, times)), fixed(found["iterations"], 1), shares])
+    header = ("cloth through cloth", "ms a frame and shot", "a quarter below", "above", "iterations", "intersect [%]")
+    return table(header, rows)
+
+
 def bodies() -> str:
     """The cape for a family on bodies that its training never saw, beside a cape for one of these alone."""
     rows = []

@@ -8,6 +8,7 @@ their order: results are deterministic.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -20,15 +21,33 @@ from .vectors import dot
 
 if TYPE_CHECKING:
     from ..energy.collision import ContactLaw
-    from ..self_contact.self_contact import KnownPairs, PairKind
 
 TINY = tl.constexpr(1e-24)
 LEAST = tl.constexpr(1e-12)  # [m]
 ENERGY, FORCE, SLOPES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
 
 
+@dataclass(frozen=True, eq=False)
+class PairTable:
+    """Pairs of one kind that are known, as `PairKind` and `KnownPairs` hold them."""
+
+    first: Tensor
+    second: Tensor
+    first_start: Tensor
+    second_start: Tensor
+    first_area: Tensor
+    second_area: Tensor
+    first_stiffness: Tensor | None
+    second_stiffness: Tensor | None
+    frame: Tensor
+    one: Tensor
+    other: Tensor
+    distance: Tensor
+    side: Tensor
+
+
 def contacts_kernel(
-    parts: Sequence[tuple[PairKind, KnownPairs]],
+    parts: Sequence[PairTable],
     x: Tensor,
     last: Tensor | None,
     rest: Tensor,
@@ -46,7 +65,7 @@ def contacts_kernel(
     """Return the sides of all pairs of each part, and the rows of `ClothContacts` of those that touch.
 
     Args:
-        parts: kinds of pairs, with the pairs that are known.
+        parts: of faces, and of edges.
         x, last, rest: positions now, at which pairs without a side have theirs, if given, and in the bind pose.
         moved: how far each vertex has moved since pairs were found, shape (V, N).
         near: pairs nearer than this are close [m], and with a `step` those that come nearer in it by more than
@@ -57,17 +76,17 @@ def contacts_kernel(
     """
     x, rest, moved = x.contiguous(), rest.contiguous(), moved.contiguous()
     before, steps = (x if each is None else each.contiguous() for each in (last, step))
-    counts = [len(pairs.frame) for _, pairs in parts]
+    counts = [len(part.frame) for part in parts]
     marks = torch.zeros(sum(counts) + 1, dtype=torch.int32, device=x.device)
-    sides = [torch.zeros_like(pairs.side) for _, pairs in parts]
+    sides = [torch.zeros_like(part.side) for part in parts]
     frames, flags = x.shape[-1], (last is not None, settled, step is not None)
     first, blocks = 1, [(triton.cdiv(count, BLOCK),) for count in counts]  # the first mark is none
-    for (kind, pairs), side, count, grid in zip(parts, sides, counts, blocks):
+    for part, side, count, grid in zip(parts, sides, counts, blocks):
         if count:
             _mark[grid](
-                x, before, rest, moved, steps, kind.first, kind.second, pairs.frame, pairs.first, pairs.second,
-                pairs.distance, pairs.side, kind.first_start, kind.second_start, marks, side, near, start, closer,
-                closing, first, count, frames, *flags, kind.first.shape[1] == 1, BLOCK, num_warps=4,
+                x, before, rest, moved, steps, part.first, part.second, part.frame, part.one, part.other,
+                part.distance, part.side, part.first_start, part.second_start, marks, side, near, start, closer,
+                closing, first, count, frames, *flags, part.first.shape[1] == 1, BLOCK, num_warps=4,
             )  # fmt: skip
         first += count
     places = marks.cumsum(0, dtype=torch.int32)
@@ -75,15 +94,15 @@ def contacts_kernel(
     numbers, whole = x.new_empty(10, found), torch.empty(5, found, dtype=torch.long, device=x.device)
     second = torch.empty(4, found, dtype=torch.bool, device=x.device)
     first = 1
-    for (kind, pairs), side, count, grid in zip(parts, sides, counts, blocks):
+    for part, side, count, grid in zip(parts, sides, counts, blocks):
         if count and found:
-            stiffness = kind.first_stiffness, kind.second_stiffness
-            given = [kind.first_start if each is None else each for each in stiffness]
+            stiffness = part.first_stiffness, part.second_stiffness
+            given = [part.first_start if each is None else each for each in stiffness]
             _write[grid](
-                x, rest, kind.first, kind.second, pairs.frame, pairs.first, pairs.second, side, marks, places,
-                kind.first_start, kind.second_start, kind.first_area, kind.second_area, *given,
-                pairs.first if garment is None else garment, numbers, whole, second, start, closer, slack, first,
-                count, found, frames, stiffness[0] is not None, garment is not None, kind.first.shape[1] == 1, BLOCK,
+                x, rest, part.first, part.second, part.frame, part.one, part.other, side, marks, places,
+                part.first_start, part.second_start, part.first_area, part.second_area, *given,
+                part.one if garment is None else garment, numbers, whole, second, start, closer, slack, first, count,
+                found, frames, stiffness[0] is not None, garment is not None, part.first.shape[1] == 1, BLOCK,
                 num_warps=4,
             )  # fmt: skip
         first += count

@@ -21,7 +21,8 @@ own kind.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -36,6 +37,9 @@ from .cloth import TouchingCloth
 from .contacts import CLOSING, SLACK, TINY, ClothContacts
 from .neighbours import Grid, near_pairs, places_among
 from .pairs import Separations, between_edges, over_faces
+
+if TYPE_CHECKING:
+    from ..kernels.cloth_contacts import PairTable
 
 REACH = 0.015  # [m] beyond the contact distance, within which pairs are known
 LEFT, MOVED = 0.5, 0.2  # of that, by which vertices may be elsewhere, and where they are when a step is cut short
@@ -170,6 +174,20 @@ class PairKind:
     second_start: Tensor
     first_stiffness: Tensor | None
     second_stiffness: Tensor | None
+
+    def table(self, pairs: KnownPairs) -> PairTable:
+        """Return pairs of this kind, for kernels."""
+        from ..kernels.cloth_contacts import PairTable
+
+        names = (field.name for field in fields(self) if field.name not in ("measure", "first_reach", "second_reach"))
+        return PairTable(
+            **{name: getattr(self, name) for name in names},
+            frame=pairs.frame,
+            one=pairs.first,
+            other=pairs.second,
+            distance=pairs.distance,
+            side=pairs.side,
+        )
 
     def near(self, at: Tensor, reach: float, garment: Tensor | None = None) -> KnownPairs:
         """Return pairs without a common vertex that lie within reach of each other; sides are 0.
@@ -381,9 +399,10 @@ class SelfContact:
         if kernels.available(x.device):
             from ..kernels.cloth_contacts import contacts_kernel
 
+            tables = [kind.table(own) for kind, own in self._parts(known)]
             reach = moved if step is None else moved + step.norm(dim=1) / CLOSING
             sides, found = contacts_kernel(
-                self._parts(known), x, last, self.rest, reach, near, start=self.law.start, closer=CLOSER, slack=SLACK,
+                tables, x, last, self.rest, reach, near, start=self.law.start, closer=CLOSER, slack=SLACK,
                 garment=self._garment, settled=settled, step=step, closing=CLOSING,
             )  # fmt: skip
             return sides, ClothContacts(self.law, x.shape[-1], *found)

@@ -48,8 +48,8 @@ from .scheduler import Asked, Course, Scheduler
 
 PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
 MAX_SUBSTEPS = 1000
-POSES = 8  # from the bind pose to one in which cloth comes to rest
-ON_THE_WAY = 10  # iterations for each of these but the last
+WAY = 8, 10  # poses from the bind pose to one in which cloth comes to rest, and iterations for each but the last
+WAY_APART = 16, 20  # where cloth does not pass through cloth: legs that go further at once press a hem through itself
 PARTS, SPLITS = 4, 2  # shorter steps for one that does not converge, and how often these are split themselves
 
 
@@ -323,7 +323,8 @@ class Simulator:
 
     def _first(self, spans: Sequence[MotionSpan], surroundings: Surroundings | None) -> tuple[StepHistory, Solution]:
         """Return the states that spans start with, and report: on a processor they can take minutes."""
-        most = self.options.quasi_static_solver.iterations + (POSES - 1) * ON_THE_WAY
+        count, iterations = self._way
+        most = self.options.quasi_static_solver.iterations + (count - 1) * iterations
         self.report(Message(f"cloth comes to rest in the first pose, in {most} iterations at most"))
         rotations, translations = (
             np.stack([getattr(span.motion, name)[0] for span in spans]) for name in ("rotations", "translations")
@@ -361,14 +362,15 @@ class Simulator:
         if self._offsets is not None:
             x = self.apply_pins(x + self._offsets, poses)
         known: ClothNeighbours | None = None
-        for share in np.arange(1, POSES + 1) / POSES:
+        count, iterations = self._way
+        for share in np.arange(1, count + 1) / count:
             lbs = poses.lbs
             moved = None if moves is None else float(share) * moves
             turns, places = slerp(turned, rotations, share), (1 - share) * placed + share * translations
             poses = self.poser.pose(turns, places, moved)
             poses = surrounded(poses) if share == 1 else poses
             x, inputs = self._carried(x, x + poses.lbs - lbs, self.inputs(poses, None), known)
-            solver = last if share == 1 else replace(last, iterations=min(ON_THE_WAY, last.iterations))
+            solver = last if share == 1 else replace(last, iterations=min(iterations, last.iterations))
             solution = minimise_from(self.potential, self.apply_pins(x, poses), inputs, solver, advanced)
             x, known = solution.x, solution.neighbours
         return poses, solution
@@ -377,8 +379,16 @@ class Simulator:
         self, x: Tensor, target: Tensor, inputs: StepInputs, known: ClothNeighbours | None
     ) -> tuple[Tensor, StepInputs]:
         """Return a target (V, 3, N), or how far the garment comes towards it past itself, and the inputs there."""
-        apart = self.options.self_contact or len(self.potential.garments) > 1
-        return self.potential.approach(x, target, inputs, known) if apart else (target, inputs)
+        return self.potential.approach(x, target, inputs, known) if self._apart else (target, inputs)
+
+    @property
+    def _apart(self) -> bool:
+        """Whether cloth does not pass through cloth."""
+        return self.options.self_contact or len(self.potential.garments) > 1
+
+    @property
+    def _way(self) -> tuple[int, int]:
+        return WAY_APART if self._apart else WAY
 
     def quasi_static(self, poses: PosedCharacters, start: Tensor) -> Solution:
         """Return the quasi-static states of poses, minimised from `start` (V, 3, N), relative to the roots."""
