@@ -83,6 +83,7 @@ def played(session, model, shots, near=None) -> list[np.ndarray]:
     return [np.array(values) for values in zip(*frames)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_every_frame_is_what_a_shot_stores(exported, model, scene, toy_motion, count):
     motions = [toy_motion(scene, 2 * FRAMES).clip(4 * shot, 4 * shot + FRAMES) for shot in range(count)]
@@ -113,6 +114,7 @@ def test_a_tight_garment_without_proxies_or_stepper_is_exported(scene, toy_motio
     assert rotations.shape == (FRAMES, 1, 0, 3, 3) and np.ptp(weights[..., :4], axis=0).max() > 0.01
 
 
+@pytest.mark.slow
 def test_what_goes_in_and_comes_out_is_told(exported, model):
     session, told = exported
     sizes = {each.name: each.shape[1] for each in session.get_inputs()}
@@ -120,6 +122,7 @@ def test_what_goes_in_and_comes_out_is_told(exported, model):
     assert session.get_outputs()[1].shape[1] == told["weights"] == model.config.shapes + 1
 
 
+@pytest.mark.slow
 def test_colliders_are_seen_and_where_they_are_is_told(exported, model, scene, toy_motion):
     session, told = exported
     assert told["sees colliders at vertices"] == proximity_vertices(scene, model.config).tolist()
