@@ -20,7 +20,7 @@ from ssilk_core.physics.simulate.characters import PosedCharacters, split_into_s
 from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
-from ssilk_core.physics.simulate.simulator import ON_THE_WAY, PARTS, POSES, SPLITS
+from ssilk_core.physics.simulate.simulator import PARTS, SPLITS, WAY
 from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
@@ -233,7 +233,7 @@ def test_progress_counts_every_frame_of_every_shot(scene, toy_motion) -> None:
     simulate(scene, CLOTH, [toy_motion(scene, 3), toy_motion(scene, 2)], SHORT, report=told.append)
     counts = [(event.done, event.total) for event in told if isinstance(event, Progress)]
     assert counts[-5:] == [(n, 5) for n in range(1, 6)]
-    assert {total for _, total in counts[:-5]} == {200 + (POSES - 1) * ON_THE_WAY}  # of the search for the rest state
+    assert {total for _, total in counts[:-5]} == {200 + (WAY[0] - 1) * WAY[1]}  # of the search for the rest state
 
 
 def test_pinned_vertices_are_skinned_plainly(scene, toy_motion) -> None:
