@@ -261,7 +261,8 @@ def test_what_starts_apart_never_intersects(scene, toy_motion, toy_grid):
     assert crossings(inner, outer, *alone) > 0  # where nothing keeps them apart they do
 
 
-def test_shots_side_by_side_are_those_of_each_alone(scene, toy_motion, toy_grid):
+def test_shots_side_by_side_are_those_of_each_alone(scene, toy_motion, toy_grid, monkeypatch):
+    monkeypatch.setattr("ssilk_core.physics.simulate.simulator.WAY_APART", (2, 5))  # the first poses are near
     inner, outer, motion = swept(scene, toy_motion, toy_grid)
     other = toy_motion(scene, 4, speed=2.0)
     simulator = Simulator(inner, HEAVY, over=[WornGarment(outer, LIGHT)])
