@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import torch
 from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
+from ssilk_core.physics.kernels import conjugate_gradient
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
 from ssilk_core.physics.kernels.separations import separations_kernel
 from ssilk_core.physics.kernels.slopes import SlopeTable
@@ -472,6 +475,33 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     expected = torch.linalg.solve(dense, right.double().flatten()).view_as(right).float()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(by_kernel.cpu(), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_graphs_of_solves_have_room_for_contacts_and_share_memory(monkeypatch):
+    def as_a_graph(work: Callable[[], object], device: torch.device) -> SimpleNamespace:
+        work()
+        return SimpleNamespace(replay=work)
+
+    monkeypatch.setattr(conjugate_gradient, "replays", lambda right: True)
+    monkeypatch.setattr(conjugate_gradient, "captured", as_a_graph)
+    monkeypatch.setattr(conjugate_gradient, "LEAST_SLOPES", 8)
+    vertices = 12
+    table = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, DEVICE).table
+    for count, frames_of in ((20, 3), (17, 2), (0, 3)):
+        blocks = 3.0 * torch.eye(3)[:, :, None].repeat(vertices, 1, 1, frames_of)
+        right, x = random(vertices, 3, frames_of, seed=9).float(), random(vertices, 3, frames_of, seed=7)
+        slopes = random_contacts(vertices, count, frames_of).slopes(x)
+        found = ContactStiffness.of(slopes, frames_of, torch.arange(vertices), vertices)
+        rows = (each.to(DEVICE) for each in (found.vertices, found.frame, found.values))
+        own = SlopeTable.of(*rows, vertices, frames_of) if count else None
+        inverse = inverse_blocks((blocks + found.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
+        given = blocks.to(DEVICE), table, inverse.to(DEVICE), right.to(DEVICE)
+        solved, _ = solve_kernel(*given, 1e-3, 8, 8, own)
+        image = 3 * solved.cpu()
+        found.add_product(solved.cpu(), image)
+        assert (image - right).norm() < 1e-2 * right.norm()
+    assert [key[1] for key in table.captured] == [32, 0]
+    assert len({each._own.blocks.data_ptr() for each in table.captured.values()}) == 1
 
 
 def twisted(
