@@ -158,8 +158,25 @@ def on_device(known: ClothNeighbours, device: torch.device) -> ClothNeighbours:
     return ClothNeighbours(known.last.to(device), known.at.to(device), faces, edges)
 
 
-def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, monkeypatch):
-    contact, x, _ = crumpled(toy_grid, scene, 2, size=(5, 3))
+def two_kinds(
+    toy_grid, scene, count: int, device: torch.device = CPU, size: tuple[int, int] = (3, 3)
+) -> tuple[SelfContact, torch.Tensor]:
+    """Two crumpled sheets, of which one lies over the other and is thicker, stiffer and tight in part."""
+    points, faces = toy_grid(*size, height=0.05 * (size[0] - 1), width=0.05 * (size[1] - 1))
+    one = TouchingCloth.of(dressed(scene, points, faces, np.zeros(len(points), dtype=bool)), FABRIC)
+    other = replace(one, points=points + [0, 0, 0.012], start=1.5 * one.start, stiffness=3 * one.stiffness,
+                    loose=np.arange(len(points)) % 2 == 0, pinned=np.arange(len(points)) % 4 == 1)  # fmt: skip
+    _, x, _ = crumpled(toy_grid, scene, count, device, size)
+    x = torch.cat([x, x + torch.tensor([[0.001], [0.002], [0.004]])])
+    return SelfContact(TouchingCloth.joined([one, other]), device, torch.float64), x
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, monkeypatch, several):
+    def cloth(device: torch.device = CPU) -> tuple[SelfContact, torch.Tensor]:
+        return two_kinds(toy_grid, scene, 2, device) if several else crumpled(toy_grid, scene, 2, device, (5, 3))[:2]
+
+    contact, x = cloth()
     monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
     x = 0.4 * x + 0.004 * random(*x.shape, seed=2)
     known = contact.neighbours(x, x)
@@ -168,7 +185,7 @@ def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, mon
     tried = x + 6e-3 * torch.nn.functional.normalize(random(*x.shape, seed=4) - 0.5, dim=1)
 
     def found(device: torch.device) -> list[torch.Tensor]:
-        own = crumpled(toy_grid, scene, 2, device, (5, 3))[0]
+        own = cloth(device)[0]
         around = on_device(known, device)
         there, pressed = own.moved(tried.to(device), around)
         others = own.contacts((0.3 * x + 0.7 * tried).to(device), there)
