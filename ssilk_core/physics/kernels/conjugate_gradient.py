@@ -130,6 +130,8 @@ class _Search:
 class _CapturedSolve:
     """A solve in memory of its own, with graphs of its beginning and of some iterations (`physics.captured`)."""
 
+    _own: _Search
+
     def __init__(
         self,
         blocks: Tensor,
