@@ -10,7 +10,7 @@ the same garments under linear blend skinning, to compare with.
 
 --latent-iterations replaces the network's step by a solver in the model's own latents: in every frame it lowers the
 simulator's energy, from where the network would step to. What is written has the size of the network's shot, and no
-shape that the model lacks. The result says how many frames have not converged.
+shape that the model lacks. The result says how far the cloth of a frame may still move.
 
 --refine continues from the network with the simulator's solver in every frame: it lowers the energy of each frame,
 and adds wrinkles that no blendshape of the model has. The course of the cloth stays the network's. With --feedback

@@ -70,6 +70,10 @@ def _value(kind: Any, name: str, value: object, figures: bool) -> Any:
     if get_origin(kind) is Literal:
         if value in get_args(kind):
             return value
-    elif isinstance(value, kind if kind is not float else (int, float)) and isinstance(value, bool) == (kind is bool):
+    elif (
+        get_origin(kind) is None  # tuples and dictionaries are returned by now
+        and isinstance(value, kind if kind is not float else (int, float))
+        and isinstance(value, bool) == (kind is bool)
+    ):
         return value
     raise TypeError(f"{name!r} is {str(value)[:40]!r}")

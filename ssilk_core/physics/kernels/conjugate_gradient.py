@@ -130,6 +130,8 @@ class _Search:
 class _CapturedSolve:
     """A solve in memory of its own, with graphs of its beginning and of some iterations (`physics.captured`)."""
 
+    _own: _Search
+
     def __init__(
         self,
         blocks: Tensor,
@@ -141,13 +143,13 @@ class _CapturedSolve:
         reduction: float,
     ) -> None:
         slopes = SlopeTable.empty(room, len(right), capacity, right.device) if room else None
-        own = _Search(
-            blocks.new_zeros(*blocks.shape[:-1], capacity),
-            table,
-            blocks.new_zeros(len(right), 3, 3, capacity),
-            right.new_zeros(*right.shape[:-1], capacity),
-            slopes,
-        )
+        alike = next((each._own for (frames, *_), each in table.captured.items() if frames == capacity), None)
+        if alike is not None:  # one solve is over before another begins, and may use the memory of what is given
+            kept, inverse, residual = alike.blocks, alike.inverse, alike.residual
+        else:
+            kept, inverse = (blocks.new_zeros(rows, 3, 3, capacity) for rows in (len(blocks), len(right)))
+            residual = right.new_zeros(*right.shape[:-1], capacity)
+        own = _Search(kept, table, inverse, residual, slopes)
         self._own, self._several = own, several + several % 2  # `product` and `fresh` change places in each
 
         def iterate() -> None:

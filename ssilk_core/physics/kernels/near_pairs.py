@@ -2,6 +2,7 @@
 """Which vertices are near which faces, and which edges near which edges; reference: `PairKind.near`.
 
 Each of what comes first in pairs looks through its part of a grid twice: pairs are counted, then written in order.
+One compiled kernel does both, since another could round otherwise, and write another number than was counted.
 """
 
 from __future__ import annotations
@@ -46,20 +47,20 @@ def near_kernel(
     flags = groups is not None, ascending, first.shape[1] == 1
     ends = torch.zeros(frames * count + 1, dtype=torch.int64, device=x.device)
     blocks = (triton.cdiv(frames * count, BLOCK),)
-    _near[blocks](*given, ends, ends, x, *sizes, 0, *flags, False, BLOCK, num_warps=1)
+    _near[blocks](*given, ends, ends, x, *sizes, 0, 0, *flags, BLOCK, num_warps=1)
     ends = ends.cumsum(0)
     found = int(ends[-1])
     pairs, distance = torch.empty(3, found, dtype=torch.int64, device=x.device), x.new_empty(found)
     if found:
-        _near[blocks](*given, ends, pairs, distance, *sizes, found, *flags, True, BLOCK, num_warps=1)
+        _near[blocks](*given, ends, pairs, distance, *sizes, found, 1, *flags, BLOCK, num_warps=1)
     return *pairs, distance
 
 
 @triton.jit(do_not_specialize=VARYING, do_not_specialize_on_alignment=VARYING)
 def _near(
     x, first, second, middle, other_middle, reaches, other_reaches, order, starts, ends, place, own, theirs, counts,
-    pairs, distance, reach, count, others, frames, total,
-    grouped: tl.constexpr, ascending: tl.constexpr, faces: tl.constexpr, write: tl.constexpr, block: tl.constexpr,
+    pairs, distance, reach, count, others, frames, total, writes,
+    grouped: tl.constexpr, ascending: tl.constexpr, faces: tl.constexpr, block: tl.constexpr,
 ):  # fmt: skip
     query = tl.program_id(0).to(tl.int64) * block + tl.arange(0, block)
     inside = query < count * frames
@@ -69,7 +70,7 @@ def _near(
     py = tl.load(at + frames, mask=inside, other=0.0)
     pz = tl.load(at + 2 * frames, mask=inside, other=0.0)
     limit = tl.load(reaches + p, mask=inside, other=0.0)
-    held = tl.load(counts + query, mask=inside, other=0) if write else query * 0
+    held = tl.load(counts + query, mask=inside & (writes != 0), other=0)
     for row in range(9):
         start = tl.load(starts + 9 * query + row, mask=inside, other=0)
         end = tl.load(ends + 9 * query + row, mask=inside, other=0)
@@ -96,12 +97,11 @@ def _near(
                 r = apart(x + tl.where(here, f, 0), frames, i, j, m, o, faces)
                 far = tl.sqrt(dot(r[0], r[1], r[2], r[0], r[1], r[2]))
                 here = here & ~shared & (far < reach)
-                if write:
+                if writes != 0:
                     turned = (q < p) if ascending else (q < 0)
                     tl.store(pairs + held, f, mask=here)
                     tl.store(pairs + total + held, tl.where(turned, q, p), mask=here)
                     tl.store(pairs + 2 * total + held, tl.where(turned, p, q), mask=here)
                     tl.store(distance + held, far, mask=here)
                 held += here.to(tl.int64)
-    if not write:
-        tl.store(counts + 1 + query, held, mask=inside)
+    tl.store(counts + 1 + query, held, mask=inside & (writes == 0))

@@ -19,8 +19,9 @@ TINY = tl.constexpr(1e-24)
 PARALLEL = tl.constexpr(1e-4)  # as in `pairs`
 # Arguments whose sizes and addresses differ from call to call: kernels are not compiled for each kind of these.
 VARYING = [
-    "count", "found", "total", "offset", "frame", "one", "other", "known", "side", "sides", "numbers", "facing",
-    "whole", "seconds", "vertices", "coefficients", "direction", "slack", "begun", "area", "pairs", "distance",
+    "count", "found", "total", "writes", "offset", "frame", "one", "other", "known", "side", "sides", "numbers",
+    "facing", "whole", "seconds", "vertices", "coefficients", "direction", "slack", "begun", "area", "pairs",
+    "distance",
 ]  # fmt: skip
 
 

@@ -18,7 +18,6 @@ from torch import Tensor
 from ..collision.one_ring import closest_in_triangle
 
 PARALLEL = 1e-4  # squared sine of the angle between edges below which they do not face each other
-SEEN_FROM = 0.2  # sine of the angle over the plane below which a pair has no side yet
 TINY = 1e-24
 
 
@@ -41,11 +40,6 @@ class Separations:
     facing: Tensor
     normal: Tensor
     height: Tensor
-
-    @property
-    def side(self) -> Tensor:
-        """1 or -1, or 0 where the pair is seen at too flat an angle to have one, shape (P,)."""
-        return torch.where(self.height.abs() > SEEN_FROM * self.distance, self.height.sign(), 0)
 
     def kept(self, kept: Tensor | slice) -> Separations:
         """Return the separations of the pairs that `kept` names."""

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ import torch
 from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
 from ssilk_core.physics.intersections.pairs import self_intersections
+from ssilk_core.physics.kernels import conjugate_gradient
 from ssilk_core.physics.kernels.conjugate_gradient import solve_kernel
 from ssilk_core.physics.kernels.separations import separations_kernel
 from ssilk_core.physics.kernels.slopes import SlopeTable
@@ -155,8 +158,25 @@ def on_device(known: ClothNeighbours, device: torch.device) -> ClothNeighbours:
     return ClothNeighbours(known.last.to(device), known.at.to(device), faces, edges)
 
 
-def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, monkeypatch):
-    contact, x, _ = crumpled(toy_grid, scene, 2, size=(5, 3))
+def two_kinds(
+    toy_grid, scene, count: int, device: torch.device = CPU, size: tuple[int, int] = (3, 3)
+) -> tuple[SelfContact, torch.Tensor]:
+    """Two crumpled sheets, of which one lies over the other and is thicker, stiffer and tight in part."""
+    points, faces = toy_grid(*size, height=0.05 * (size[0] - 1), width=0.05 * (size[1] - 1))
+    one = TouchingCloth.of(dressed(scene, points, faces, np.zeros(len(points), dtype=bool)), FABRIC)
+    other = replace(one, points=points + [0, 0, 0.012], start=1.5 * one.start, stiffness=3 * one.stiffness,
+                    loose=np.arange(len(points)) % 2 == 0, pinned=np.arange(len(points)) % 4 == 1)  # fmt: skip
+    _, x, _ = crumpled(toy_grid, scene, count, device, size)
+    x = torch.cat([x, x + torch.tensor([[0.001], [0.002], [0.004]])])
+    return SelfContact(TouchingCloth.joined([one, other]), device, torch.float64), x
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, monkeypatch, several):
+    def cloth(device: torch.device = CPU) -> tuple[SelfContact, torch.Tensor]:
+        return two_kinds(toy_grid, scene, 2, device) if several else crumpled(toy_grid, scene, 2, device, (5, 3))[:2]
+
+    contact, x = cloth()
     monkeypatch.setattr("ssilk_core.physics.self_contact.self_contact.loops.available", lambda device: False)
     x = 0.4 * x + 0.004 * random(*x.shape, seed=2)
     known = contact.neighbours(x, x)
@@ -165,7 +185,7 @@ def test_kernels_find_the_contacts_that_the_reference_finds(scene, toy_grid, mon
     tried = x + 6e-3 * torch.nn.functional.normalize(random(*x.shape, seed=4) - 0.5, dim=1)
 
     def found(device: torch.device) -> list[torch.Tensor]:
-        own = crumpled(toy_grid, scene, 2, device, (5, 3))[0]
+        own = cloth(device)[0]
         around = on_device(known, device)
         there, pressed = own.moved(tried.to(device), around)
         others = own.contacts((0.3 * x + 0.7 * tried).to(device), there)
@@ -472,6 +492,33 @@ def test_the_kernel_solves_with_contacts_as_dense_algebra_does(monkeypatch):
     expected = torch.linalg.solve(dense, right.double().flatten()).view_as(right).float()
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(by_kernel.cpu(), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_graphs_of_solves_have_room_for_contacts_and_share_memory(monkeypatch):
+    def as_a_graph(work: Callable[[], object], device: torch.device) -> SimpleNamespace:
+        work()
+        return SimpleNamespace(replay=work)
+
+    monkeypatch.setattr(conjugate_gradient, "replays", lambda right: True)
+    monkeypatch.setattr(conjugate_gradient, "captured", as_a_graph)
+    monkeypatch.setattr(conjugate_gradient, "LEAST_SLOPES", 8)
+    vertices = 12
+    table = BlockPattern(np.zeros((0, 2), dtype=int), np.arange(vertices), vertices, DEVICE).table
+    for count, frames_of in ((20, 3), (17, 2), (0, 3)):
+        blocks = 3.0 * torch.eye(3)[:, :, None].repeat(vertices, 1, 1, frames_of)
+        right, x = random(vertices, 3, frames_of, seed=9).float(), random(vertices, 3, frames_of, seed=7)
+        slopes = random_contacts(vertices, count, frames_of).slopes(x)
+        found = ContactStiffness.of(slopes, frames_of, torch.arange(vertices), vertices)
+        rows = (each.to(DEVICE) for each in (found.vertices, found.frame, found.values))
+        own = SlopeTable.of(*rows, vertices, frames_of) if count else None
+        inverse = inverse_blocks((blocks + found.diagonal).permute(3, 0, 1, 2).contiguous()).permute(1, 2, 3, 0)
+        given = blocks.to(DEVICE), table, inverse.to(DEVICE), right.to(DEVICE)
+        solved, _ = solve_kernel(*given, 1e-3, 8, 8, own)
+        image = 3 * solved.cpu()
+        found.add_product(solved.cpu(), image)
+        assert (image - right).norm() < 1e-2 * right.norm()
+    assert [key[1] for key in table.captured] == [32, 0]
+    assert len({each._own.blocks.data_ptr() for each in table.captured.values()}) == 1
 
 
 def twisted(

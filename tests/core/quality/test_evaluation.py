@@ -512,6 +512,8 @@ def test_a_written_row_is_read_again_and_what_was_not_finite_is_no_number():
         ({"total": "much"}, "'figures.total' is 'much'"),
         ({"clips": None}, "'figures.clips' is 'None'"),
         ({"clips": True}, "'figures.clips' is 'True'"),
+        ({"terms": "gravity"}, "'figures.terms' is 'gravity'"),
+        ({"clip_totals": 3}, "'figures.clip_totals' is '3'"),
     ):
         with pytest.raises(TypeError, match=complaint):
             from_plain(ResultRow, {**written, "figures": {**written["figures"], **broken}}, figures=True)
