@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from ssilk_core.physics.captured import Captured
 from ssilk_core.physics.energy.collision import ContactLaw
@@ -29,8 +30,20 @@ from ssilk_core.physics.simulate.contact_stiffness import ContactStiffness
 from ssilk_core.physics.simulate.friction import Friction
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import Search, SolverOptions, minimise_from, newton_step
-from ssilk_core.scene.assets import LOOSE, PINNED, Garment, Mesh, ProxyRig, Scene, SkinWeights
+from ssilk_core.scene.assets import (
+    LOOSE,
+    PINNED,
+    Body,
+    Character,
+    Garment,
+    Mesh,
+    ProxyRig,
+    Scene,
+    Skeleton,
+    SkinWeights,
+)
 from ssilk_core.scene.fabrics import Fabric
+from ssilk_core.scene.kinematics import local_transforms, quaternion_from_matrix
 
 CPU = torch.device("cpu")
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")  # on a CPU kernels run in an interpreter
@@ -605,3 +618,49 @@ def test_shots_of_different_lengths_go_on_with_it(scene, toy_motion, monkeypatch
     for (_, number), frame in found.items():
         np.testing.assert_allclose(frame.points, found[0, number].points, atol=1e-4)
         assert frame.residual < 1e-2
+
+
+def skirt_over_legs() -> tuple[Scene, np.ndarray]:
+    """A tube that hangs from hips over two legs, each a capsule with a joint; and the joints."""
+    joints = np.array([[0.0, 1.0, 0.0], [-0.09, 0.95, 0.0], [0.09, 0.95, 0.0]])
+    binds = np.tile(np.eye(4), (3, 1, 1))
+    binds[:, :3, 3] = joints
+    parents = [-1, 0, 0]
+    skeleton = Skeleton("/legs", ("Hips", "Hips/L", "Hips/R"), parents, binds, local_transforms(binds, parents))
+    solids = [trimesh.creation.capsule(height=0.05, radius=0.13, count=(8, 8)).apply_translation([0, 1.02, -0.02])]
+    for joint in joints[1:]:
+        leg = trimesh.creation.capsule(height=0.42, radius=0.075, count=(10, 10))
+        leg.vertices = leg.vertices[:, [0, 2, 1]] * [1, -1, 1]
+        solids.append(leg.apply_translation(joint - [0, leg.vertices[:, 1].max() - 0.06, 0]))
+    body = trimesh.util.concatenate(solids)
+    owner = np.repeat(np.arange(3), [len(solid.vertices) for solid in solids])[:, None]
+    columns, heights = 12, np.linspace(0.08, -0.42, 6)
+    angle, radius = np.arange(columns) * 2 * np.pi / columns, np.linspace(0.16, 0.22, 6)[:, None]
+    around = np.stack(
+        [radius * np.cos(angle), np.repeat(heights[:, None] + 1, columns, 1), radius * np.sin(angle)], -1
+    )
+    here, right = np.arange(60), np.arange(60) // columns * columns + (np.arange(60) + 1) % columns
+    faces = np.concatenate([np.c_[here, right, here + columns], np.c_[right, right + columns, here + columns]])
+    skin = SkinWeights("/skirt", np.zeros((72, 1), dtype=int), np.ones((72, 1)))
+    garment = Garment(
+        Mesh("/skirt", around.reshape(-1, 3), faces), skin, np.where(np.arange(72) < columns, PINNED, LOOSE)
+    )
+    dressed_body = Body(Mesh("/body", body.vertices, body.faces), SkinWeights("/body", owner, np.ones(owner.shape)))
+    rig = ProxyRig("/skirt", (), np.zeros(0, dtype=int), np.zeros((0, 4, 4)), skin)
+    return Scene(Character("/legs", skeleton, (dressed_body,)), garment, rig), joints
+
+
+@pytest.mark.slow
+def test_thighs_that_rise_do_not_leave_a_skirt_on_the_way_to_the_first_pose():
+    scene, joints = skirt_over_legs()
+    angle = np.deg2rad(110)
+    raised = np.array([[1, 0, 0], [0, np.cos(angle), np.sin(angle)], [0, -np.sin(angle), np.cos(angle)]])
+    turns = np.stack([np.eye(3), raised, raised])
+    options = SimulationOptions(self_contact=True, quasi_static_solver=SolverOptions(iterations=10))
+    simulator = Simulator(scene, FABRIC, options)
+    places = scene.character.skeleton.rest_transforms[None, :, :3, 3]
+    _, found = simulator.at_rest(quaternion_from_matrix(turns)[None], places)
+    skirt = trimesh.Trimesh(found.x[..., 0].double().numpy(), scene.garment.mesh.faces, process=False)
+    hips, thigh = joints[1:] - joints[0], raised @ [0, -0.42, 0]
+    met, ray, _ = skirt.ray.intersects_location(hips, np.tile(thigh, (2, 1)))
+    assert not (np.linalg.norm(met - hips[ray], axis=1) < 0.42).any()
