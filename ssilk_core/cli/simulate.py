@@ -231,7 +231,7 @@ def _written(
     played = shots_of(motions, first.scene.character.skeleton, settings)
     total = sum(motion.frame_count for motion in played)
     report(Started("simulate", total, {"outputs": [str(shot.output) for own in shots for shot in own]}))
-    figures, start = _Figures(settings.solver.tolerance), time.monotonic()
+    figures = _Figures(settings.solver.tolerance)
     with ExitStack() as stack:
         caches = [
             _Caches(stack, each.options, own, each.worn.scene, played, worlds, report)
@@ -252,7 +252,7 @@ def _written(
         for each, cache in zip(garments, caches)
         for what, value in cache.figures().items()
     }
-    return {**figures.of_all(total, time.monotonic() - start), **fits, **counter.figures()}
+    return {**figures.of_all(total), **fits, **counter.figures()}
 
 
 class _Caches:
@@ -459,18 +459,22 @@ class _Figures:
 
     def __init__(self, tolerance: float) -> None:
         self.tolerance, self.solved, self.iterations, self.fixed = tolerance, 0, 0, 0
+        self.start, self.settled = time.monotonic(), 0.0
 
     def add(self, frame: SimulatedFrame) -> None:
+        self.settled = self.settled or time.monotonic() - self.start  # before the first frame cloth comes to rest
         self.solved += frame.residual <= self.tolerance
         self.iterations += frame.iterations
         self.fixed += frame.fixed
 
-    def of_all(self, frames: int, seconds: float) -> dict[str, object]:
+    def of_all(self, frames: int) -> dict[str, object]:
         """Return figures to show."""
+        seconds = time.monotonic() - self.start - self.settled
         return {
             "frames": frames,
             "within the tolerance": f"{self.solved / frames:.1%}",
             "Newton iterations per frame": round(self.iterations / frames, 1),
             "fixed vertices per frame": round(self.fixed / frames, 1),
+            "seconds until the first frame": float(f"{self.settled:.3g}"),
             "seconds per frame": float(f"{seconds / frames:.3g}"),
         }

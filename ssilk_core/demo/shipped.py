@@ -77,11 +77,12 @@ def need_trained_on(mesh: Mesh, file: ModelFile, path: Path) -> None:
 def origin(file: ModelFile) -> str:
     """Return in words how a shipped model came to be."""
     made, shipped, later = file.provenance, file.provenance["shipped"], list[str]()
+    seed = made["seed"]
     while "base" in made:  # `train --stepper-of` or `--start-from`
         later.insert(0, f", then {made['iteration']:,}" + ("" if made.get("whole") else " of the stepper alone"))
         made = made["base"]
     return (
-        f"{made['iteration']:,} iterations{''.join(later)} on {len(made['motions'])} motions, seed {made['seed']}, "
+        f"{made['iteration']:,} iterations{''.join(later)} on {len(made['motions'])} motions, seed {seed}, "
         f"{made['device']}, ssilk {made['ssilk']}, {shipped['date']}; "
         f"on {shipped['held-out clips']} held-out motions "
         f"{shipped['energy [J]']:.3g} J, linear blend skinning {shipped['linear blend skinning [J]']:.3g} J, "

@@ -100,7 +100,8 @@ def _verify_skinned(
     from ...scene.decomposition import FitTolerance
 
     if "cache" not in said:
-        fail(str(shot), "its points were simulated and not kept", "only a shot of a cache can be compared with it")
+        found, allowed = "its points were simulated and not kept", "only a shot of a cache can be compared with it"
+        fail(str(shot), found, allowed, "'ssilk simulate --points' keeps them, 'ssilk skin' makes a shot of those")
     near = shot.parent / str(said["cache"])
     path = Path(cache) if cache else near
     if not path.is_file():
