@@ -81,7 +81,7 @@ def write_hero(path: Path) -> Path:
     return path
 
 
-def write_clip(path: Path, frames: int = 24, fps: float = 30.0, joints: Sequence[str] = JOINTS) -> Path:
+def write_clip(path: Path, frames: int = 40, fps: float = 30.0, joints: Sequence[str] = JOINTS) -> Path:
     """Hips that sway and turn, sampled at every frame."""
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)

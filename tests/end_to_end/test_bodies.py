@@ -66,6 +66,7 @@ def family(toy, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = toy.copy(tmp_path_factory.mktemp("family"))
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        toy.write_clip(folder / "clip.usda", frames=24)
         write_member(folder / "taller.usda", taller)
         write_member(folder / "heavier.usda", heavier)
         train = f"{TRAIN} --family taller.usda heavier.usda -o family.safetensors"

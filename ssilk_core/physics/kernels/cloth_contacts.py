@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 TINY = tl.constexpr(1e-24)
 LEAST = tl.constexpr(1e-12)  # [m]
-ENERGY, FORCE, SLOPES = tl.constexpr(0), tl.constexpr(1), tl.constexpr(2)
+PRESSED = "energy", "force", "slopes"
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,19 +150,19 @@ def pressed_kernel(
     direction: Tensor,
     start: Tensor,
     area: Tensor,
-    what: tl.constexpr,
+    what: str,
 ) -> Tensor:
     """Return of each contact its energy (P,), its forces on its vertices (4, 3, P), or its slopes, likewise.
 
     Args:
-        what: `ENERGY`, `FORCE` or `SLOPES`.
+        what: one of `PRESSED`.
     """
     x, count = x.contiguous(), len(frame)
-    found = x.new_empty(count) if what is ENERGY else x.new_empty(4, 3, count)
+    found = x.new_empty(count) if what == "energy" else x.new_empty(4, 3, count)
     if count:
         rows = (each.contiguous() for each in (vertices, frame, coefficients, direction, start, area))
         _pressed[(triton.cdiv(count, BLOCK),)](x, *rows, found, law.stiffness, max(law.ramp, TINY.value), law.ramp,
-                                               count, x.shape[-1], what.value, BLOCK, num_warps=4)  # fmt: skip
+                                               count, x.shape[-1], PRESSED.index(what), BLOCK, num_warps=4)  # fmt: skip
     return found
 
 

@@ -95,14 +95,14 @@ class ClothContacts:
 
     def energy(self, x: Tensor) -> Tensor:
         """Return the energy of each frame [J], shape (N,)."""
-        energy = self._by_kernel(x, "ENERGY")
+        energy = self._by_kernel(x, "energy")
         if energy is None:
             energy = self.area * self.law.energy(self._relative(x))
         return energy.new_zeros(self.frames).index_put_((self.frame,), energy, accumulate=True)
 
     def gradient(self, x: Tensor) -> Tensor:
         """Return the gradient [N], shape (V, 3, N)."""
-        force = self._by_kernel(x, "FORCE")
+        force = self._by_kernel(x, "force")
         if force is None:
             force = (-self.pressure(x) * self.coefficients)[:, None] * self.direction
         return at_vertices(force, self.vertices, self.frame, x)
@@ -117,7 +117,7 @@ class ClothContacts:
 
     def slopes(self, x: Tensor) -> Slopes:
         """Return what the Hessian at x is made of."""
-        values = self._by_kernel(x, "SLOPES")
+        values = self._by_kernel(x, "slopes")
         if values is None:
             values = (self.stiffness(x).sqrt() * self.coefficients)[:, None] * self.direction
         return Slopes(self.frame, self.vertices, values)
@@ -126,10 +126,10 @@ class ClothContacts:
         """Return what `pressed_kernel` does, where kernels run."""
         if not kernels.available(x.device):
             return None
-        from ..kernels import cloth_contacts
+        from ..kernels.cloth_contacts import pressed_kernel
 
         rows = self.vertices, self.frame, self.coefficients, self.direction, self.start, self.area
-        return cloth_contacts.pressed_kernel(x, self.law, *rows, getattr(cloth_contacts, what))
+        return pressed_kernel(x, self.law, *rows, what)
 
     def allowed(self, x: Tensor, step: Tensor, yielding: float = 0.0) -> Tensor:
         """Return by which share of a step (V, 3, N) each vertex may move, shape (V, N).
