@@ -155,6 +155,7 @@ def test_a_family_is_learned_and_the_model_file_holds_it(world):
     assert Path("family.safetensors").stat().st_size < 1.3 * Path("model.safetensors").stat().st_size
 
 
+@pytest.mark.slow
 def test_a_garment_is_graded_where_it_is_asked_for(world, toy, capsys):
     names = ("taller.usda", "heavier.usda")
     train = f"{TRAIN} --family {' '.join(names)} --graded -o graded.safetensors"
@@ -393,6 +394,7 @@ def test_what_there_is_to_say_of_a_body_is_said_by_all_that_measure_it(world, ca
     assert "beyond the bodies of the training" in told.out + told.err
 
 
+@pytest.mark.slow
 def test_a_stress_on_several_bodies_has_cases_of_each_and_says_which_they_are(world, capsys):
     stages = "--stage rigged.usda --stage heavier.usda"
     assert run(f"stress family.safetensors {stages} --quick --only 'rate: 60' 'motion: NaN' -o out.json") == 0

@@ -154,6 +154,7 @@ def missing_at_first(monkeypatch):
     monkeypatch.setattr(blendshapes, "shapes_of", shapes)
 
 
+@pytest.mark.slow
 def test_points_of_layers_are_those_of_the_last_attempt(there, missing_at_first):
     assert main([*BAKE, "-o", "attempts/", "--certify", "--points", *MIDDLE]) == 0
     faces, (path,) = skinned("plain.usda")[1], there.glob("attempts/shots/*/*/anim.usdc")

@@ -208,6 +208,7 @@ def test_the_last_step_finds_what_is_not_as_it_was_written(farm, toy, capsys):
     check_fails()
 
 
+@pytest.mark.slow
 def test_killed_workers_lose_no_finished_shot_and_leave_no_half_file(farm):
     """Killed as soon as something is being written, and when a shot is finished; then let through.
 

@@ -103,6 +103,7 @@ def test_what_cannot_be_compared_is_refused(script, world, options, complaint):
         script("own_starts", f"--model model.safetensors {PLACE} --motions clips {options}")
 
 
+@pytest.mark.slow
 def test_a_sheet_has_a_row_for_each_method(script, world):
     """The simulator's positions are written once, and then read: here, moved away by a hand's breadth."""
     options = f"--model model.safetensors {PLACE} --motion clips/brief.usdc --simulation kept.npz"

@@ -90,7 +90,10 @@ def counted(path, count: int, seed: int) -> tuple[int, np.ndarray, np.ndarray]:
     return int(covered.sum()), np.array(shows), np.array(bare)
 
 
-@pytest.mark.parametrize("words", [[], ["--refine", "2"], ["--quality", "latent"]], ids=" ".join)
+SOLVED = [pytest.param(words, marks=pytest.mark.slow) for words in (["--refine", "2"], ["--quality", "latent"])]
+
+
+@pytest.mark.parametrize("words", [[], *SOLVED], ids=" ".join)
 def test_the_figure_is_that_of_the_written_file(folder, monkeypatch, capsys, words):
     monkeypatch.chdir(folder)
     bake = ["bake", "model.safetensors", "--stage", "rigged.usda", "--motion", "brief.usda", "-o", "shot.usdc"]

@@ -46,6 +46,7 @@ def simulated(name: str, *more: str) -> np.ndarray:
     return points_of(name)
 
 
+@pytest.mark.slow
 def test_the_simulator_has_it_as_another_fabric_has_its_own(stage, capsys):
     plain = simulated("plain.usdc")
     wanted = simulated("fabric.usdc", *(part for each in NUMBERS for part in ("--material", _times(each, 16.0))))

@@ -563,6 +563,7 @@ over = ["torn"]
 """
 
 
+@pytest.mark.slow
 def test_an_interrupted_list_goes_on_from_the_inside_out_and_a_failure_is_told(world, capsys):
     """Inner garments come first, and what lies over one that failed is not trained. The list is longer by then."""
     Path("list.toml").write_text(LIST.partition("[torn]")[0])

@@ -161,8 +161,9 @@ def pressed_kernel(
     found = x.new_empty(count) if what == "energy" else x.new_empty(4, 3, count)
     if count:
         rows = (each.contiguous() for each in (vertices, frame, coefficients, direction, start, area))
-        _pressed[(triton.cdiv(count, BLOCK),)](x, *rows, found, law.stiffness, max(law.ramp, TINY.value), law.ramp,
-                                               count, x.shape[-1], PRESSED.index(what), BLOCK, num_warps=4)  # fmt: skip
+        numbers = law.stiffness, max(law.ramp, TINY.value), law.ramp
+        _pressed[(triton.cdiv(count, BLOCK),)](x, *rows, found, *numbers, count, x.shape[-1], PRESSED.index(what),
+                                               BLOCK, num_warps=4)  # fmt: skip
     return found
 
 

@@ -213,6 +213,7 @@ def course(layers) -> list[np.ndarray]:
     return [pushed(layers, 0.012 * np.sin(np.pi * frame / 39) - 0.009) for frame in range(40)]
 
 
+@pytest.mark.slow
 def test_corrections_come_and_go_and_other_frames_stay(layers, course):
     certifier, frames = Certifier(layers), still(layers, course)
     faults = certifier.faults(frames)

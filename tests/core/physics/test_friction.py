@@ -110,6 +110,7 @@ def test_a_sheet_slides_down_a_steep_slope(scene, toy_grid, slope):
     need_falling_energy(path)
 
 
+@pytest.mark.slow
 def test_a_sheet_is_carried_by_what_it_lies_on(scene, toy_grid):
     sheet, x = lying(scene, toy_grid, 1)
     drift, steps = 0.05, 20

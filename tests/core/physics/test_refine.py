@@ -91,6 +91,7 @@ def on_the_ball(scene):
     return replace(scene, garment=replace(scene.garment, mesh=near))
 
 
+@pytest.mark.slow
 def test_with_feedback_it_becomes_the_simulator(scene, rollout) -> None:
     motion, points, scene = rollout[0].clip(0, 4), rollout[1][:4], on_the_ball(scene)
     solver = SolverOptions(tolerance=1e-3, iterations=200)
@@ -138,6 +139,7 @@ def test_with_feedback_a_shot_begins_at_rest(scene, rollout) -> None:
     assert alone[0].residual > changes[0].residual
 
 
+@pytest.mark.slow
 def test_shots_at_once_are_what_each_is_by_itself(scene, rollout) -> None:
     motion, points, scene = *rollout, on_the_ball(scene)
     shots = [(motion, points), (motion.clip(3, FRAMES), points[3:])]

@@ -271,6 +271,7 @@ def test_a_shot_begins_anew_after_a_cut(scene, toy_motion) -> None:
     np.testing.assert_allclose(points[3:], alone, atol=1e-3)  # what the tolerance leaves a quasi-static state
 
 
+@pytest.mark.slow
 def test_sequences_are_simulated_as_shots_of_their_own(scene, toy_motion) -> None:
     motion = toy_motion(scene, 5)
     (points,) = simulate(scene, CLOTH, [motion], replace(SHORT, sequence=3))

@@ -258,6 +258,7 @@ def test_a_clip_of_one_frame_is_a_pose_that_is_held(subject, toy_motion):
     assert found.finite and found.speed < 1e-3 and found.growth == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_double_precision_is_its_own_truth_and_half_is_not(subject):
     exact = subject.in_precision(torch.float64)
     assert meter.precision_errors(exact, exact, subject.base) == (0, 0)

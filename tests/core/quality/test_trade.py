@@ -186,6 +186,7 @@ def test_refined_variants_are_counted_as_what_a_bake_stores(meter, bench, points
     np.testing.assert_allclose(stored[..., 0].numpy(), first, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_simulator_goes_on_from_the_networks_first_two_states(meter, bench, model, monkeypatch):
     reducer, dressed, take_set = bench
     method = ShotMethod("simulator", reducer.player, dressed, take_set, fps=FPS, simulated=True)
