@@ -41,6 +41,7 @@ def test_a_mistyped_name_is_told_with_the_file_that_it_resembles(tmp_path):
     (tmp_path / "cape.txt").touch()
     said = refusal(tmp_path / "cpe.safetensors")
     assert said.endswith("no such model file; a file of 'ssilk train' is needed; did you mean 'cape.safetensors'?")
+    assert refusal(tmp_path / "nope.safetensors").endswith("a file of 'ssilk train' is needed.")
     need_input(f"{tmp_path}/cape.safetensors:/Hero", MODEL)
     for elsewhere in ("show.usdz[cape.usda]", "asset://cape"):
         need_input(elsewhere, MODEL)

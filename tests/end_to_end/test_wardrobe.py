@@ -117,6 +117,7 @@ WRONG = {
     "missing": ('[cape]\nstage = "a"', "table 'cape', key 'motions': missing; it is needed here or in"),
     "fabric": ('[cape]\nfabric = "silkk"', "wool, leather is needed; did you mean 'silk'?"),
     "preset": ('[cape]\npreset = "fast"', "key 'preset': 'fast'; one of draft, preview, light, final, paper is"),
+    "misspelt": ('[cape]\npreset = "finl"', "final, paper is needed; did you mean 'final'?"),
     "set": ('[cape]\nset = "batch=3"', "key 'set': 'batch=3'; a table of values, like { iterations = 20000 }, is"),
     "over": (
         '[cape]\nstage = "a"\nmotions = "b"\nover = ["shirt"]',

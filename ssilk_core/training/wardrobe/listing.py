@@ -7,7 +7,7 @@ import json
 import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -48,11 +48,18 @@ class WardrobeEntry:
 
 @dataclass(frozen=True)
 class Key:
-    """Allowed values of a key, and its option of 'ssilk train'; "" for a positional argument."""
+    """Allowed values of a key, its option of 'ssilk train', "" for a positional argument, and the names it may have."""
 
     option: str
     fits: Callable[[Any], bool]
     allowed: str
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def one_of(cls, option: str, names: Iterable[str]) -> Key:
+        """Return the key whose value is one of some names."""
+        known = tuple(names)
+        return cls(option, lambda value: value in known, f"one of {', '.join(known)}", known)
 
 
 def _is_text(value: Any) -> bool:
@@ -76,8 +83,8 @@ KEYS = {
     "garment": Key("--garment", _is_text, "a path, a path:/prim or a prim"),
     "motions": Key("--motions", _is_texts, "a path or a list of paths"),
     "valid": Key("--valid", _is_texts, "a path or a list of paths"),
-    "preset": Key("--preset", lambda value: value in [*PRESETS], f"one of {', '.join(PRESETS)}"),
-    "fabric": Key("--fabric", lambda value: value in [*FABRICS], f"one of {', '.join(FABRICS)}"),
+    "preset": Key.one_of("--preset", PRESETS),
+    "fabric": Key.one_of("--fabric", FABRICS),
     "material": Key("--material", _is_scalars, "a table of values, like { drag = 0.3 },"),
     "fabrics": Key("--fabrics", _is_range, "a list of presets and factors, like ['silk', 4],"),
     "set": Key("--set", _is_scalars, "a table of values, like { iterations = 20000 },"),
@@ -216,7 +223,7 @@ def _need_table(path: Path, name: str, table: Any) -> None:
         if key not in KEYS:
             fail_unknown(where, "no such key", key, KEYS)
         if not KEYS[key].fits(value):
-            near = did_you_mean(value, FABRICS) if key == "fabric" and isinstance(value, str) else ""
+            near = did_you_mean(value, KEYS[key].names) if isinstance(value, str) else ""
             fail(where, f"{value!r}", f"{KEYS[key].allowed} is needed", near)
 
 
