@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from typing import Any
@@ -34,65 +34,22 @@ from ...scene.kinematics import bind_pose, slerp
 from ..collision import limb_axes
 from ..collision.inner_cloth import InnerSurface
 from ..collision.pierced import PiercedCloth, PiercedOutfit
-from ..constants import GRAVITY
 from ..self_contact import ClothNeighbours
-from ..world.surroundings import PosedWorld, Surroundings
+from ..world.surroundings import Surroundings
 from .characters import CharacterPoser, MotionSpan, PosedCharacters, join_spans, split_into_spans
 from .cubature import Cubature, sampled_potential
 from .history import StepHistory
 from .incremental_potential import IncrementalPotential, StepInputs
-from .newton import Search, Solution, SolverOptions, minimise_from
+from .newton import Search, Solution, minimise_from
+from .options import PRECISIONS, SimulationOptions
 from .outfit import OutfitPotential, WornGarment
 from .over_cloth import OverPotential
 from .scheduler import Asked, Course, Scheduler
+from .wind import carried_by_air, pushed_by_wind
 
-PRECISIONS = {"float64": torch.float64, "float32": torch.float32}
-MAX_SUBSTEPS = 1000
 WAY = 8, 10  # poses from the bind pose to one in which cloth comes to rest, and iterations for each but the last
 WAY_APART = 16, 20  # where cloth does not pass through cloth: legs that go further at once press a hem through itself
 PARTS, SPLITS = 4, 2  # shorter steps for one that does not converge, and how often these are split themselves
-
-
-@dataclass(frozen=True, kw_only=True)
-class SimulationOptions:
-    """Settings of a simulation.
-
-    Attributes:
-        fps: frames per second; the default is the rate of training.
-        substeps: steps in each frame.
-        batch: number of shots simulated in parallel.
-        sequence: number of frames after which a shot restarts, for evaluation; sequences are simulated in parallel.
-            None for whole shots.
-        precision: "float64" or "float32", of positions, energies and forces; linear systems are always float32.
-        gravity: acceleration [m/s2].
-        self_contact: loose cloth does not pass through the garment (`physics.self_contact`).
-        solver: settings for every step.
-        quasi_static_solver: settings for quasi-static states, which converge more slowly without inertia.
-    """
-
-    fps: float = 30.0
-    substeps: int = 1
-    batch: int = 64
-    sequence: int | None = None
-    precision: str = "float64"
-    gravity: tuple[float, float, float] = (0.0, -GRAVITY, 0.0)
-    self_contact: bool = False
-    solver: SolverOptions = field(default_factory=SolverOptions)
-    quasi_static_solver: SolverOptions = field(default_factory=lambda: SolverOptions(iterations=150))
-
-    def __post_init__(self) -> None:
-        if not 0 < self.fps <= 10_000:
-            fail("simulation", f"{self.fps:g} frames per second", "a positive rate is needed")
-        if not 0 < self.substeps <= MAX_SUBSTEPS:
-            fail("simulation", f"substeps = {self.substeps}", f"1 to {MAX_SUBSTEPS} are allowed")
-        if not self.batch > 0:
-            fail("simulation", f"batch = {self.batch}", "at least 1 is needed")
-        if not (self.sequence is None or self.sequence >= 1):
-            fail("simulation", f"sequences of {self.sequence} frames", "one at least is needed")
-        if self.precision not in PRECISIONS:
-            fail("simulation", f"precision '{self.precision}'", "it is float64 or float32")
-        if not np.isfinite(self.gravity).all():
-            fail("simulation", f"gravity {self.gravity}", "it must be finite")
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,48 +364,17 @@ class Simulator:
         met = world if world and world.has_colliders else None
         if past is None:
             if world is not None:
-                gravity = gravity + self._pushed_by_wind(world, poses.lbs)
+                gravity = gravity + pushed_by_wind(self.potential.garments, world, poses.lbs)
             return StepInputs(poses.body, gravity, skinned=poses.lbs, world=met)
         shift = poses.root - past.root
         predicted = past.follow_lbs(poses) if past.before is None else past.local + (past.last - past.before - shift)
         friction = past.friction and past.friction.after(poses.body.points, world)
         limbs = poses.body.limbs
         pierced = past.pierced.on(limbs) if past.pierced and limbs else None
-        advected = past.local if world is None else self._advected(world, past, poses)
+        advected = past.local if world is None else carried_by_air(world, past, poses.root, self.dt)
         dt = self.dt if dt is None else dt.to(past.lbs.dtype) if isinstance(dt, Tensor) else dt
         own = predicted.to(past.lbs.dtype), advected, dt, poses.lbs
         return StepInputs(poses.body, gravity, *own, friction=friction, pierced=pierced, world=met)
-
-    def _advected(self, world: PosedWorld, past: StepHistory, poses: PosedCharacters) -> Tensor:
-        """Return the last positions moved with the air, relative to the roots, shape (V, 3, N)."""
-        carried = past.local.clone()
-        for frame, (air, seconds) in enumerate(zip(world.air, world.seconds, strict=True)):
-            if air is not None:
-                moved = past.last[..., frame]
-                blown = torch.as_tensor(air.velocity(moved.cpu().numpy(), seconds).copy()).to(moved)
-                carried[..., frame] = (moved + self.dt * blown - poses.root[:, frame]).to(carried.dtype)
-        return carried
-
-    def _pushed_by_wind(self, world: PosedWorld, lbs: Tensor) -> Tensor:
-        """Return the mean acceleration by which wind pushes resting cloth [m/s2], shape (3, N).
-
-        For several garments it is that of each at its vertices, shape (V, 3, N).
-        """
-        garments = self.potential.garments
-        parts = [self._pushed(world, lbs[rows], fabric) for rows, fabric in garments]
-        if len(parts) == 1:
-            return parts[0]
-        return torch.cat([part.expand(rows.stop - rows.start, -1, -1) for part, (rows, _) in zip(parts, garments)])
-
-    def _pushed(self, world: PosedWorld, lbs: Tensor, fabric: Fabric) -> Tensor:
-        """Return that of one garment, shape (3, N)."""
-        pushed = torch.zeros_like(world.gravity)
-        points = lbs.double().cpu().numpy()
-        for frame, (air, seconds) in enumerate(zip(world.air, world.seconds, strict=True)):
-            if air is not None:
-                blown = air.velocity(points[..., frame] + world.roots[frame], seconds).mean(axis=0)
-                pushed[:, frame] = torch.as_tensor(blown).to(pushed)
-        return fabric.drag / fabric.density * pushed
 
     def search(self, poses: PosedCharacters, past: StepHistory, numbers: Sequence[int], dt: float | Tensor) -> Search:
         """Return the search for the states one step after `past`, relative to the roots, by numbers of N shots.

@@ -48,7 +48,11 @@ class WardrobeEntry:
 
 @dataclass(frozen=True)
 class Key:
-    """Allowed values of a key, its option of 'ssilk train', "" for a positional argument, and the names it may have."""
+    """Allowed values of a key, and its option of 'ssilk train'; "" for a positional argument.
+
+    Attributes:
+        names: all allowed values, where these are names.
+    """
 
     option: str
     fits: Callable[[Any], bool]

@@ -18,6 +18,7 @@ from ssilk_core.physics.simulate.history import StepHistory
 from ssilk_core.physics.simulate.incremental_potential import IncrementalPotential, StepInputs
 from ssilk_core.physics.simulate.newton import SolverOptions, minimise_from
 from ssilk_core.physics.simulate.outfit import OutfitPotential
+from ssilk_core.physics.simulate.wind import pushed_by_wind
 from ssilk_core.scene.assets import (
     LOOSE,
     PINNED,
@@ -380,7 +381,8 @@ def test_wind_pushes_each_garment_by_its_own_drag(scene, toy_motion, toy_grid):
     class World:
         gravity, air, seconds, roots = torch.zeros(3, 1, dtype=torch.float64), [Air()], [0.0], np.zeros((1, 3))
 
-    found = simulator._pushed_by_wind(World(), positions([WornGarment(inner, HEAVY), WornGarment(outer, LIGHT)]))
+    garments = simulator.potential.garments
+    found = pushed_by_wind(garments, World(), positions([WornGarment(inner, HEAVY), WornGarment(outer, LIGHT)]))
     assert found.shape == (2 * count, 3, 1)
     assert float(found[0, 2]) == pytest.approx(2.0 * HEAVY.drag / HEAVY.density)
     assert float(found[-1, 2]) == pytest.approx(2.0 * 0.6 / LIGHT.density)
