@@ -171,15 +171,8 @@ def playing() -> str:
 
 
 def extremes() -> str:
-    """How many extremes of each kind work, fall back, are refused, and do not apply.
-
-    Where the cape knows one fabric, it is the cape for a range of fabrics.
-    """
-    ranged = {(each["group"], each["name"]): each for each in document("stress_cape_fabrics")["outcomes"]}
-    outcomes = [
-        ranged.get((each["group"], each["name"]), each) if each["verdict"] == "does not apply" else each
-        for each in document("stress_cape")["outcomes"]
-    ]
+    """How many extremes of each kind work, fall back, are refused, and do not apply."""
+    outcomes = document("stress_cape")["outcomes"]
     groups = dict.fromkeys(each["group"] for each in outcomes)
     rows = []
     for verdict in ("works", "falls back", "refuses", "does not apply"):

@@ -4,7 +4,7 @@
 The demo consists of commands that can be typed; each is printed before it runs. --pretrained leaves out the training.
 Three choices train nothing: --garment cape_over_dress films an outfit, a cape that was trained over the hooded dress,
 and the dress; --garment cape_family films one model of the cape on three bodies side by side, and --garment
-cape_fabrics one in three fabrics. The list outfit.toml, to inspect and train the outfit anew, is written beside it.
+cape_fabrics the cape in three fabrics. The outfit's list, outfit.toml, is written to inspect and train it anew.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from ..events import Message, Reporter, Result
 if TYPE_CHECKING:
     from ..scene.assets import Mesh
 
-RANGED_GARMENT = "cape"  # of which models for a family of bodies and for a range of fabrics ship
-FAMILY, FABRICS = "cape_family", "cape_fabrics"  # these models
+RANGED_GARMENT = "cape"  # whose model knows a range of fabrics, and of which one for a family of bodies ships
+FAMILY, FABRICS = "cape_family", "cape_fabrics"  # the latter's name, and that of the cape in several fabrics
 FILMED_FABRICS = ("silk", "default", "leather")
 FILMED_BODIES = {"neutral": "", "tall": "tall", "heavy": "heavy"}  # by their captions
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits
@@ -53,8 +53,8 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     wardrobe = _make_inputs(options, report)
     ranged = options.garment in (FAMILY, FABRICS)
     garment = RANGED_GARMENT if ranged else options.garment
-    shipped = open_shipped(options.garment, wardrobe[garment])
-    report(Message(f"shipped {options.garment}: {origin(shipped)}"))
+    model = garment if options.garment == FABRICS else options.garment
+    report(Message(f"shipped {model}: {origin(open_shipped(model, wardrobe[garment]))}"))
     if options.garment == FAMILY:
         _make_shots(options.output, report)
         commands = _on_bodies(options)
@@ -139,7 +139,7 @@ def _in_fabrics(options: argparse.Namespace) -> list[list[str]]:
     return [
         ["rig", str(_body()), "--garment", str(out / "wardrobe" / f"{RANGED_GARMENT}.usdc"), "-o", stage],
         *(
-            ["bake", str(shipped_path(FABRICS)), "--stage", stage, "--motion", str(out / "shot.usdc"),
+            ["bake", str(shipped_path(RANGED_GARMENT)), "--stage", stage, "--motion", str(out / "shot.usdc"),
              "--fabric", fabric, "-o", shots[fabric]]
             for fabric in FILMED_FABRICS
         ),

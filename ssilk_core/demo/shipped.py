@@ -12,7 +12,7 @@ from ..network.checkpoint import ModelFile, load_model
 from ..scene.assets import Mesh
 
 FOLDER = Path(__file__).with_name("models")
-RANGES = ("_family", "_fabrics")  # behind a garment's name: its models for a family of bodies, a range of fabrics
+FAMILY = "_family"  # behind a garment's name: its model for a family of bodies
 TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here
 
 
@@ -23,9 +23,7 @@ def shipped_path(garment: str) -> Path:
 
 def garment_of(name: str) -> str:
     """Return the garment of the wardrobe that a shipped model is of."""
-    for suffix in RANGES:
-        name = name.removesuffix(suffix)
-    return name
+    return name.removesuffix(FAMILY)
 
 
 def open_shipped(garment: str, mesh: Mesh) -> ModelFile:

@@ -255,7 +255,7 @@ def test_names_of_presets_mean_what_they_meant_when_a_range_was_made(scene, mode
 
 
 def test_a_range_of_before_the_presets_were_calibrated_means_those_of_then(tmp_path):
-    shipped = load_model(shipped_path("cape_fabrics"))
+    shipped = load_model(shipped_path("cape"))
     own, known = shipped.fabric, replace(shipped.fabrics.range, points=None)
     shipped = replace(shipped, fabrics=replace(shipped.fabrics, range=known))
     then = {"silk": 0.3, "cotton": 1.5, "denim": 10, "wool": 5, "leather": 40}
