@@ -2,12 +2,12 @@
 """A model for a family of bodies on bodies that its training never saw, beside models for one of these alone.
 
     python benchmarks/bodies.py draw FOLDER                                   # more bodies, with Anny
-    python benchmarks/bodies.py train BODY.usdc -o BODY.safetensors --motions FOLDER --index FILE
+    python benchmarks/bodies.py train BODY.usdc --start-from CAPE -o BODY.safetensors --motions FOLDER --index FILE
     python benchmarks/bodies.py simulate BODIES --clips NAMES -o FOLDER --motions FOLDER --index FILE
     python benchmarks/bodies.py measure BODIES --alone NAME=MODEL --simulated FOLDER -o FOLDER --motions FOLDER ...
     python benchmarks/bodies.py join FOLDER
 
-A model for one body starts where that of the family started, from the cape that ships, laid on that body. It is
+A model for one body starts where that of the family started, from a cape for the first body, laid on that body. It is
 trained with the family's settings for as many iterations, all of them on that body, on the motions between its bones.
 Its garment is the family's: sewn for the first body. What is drawn are Anny's parameters: mixtures of those of three
 members, a tenth beyond their mean, as training draws bodies among their shapes. Single steps are measured as in a
@@ -54,7 +54,7 @@ from ssilk_core.training.settings import TrainConfig
 from ssilk_core.training.step_errors import StepErrors
 from ssilk_core.training.validation import Validator
 
-FAMILY, FIRST = shipped_path("cape_family"), shipped_path("cape")
+FAMILY = shipped_path("cape_family")
 DRAWN, SEED = 7, 49  # bodies beside the three that ship and that training never saw
 CLIPS = "02_04", "05_12", "06_05", "07_09", "09_11"  # of `test`, as docs/training.md has them
 STEPS = 128  # single steps on each body
@@ -112,7 +112,7 @@ def draw(options: argparse.Namespace) -> None:
 def train_alone(options: argparse.Namespace) -> None:
     """Train a model for one body alone, from where the family's began, with its settings."""
     dressed, index = Dressed.of(options.stage), read_index(options.index)
-    known, first, scene = dressed.family.provenance, load_model(FIRST), dressed.on.scene
+    known, first, scene = dressed.family.provenance, load_model(options.start_from), dressed.on.scene
     settings = TrainConfig(**known["train"])
     iterations = options.iterations or known["planned"]
     job = TrainJob(
@@ -227,6 +227,7 @@ def main() -> None:
     own.add_argument("stage", type=Path)
     own.add_argument("--index", type=Path, required=True, help="JSON list of clips and their splits")
     own.add_argument("--iterations", type=int, help="default: as many as the family's")
+    own.add_argument("--start-from", type=Path, required=True, metavar="MODEL", help="that the family started from")
     verb("simulate", simulate_bodies, "motions", "stages")
     asked = verb("measure", measure, "motions", "stages")
     asked.add_argument("--alone", nargs="*", default=[], metavar="NAME=MODEL", help="models for one body alone")

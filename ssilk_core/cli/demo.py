@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..scene.assets import Mesh
 
 RANGED_GARMENT = "cape"  # whose model knows a range of fabrics, and of which one for a family of bodies ships
-FAMILY, FABRICS = "cape_family", "cape_fabrics"  # the latter's name, and that of the cape in several fabrics
+FAMILY, FABRICS = "cape_family", "cape_fabrics"  # choices: the model for a family, and the cape in three fabrics
 FILMED_FABRICS = ("silk", "default", "leather")
 FILMED_BODIES = {"neutral": "", "tall": "tall", "heavy": "heavy"}  # by their captions
 PRESET = "draft"  # of the training: the only one that a processor finishes while someone waits

@@ -12,7 +12,7 @@ from ..network.checkpoint import ModelFile, load_model
 from ..scene.assets import Mesh
 
 FOLDER = Path(__file__).with_name("models")
-FAMILY = "_family"  # behind a garment's name: its model for a family of bodies
+FAMILY_SUFFIX = "_family"  # behind a garment's name: its model for a family of bodies
 TOLERANCE = 0.01  # [m] between the garment of a model, which was settled, and the one that is built here
 
 
@@ -23,7 +23,7 @@ def shipped_path(garment: str) -> Path:
 
 def garment_of(name: str) -> str:
     """Return the garment of the wardrobe that a shipped model is of."""
-    return name.removesuffix(FAMILY)
+    return name.removesuffix(FAMILY_SUFFIX)
 
 
 def open_shipped(garment: str, mesh: Mesh) -> ModelFile:

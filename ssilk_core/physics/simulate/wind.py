@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What moving air does to cloth whose drag is linear in its velocity through the air."""
+"""What moving air does to cloth, whose drag by mass is (c / rho) (w - v): linear in the air's velocity w.
+
+c is `Fabric.drag` [kg/(m2 s)], rho its density [kg/m2], v the cloth's velocity. The potential has it as a pull
+towards where the air carries the last positions.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,12 @@ from .history import StepHistory
 
 
 def carried_by_air(world: PosedWorld, past: StepHistory, root: Tensor, dt: float) -> Tensor:
-    """Return the last positions, moved with the air for a time step dt [s], relative to the roots, shape (V, 3, N).
+    """Return the last positions [m], moved with the air for a time step, relative to the roots, shape (V, 3, N).
 
     Args:
+        world: what surrounds the N characters at the end of the step.
+        past: before it.
+        dt: its length [s].
         root: positions of the roots at the end of the step [m], shape (3, N).
     """
     carried = past.local.clone()
@@ -35,6 +42,7 @@ def pushed_by_wind(garments: Sequence[tuple[slice, Fabric]], world: PosedWorld, 
 
     Args:
         garments: the vertices of each, and its fabric.
+        world: what surrounds the N characters.
         lbs: linear blend skinning, relative to the roots [m], shape (V, 3, N).
     """
     parts = [_pushed(world, lbs[rows], fabric) for rows, fabric in garments]
