@@ -8,6 +8,7 @@ import shlex
 import sys
 from collections import Counter
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -129,10 +130,15 @@ def test_settings_vary_about_what_most_models_have(made):
     assert alone(told, "window") == {6: ["usual", "again"], 16: ["long"]}
 
 
-def test_single_frames_are_timed(made):
+def test_single_frames_are_timed(made, monkeypatch):
+    """By a clock whose ticks grow by two: what comes after a network takes that much longer than its end."""
+    from helpers import single_frames
+
+    ticks = count()
+    monkeypatch.setattr(single_frames, "now", lambda _: float(next(ticks) ** 2))
     (_, *lines), figures = made(f"table3 models/2.safetensors ncs.safetensors {WORLD} --clip brief --frames 3")
     assert [line[0] for line in lines] == ["2", "ncs"]
-    assert all(0 < times["model"][0] < times["full"][0] for times in figures.values())
+    assert [times["full"][0] - times["model"][0] for times in figures.values()] == [2.0, 2.0]
 
 
 @pytest.mark.parametrize(
