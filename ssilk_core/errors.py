@@ -46,13 +46,14 @@ def fail_unknown(where: str, found: str, name: str, allowed: Iterable[str]) -> N
     fail(where, found, f"it is one of {', '.join(names)}", did_you_mean(name, names))
 
 
-def did_you_mean(name: str, allowed: Iterable[str], like: float = 0.6) -> str:
+def did_you_mean(name: str, allowed: Iterable[str], like: float = 0.6, *, ending: str = "") -> str:
     """Return a question that suggests the allowed name which `name` resembles most; "" where it resembles none.
 
     Args:
         like: likeness, up to 1 of the same, from which on it does.
+        ending: what all names end in: told, and not compared, as it would make all alike.
     """
     from difflib import get_close_matches  # only failures need it
 
     near = get_close_matches(name, list(allowed), n=1, cutoff=like)
-    return f"did you mean '{near[0]}'?" if near else ""
+    return f"did you mean '{near[0]}{ending}'?" if near else ""

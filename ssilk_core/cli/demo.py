@@ -53,7 +53,7 @@ def run(options: argparse.Namespace, report: Reporter) -> int:
     wardrobe = _make_inputs(options, report)
     ranged = options.garment in (FAMILY, FABRICS)
     garment = RANGED_GARMENT if ranged else options.garment
-    model = garment if options.garment == FABRICS else options.garment
+    model = FAMILY if options.garment == FAMILY else garment
     report(Message(f"shipped {model}: {origin(open_shipped(model, wardrobe[garment]))}"))
     if options.garment == FAMILY:
         _make_shots(options.output, report)

@@ -103,9 +103,8 @@ def need_input(named: str, kind: Kind, meant: str = "") -> None:
     elif path.exists():
         found = f"{_special(path)}, and no {kind.name}"
     elif path.parent.is_dir() and not meant:
-        beside = (each for each in path.parent.iterdir() if each.suffix == path.suffix)
-        # An ending alone is no likeness.
-        near = did_you_mean(path.name, [each.name for each in beside if did_you_mean(path.stem, [each.stem])])
+        beside = (each.stem for each in path.parent.iterdir() if each.suffix == path.suffix)
+        near = did_you_mean(path.stem, beside, ending=path.suffix)
     fail(named, found, kind.needed, near)
 
 
